@@ -193,13 +193,6 @@ def test_a_simulation_needs_no_gradient(run: Run) -> None:
     assert found["factorisations"] == ARMS and found["simulations"] == 1
 
 
-@pytest.mark.parametrize("overrides", [[SHARED], [RIGID]], ids=" ".join)
-def test_one_mesh_and_one_filter(overrides: list[str]) -> None:
-    """Mesh and filter belong to an `Arm`, of which there is one."""
-    built = build(*overrides)
-    assert WORLD.allreduce(len(built.arms)) == 1
-
-
 @pytest.mark.parametrize("kind", ["static", "eigenfrequency"])
 def test_nothing_moves_unless_asked(kind: str) -> None:
     """No simulation and no reduced model without `simulated`; with it the same objective."""

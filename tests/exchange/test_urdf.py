@@ -275,18 +275,6 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
 
 
-@pytest.mark.parametrize("radius", [0.0331, 0.0575, 0.0704])
-def test_the_filter_is_wide_enough_for_the_cells(tmp_path, radius):
-    """What the command writes, the run does not warn of."""
-    text = DEMO.read_text().replace('cylinder radius="0.055"', f'cylinder radius="{radius}"')
-    assert text != DEMO.read_text()
-    (tmp_path / "robot.urdf").write_text(text)
-    run_import(tmp_path / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "a")
-    scene = load_scene(tmp_path / "a" / "robot.toml")
-    sizes = {k: scene.arms[k].cell_size for k in scene.designed}
-    assert None not in sizes.values() and filter_warnings(scene, sizes) == []
-
-
 # -- shapes ----------------------------------------------------------------------------------
 
 SIDES = (0.5, 0.1, 0.08)

@@ -135,36 +135,6 @@ def test_matrices_against_assembly_of_the_forms(distort):
 
 
 @pytest.mark.serial  # ranks: test_ranks of test_elements
-def test_nothing_is_assembled_or_factorised_twice_for_a_design():
-    substructure = make_arm(make_mesh((6, 2)))
-    counts = substructure.profile.counts
-    assert dataclasses.asdict(counts) == dict.fromkeys(dataclasses.asdict(counts), 0)
-    young, density = rough_design(substructure.mesh)
-    right = np.ones((substructure.T.num_interior, 2))
-
-    def work(arm):
-        """Ask for everything, twice."""
-        for _ in range(2):
-            arm.solve(right)
-            arm.interior_mass()
-            arm.interior_stiffness()
-            arm.mass_times(arm.rigid)
-            arm.energy_matrix(arm.rigid)
-        return counts.assemblies, counts.factorisations, counts.solves
-
-    first = substructure.at(young, density)
-    assert counts.assemblies == 0  # nothing before it is asked for
-    assert work(first) == (2, 1, 4)
-    assert substructure.at(young.copy(), density.copy()) is first
-    assert work(first) == (2, 1, 8)
-    stiffer = substructure.at(2.0 * young, density)
-    assert work(stiffer) == (3, 2, 12)
-    assert work(substructure.at(2.0 * young, 3.0 * density)) == (4, 2, 16)
-    # An older design keeps its matrices; its factor gave way to the next one's.
-    assert work(first) == (4, 3, 20)
-
-
-@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_designs_of_one_arm_do_not_disturb_each_other():
     """Kept patterns, symbolic factor and shared arrays give what a fresh arm gives."""
     mesh = make_mesh((10, 3))

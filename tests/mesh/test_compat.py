@@ -4,9 +4,6 @@ import subprocess
 import sys
 
 import pytest
-from mpi4py import MPI
-
-COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.serial

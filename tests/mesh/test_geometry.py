@@ -353,30 +353,6 @@ def named(text, kind, fits):
     return re.sub(rf"{kind}\('\d+'", f"{kind}(''", marked)
 
 
-@pytest.mark.serial  # Gmsh runs on one rank
-def test_mesh_of_a_step_file_with_named_curves(shared_tmp_path):
-    """The way of the tutorial for CAD programs that write no names."""
-    step = step_file(shared_tmp_path / "arm.step", bar=bar_with_straight_ends)
-
-    def name(gmsh):
-        gmsh.option.setString("Geometry.OCCTargetUnit", "M")
-        gmsh.model.occ.importShapes(str(step))
-        gmsh.model.occ.synchronize()
-        for end, x in (("inboard", 0.0), ("outboard", LENGTH)):
-            lines = gmsh.model.getEntitiesInBoundingBox(x - 1e-6, -1, -1, x + 1e-6, 1, 1, 1)
-            gmsh.model.setPhysicalName(
-                1, gmsh.model.addPhysicalGroup(1, [n for _, n in lines]), end
-            )
-        faces = [tag for _, tag in gmsh.model.getEntities(2)]
-        gmsh.model.setPhysicalName(2, gmsh.model.addPhysicalGroup(2, faces), "design")
-        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.01)
-        gmsh.model.mesh.generate(2)
-
-    mesh = arm_mesh(COMM, entry(gmsh_writes(shared_tmp_path / "arm.msh", name)))
-    assert figures(mesh)[1] == pytest.approx(LENGTH * HEIGHT, rel=1e-9)
-    assert figures(mesh)[3] == figures(mesh)[4] == 6
-
-
 # --- what cannot be an arm -------------------------------------------------------------------
 
 
@@ -492,15 +468,6 @@ def test_prismatic_solid_is_taken_by_its_planar_face(shared_tmp_path, z):
     assert figures(mesh)[1] == pytest.approx(area, rel=2e-3)  # polygons in place of circles
     assert radius_error(mesh, mesh.inboard_facets, 0.0, 0.013) < 1e-9
     assert np.abs(mesh.mesh.geometry.x[:, 2]).max() == 0.0
-
-
-@pytest.mark.serial  # Gmsh runs on one rank
-def test_solids_side_by_side(shared_tmp_path):
-    solids = {"arm": lifted(plate, 0.1, 0.01), "passive2": lifted(ring, 0.1, 0.01)}
-    path = step_file(shared_tmp_path / "arm.step", **solids)
-    mesh = arm_mesh(COMM, entry(path, mesh_size=0.004, thickness=0.01))
-    assert np.array_equal(mesh.passive, np.linalg.norm(mesh.centroid, axis=1) < 0.0129)
-    assert COMM.allreduce(int(mesh.passive.sum())) >= 10
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import pytest
 from bodies import assert_close
 from mpi4py import MPI
 from runs import TWO_ARM, refusal
-from scipy.integrate import quad
 
 import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
@@ -25,7 +24,6 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 
 LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)
-DEGREES = {"quintic": 5, "septic": 7, "trapezoidal": 2, "s-curve": 3}  # of s between knots
 SMOOTH = {"quintic": 2, "septic": 3, "trapezoidal": 1, "s-curve": 2}  # continuous derivatives
 
 
@@ -162,27 +160,6 @@ def posed(**motion: Any) -> Scene:
     """Return the example with another motion."""
     data = load_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
     return scene_from_dict(data | {"motion": {"path": "arc"} | motion}, "test.toml")
-
-
-@EVERY
-def test_path_runs_by_the_law(name: str) -> None:
-    """Against an independent quadrature of its own acceleration, by SciPy, twice."""
-    of = posed(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=name, duration=1.2)
-    ends = [0.0, *(t for t in breakpoints(of) if 0.0 < t <= 1.2)]
-
-    def speed(t: float) -> float:
-        return float(desired_path(np.array([t]), of.motion).pd[0, 0])
-
-    for order, expected in ((1, 1.2), (2, 0.0)):
-        gained = 0.0
-        for a, b in pairwise(ends):
-            integrand = (
-                speed
-                if order == 1
-                else lambda t: float(desired_path(np.array([t]), of.motion).pdd[0, 0])
-            )
-            gained += quad(integrand, a, b, epsabs=1e-12)[0]
-        assert_close(gained, expected, 1e-11, 1.0)
 
 
 def test_duration_follows_from_the_limits() -> None:

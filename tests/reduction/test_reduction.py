@@ -224,33 +224,6 @@ def test_too_many_modes_are_an_error_that_says_so():
         lowest_eigenpairs(interior_pencil(arm), 5, None)
 
 
-# -- what it costs --------------------------------------------------------------------------------
-
-
-def test_what_it_costs():
-    """Three coordinates need no eigenproblem, Krylov vectors a solve each, resumed designs one."""
-    arm = make_arm(comm=COMM)
-    counts = arm.profile.counts
-    arm = with_densities(arm, graded(arm.mesh.centroid))
-
-    def spent(reduce, options):
-        before = counts.solves
-        reduce(arm, options)
-        assert (counts.assemblies, counts.factorisations) == (2, 1)
-        return counts.eigenproblems, counts.solves - before
-
-    assert spent(craig_bampton, Options(3)) == (0, 3)
-    assert spent(krylov, Options(3)) == (0, 0)  # the same vectors
-    assert spent(krylov, Options(8)) == (0, 5)
-    assert spent(krylov, Options(6, (25.0,)))[1] < 40  # measured: 30
-    assert spent(balanced, Options(8))[1] < 40  # measured: 27
-    assert spent(craig_bampton, Options(4))[0] == 1
-    assert spent(modal, Options(4))[0] == 2
-    arm = with_densities(arm, uniform(arm.mesh.centroid))
-    modal(arm, Options(1))
-    assert (counts.assemblies, counts.factorisations, counts.eigenproblems) == (4, 2, 3)
-
-
 # -- the search's start ---------------------------------------------------------------------------
 
 
@@ -559,11 +532,6 @@ def test_adjoint_of_modes_is_no_answer_where_a_product_is_no_number(iterative):
         broken[0] = after
         with pytest.raises(ConvergenceError, match="derivatives of mode 1 do not converge"):
             complement_solve(pencil, modes, values, right)
-
-
-# -- in motion ------------------------------------------------------------------------------------
-
-MOTION = ["arms.cells=[30,4]", "motion.duration=0.9", "motion.horizon=1.0"]
 
 
 # -- ranks ----------------------------------------------------------------------------------------
