@@ -25,7 +25,6 @@ from dolfinopt.reduction import (
     basis_errors,
     craig_bampton,
     krylov,
-    mac,
     modal,
 )
 from dolfinopt.reduction.eigenproblem import (
@@ -317,7 +316,7 @@ def stubby_arm():
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("design", [uniform, graded])
-@pytest.mark.parametrize("blocks", [1, 2, 3])
+@pytest.mark.parametrize("blocks", [1, 3])
 @pytest.mark.parametrize("places", [(0,), (1,), (0, 2)], ids=str)
 def test_moments_match_at_the_shifts(stubby_arm, design, blocks, places):
     """k complete blocks: B' (K - s M)^-1 B and its reduced twin differ by O((s - w^2)^(2 k)).
@@ -441,19 +440,6 @@ def test_more_coordinates_bring_the_full_arm(shared_arm):
     assert (missing["modal"][:, [0, 2]] > 1e-3).all()  # what truncation loses
     # Measured: 4e-4, 1e-4, 1e-6, 1e-9.
     assert (np.abs(missing["balanced"]).max(axis=1) < [1e-3, 1e-3, 1e-5, 1e-7]).all()
-
-
-def test_mac_tells_modes_apart(at):
-    shared_arm, own_arm = at(graded)
-    one, other = modal(shared_arm, Options(4)), craig_bampton(shared_arm, Options(5))
-    assert np.abs(mac(shared_arm, one.V, -3.0 * one.V) - np.eye(4)).max() < 1e-11
-    _, M = dense(own_arm)
-    v, w = (
-        rows(own_arm, modal(own_arm, Options(4))),
-        rows(own_arm, craig_bampton(own_arm, Options(5))),
-    )
-    lengths = np.outer(np.diag(v.T @ M @ v), np.diag(w.T @ M @ w))
-    assert mac(shared_arm, one.V, other.V) == pytest.approx((v.T @ M @ w) ** 2 / lengths, abs=1e-9)
 
 
 @pytest.mark.parametrize("method", sorted(SUBSPACES))

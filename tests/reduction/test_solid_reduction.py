@@ -99,34 +99,6 @@ def test_response_of_the_full_model(full, method):
     assert not basis.V[full.arm.inboard].any()
 
 
-def test_statics_are_exact(full):
-    """Six constraint modes give the interface's compliance, twelve Krylov vectors all statics."""
-    exact = full.response(0.0)
-    for method, count, inputs in (("craig-bampton", 6, 6), ("krylov", 6, 6), ("krylov", 12, 12)):
-        basis = METHODS[method].reduce(full.arm, Options(count), None)
-        found = _response(*reduced(full.arm, basis), 0.0)
-        part = slice(inputs), slice(inputs)
-        assert distance(found[part], exact[part]) < 1e-9, method
-
-
-def test_moments_of_krylov_subspaces(full):
-    """Twelve vectors match value and derivative by the square of the frequency, at any shift.
-
-    The derivative of B' (K - s M)^-1 B by s is B' (K - s M)^-1 M (K - s M)^-1 B.
-    """
-    for shift in (0.0, 40.0):
-        options = Options(12, shifts=(shift,))
-        K, M, inputs = reduced(full.arm, METHODS["krylov"].reduce(full.arm, options, None))
-        s = (2.0 * np.pi * shift) ** 2
-        exact, found = (
-            np.linalg.solve(K - s * M, inputs)
-            for K, M, inputs in ((full.K, full.M, full.inputs), (K, M, inputs))
-        )
-        for left, right in ((found.T @ inputs, exact.T @ full.inputs),
-                            (found.T @ M @ found, exact.T @ full.M @ exact)):  # fmt: skip
-            assert distance(left, right) < 1e-7, shift
-
-
 def test_automatic_order_in_space():
     """As few coordinates as a loose tolerance allows, but those of the interface."""
     changes = (
