@@ -22,13 +22,7 @@ from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output import checkpoint, design, run, summary, views
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
-from dolfinopt.parallel import (
-    RaisedElsewhere,
-    _pickled,
-    on_root,
-    partition_arms,
-    together,
-)
+from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, partition_arms, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene

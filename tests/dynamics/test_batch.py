@@ -9,9 +9,7 @@ import pytest
 from bodies import beam, random_cloud
 
 from dolfinopt.dynamics import batch, radau
-from dolfinopt.dynamics.collocation import (
-    Solution,
-)
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError

@@ -224,9 +224,7 @@ def fitted_order(
     exact = reference.sample(t, rate)
     errors = [
         relative_error(
-            problem.mechanism,
-            on_grid(even_steps(problem, count)).sample(t, rate) - exact,
-            exact,
+            problem.mechanism, on_grid(even_steps(problem, count)).sample(t, rate) - exact, exact
         )
         for count in counts
     ]

@@ -8,26 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from robots import (
-    DEMO,
-    DEMO_MOTION,
-    frames_of,
-    mechanism_of,
-    run_import,
-    tree_of,
-    write_uneven,
-)
+from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_of, write_uneven
 from runs import run
 
 from dolfinopt.arms.arm import build_arms, uniform_design
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
 from dolfinopt.exchange.urdf.read import read_robot
-from dolfinopt.exchange.urdf.robot import (
-    MASSLESS,
-    Robot,
-    default_tool,
-    scene_bodies,
-)
+from dolfinopt.exchange.urdf.robot import MASSLESS, Robot, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells

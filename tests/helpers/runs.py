@@ -90,9 +90,5 @@ def command(*words: object, ranks: int = 0) -> list[str]:
 def shell(*words: object, ranks: int = 0) -> subprocess.CompletedProcess:
     """Run dolfinopt in a process of its own, or under mpirun; return status and output."""
     return subprocess.run(
-        command(*words, ranks=ranks),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment(),
+        command(*words, ranks=ranks), capture_output=True, text=True, timeout=120, env=environment()
     )

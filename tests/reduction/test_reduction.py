@@ -18,15 +18,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.shape_integrals import shape_integrals
-from dolfinopt.reduction import (
-    Basis,
-    Options,
-    balanced,
-    basis_errors,
-    craig_bampton,
-    krylov,
-    modal,
-)
+from dolfinopt.reduction import Basis, Options, balanced, basis_errors, craig_bampton, krylov, modal
 from dolfinopt.reduction.eigenproblem import (
     Operators,
     Pencil,

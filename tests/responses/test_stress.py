@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from remainders import (
-    Built,
-    build,
-    uneven,
-    wave,
-)
+from remainders import Built, build, uneven, wave
 from runs import TWO_ARM
 
 import dolfinopt as do

@@ -48,12 +48,7 @@ USED = {
     "arms.mesh_size": ["arms.mesh=meshes/arm_bores.geo", "arms.passive=0.001"],
 }
 # Loads and weights have tests of their own; the smallest tolerances run for minutes.
-NO_LIMITS = {
-    "objective.loads",
-    "scenarios.weight",
-    "reduction.tolerance",
-    "simulation.tolerance",
-}
+NO_LIMITS = {"objective.loads", "scenarios.weight", "reduction.tolerance", "simulation.tolerance"}
 
 
 MACHINE_KEYS = ("control.", "closure.", "arms.joint", "arms.rotor", "arms.gear", "motion.speed")

@@ -608,8 +608,7 @@ def test_missing_key(table, key, described):
 
 
 @pytest.mark.parametrize(
-    ("table", "remedy"),
-    [("motion", "[motion] with path"), ("payload", "[payload] with mass")],
+    ("table", "remedy"), [("motion", "[motion] with path"), ("payload", "[payload] with mass")]
 )
 def test_motion_and_payload_are_stated(table, remedy):
     """Not even a scene without dynamic responses has them by default: every run simulates."""
