@@ -235,6 +235,10 @@ def test_round_trips_are_exact(tmp_path, nq, sigma, J):
     write_sid_npz(tmp_path / "a.sid.npz", data)
     assert bits(read_sid(tmp_path / "a.sid")) == bits(data)
     assert bits(read_sid_npz(tmp_path / "a.sid.npz")) == bits(data)
+    text = (tmp_path / "a.sid").read_text()
+    # For other programs: 17 digits, Fortran's exponent, the equals sign in column 49.
+    assert {line.index("=") for line in text.splitlines() if "=" in line} == {48}
+    assert re.search(r"^ +m0\( 1, 1\) +=  ?-?\d\.\d{16}D[+-]\d\d$", text, re.MULTILINE)
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
