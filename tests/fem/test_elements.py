@@ -164,22 +164,6 @@ def test_patch(shape, element):
 
 @pytest.mark.serial  # ranks: test_ranks, test_patch
 @pytest.mark.parametrize(
-    ("shape", "element"), [one for one in SHAPES if one[0] != "triangle"], ids=repr
-)
-def test_tension(shape, element):
-    """Uniaxial stress on distorted cells: the ends carry all of it."""
-    stretch = 1e-3
-    arm, size, thickness = distorted(shape, element)
-    field = (arm.points * (stretch * np.array([1.0, -NU, -NU])[: len(size)]))[:, :, None]
-    forces, outboard = arm.restrict(arm.stiffness_times(field))
-    pull = YOUNG * stretch * size[1:].prod() * thickness
-    assert np.abs(forces).max(initial=0.0) < ROUNDING * pull
-    assert outboard[0, 0] == pytest.approx(pull, rel=ROUNDING)
-    assert np.abs(outboard[1:]).max() < ROUNDING * pull
-
-
-@pytest.mark.serial  # ranks: test_ranks, test_patch
-@pytest.mark.parametrize(
     ("element", "exact"), zip(OF_QUADRILATERALS, [True, False, True, True]), ids=repr
 )
 def test_pure_bending_of_the_reduced_arm(element, exact):

@@ -300,15 +300,6 @@ def test_figures_are_written(tmp_path):
 # -- motion ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arms", [1, 2, 3])
-def test_chain_ends_at_the_end_effector(arms):
-    mechanism = manipulator(arms)[1]
-    random = np.random.default_rng(arms)
-    q_r, q_e = random.normal(size=(9, 1 + arms)), 0.2 * random.normal(size=(9, 2 * arms))
-    place = shapes.plane(shapes.chain(mechanism, q_r, q_e)[0])
-    np.testing.assert_allclose(place[:, -1], end_effector(mechanism, still(q_r), q_e), atol=1e-14)
-
-
 @pytest.mark.parametrize("magnification", [1.0, 20.0])
 def test_magnified_arms_join(magnification):
     views, mechanism = manipulator(3)
@@ -341,17 +332,6 @@ def test_film_runs_from_the_first_to_the_last_instant():
     chosen = animation.make_film(views, moving, None, 7).magnification
     assert chosen == animation.round_magnification(largest, sum(LENGTHS[:2]))
     assert len(animation.make_film(views, moving, 1.0, 1000).t) == len(moving.t)
-
-
-def test_bounds_hold_all_cells():
-    views, mechanism = manipulator(2)
-    views[0] = beam("plate", 1.0, 1.5, 20, 4)  # reaches far beyond joints and paths
-    drawn = animation.make_film(views, swinging(mechanism), 10.0, 9).motion
-    low, high = drawn.bounds()
-    cells = [drawn.cells(k, frame).reshape(-1, 2) for k in range(2) for frame in range(9)]
-    points = np.concatenate([*cells, drawn.base(0), drawn.base(8)])
-    np.testing.assert_allclose(low, points.min(axis=0))
-    np.testing.assert_allclose(high, points.max(axis=0))
 
 
 @pytest.mark.parametrize(("arms", "magnification"), [(1, 100.0), (3, 20000.0)])
