@@ -235,6 +235,11 @@ def test_connectivity() -> None:
         outcomes.add(found := arm.substructure.connectivity.floats(young[column, row]))
         assert found == (worst > 1e6)
     assert outcomes == {True, False}
+    # An island that is itself softer than the rest, in void of 1e-9: it hangs or not by its own.
+    for island, floating in ((0.1, True), (1e-4, False)):
+        young = np.where(np.arange(nx)[:, None] < 4, 1.0, np.full((nx, ny), 1e-9))
+        young[8:10, 2] = island
+        assert arm.substructure.connectivity.floats(70e9 * young[column, row]) == floating
 
 
 def test_designs_that_hang_together_cost_nothing_more() -> None:
@@ -441,17 +446,17 @@ def mass_matrix(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.
 
 
 def test_undamped_energy_does_not_drift() -> None:
-    """28 s after the motion the arms still vibrate with the energy they were left with."""
+    """13 s after the motion the arms still vibrate with the energy they were left with."""
     trajectory = moved(
         "damping.stiffness_proportional=0.0",
-        "motion.horizon=30.0",
+        "motion.horizon=15.0",
         "simulation.stages=5",
         "simulation.sample=0.01",
         cells=(12, 2),
     )
     K, solution = trajectory.mechanism.stiffness(), trajectory.solution
     energies = []
-    for t in np.linspace(2.0, 30.0, 57):
+    for t in np.linspace(2.0, 15.0, 27):
         at = np.array([t])
         q, qd = solution.sample(at)[0], solution.sample(at, 1)[0]
         M = mass_matrix(trajectory.mechanism, trajectory.problem.motion(at), q)

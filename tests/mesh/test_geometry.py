@@ -368,6 +368,7 @@ BOTH = 'Physical Surface("design") = {1}; Physical Surface("passive") = {1};'
         (PLAIN + ENDS + BOTH, {}, ["surface 1", '"design" and "passive"']),
         (PLAIN + ENDS, {"length": 0.6}, ["(0.5, 0) m", "(length, 0) = (0.6, 0) m"]),
         (PLAIN + ENDS, {"height": 0.1}, ["0.06 m high", "height = 0.1 m within 0.005 m"]),
+        (PLAIN + ENDS, {"height": 0.04}, ["0.06 m high", "height = 0.04 m within 0.002 m"]),
         (MILLIMETRES + ENDS, {}, ["(500, 0) m", "(length, 0) = (0.5, 0) m", "millimetres"]),
         (PLAIN + ENDS, {"mesh_size": 0.01}, ['no parameter "mesh size (m)"']),
         (PLAIN.replace("0.03, 0,", "0.03, 1,") + ENDS, {}, ["1 m off the plane z = 0"]),
@@ -592,6 +593,12 @@ def horseshoe(turn):
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=1), cells
 
 
+def spiral():
+    """Return a strip whose end crosses its beginning, though no cell's centre lies in another."""
+    points, cells = horseshoe(1.005)
+    return points * (1.0 + 0.1 * (np.arange(len(points)) % 41) / 40.0)[:, None], cells
+
+
 def check_cells(points, cells):
     checks._check_cells(FlatMesh(points, cells, cells[:1, :2], cells[:1, :2]))
 
@@ -627,7 +634,7 @@ def test_cells_side_by_side_are_accepted(made):
 
 
 @pytest.mark.parametrize(
-    "made", [fan(1.1), horseshoe(1.02), pushed(), mirrored(), doubled()], ids=range(5)
+    "made", [fan(1.1), horseshoe(1.02), spiral(), pushed(), mirrored(), doubled()], ids=range(6)
 )
 def test_overlapping_cells_are_refused(made):
     assert re.search(r"\d+ cells overlap .*\(", refusal(lambda: check_cells(*made)))
