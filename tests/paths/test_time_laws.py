@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,12 @@ import numpy as np
 import pytest
 from bodies import assert_close
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM, refusal
 
-import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.multibody.motion import breakpoints, desired_path, rigid_motion
 from dolfinopt.paths.time_laws import Law, Limits, law_for
-from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import evaluate_batch
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
@@ -264,13 +264,11 @@ def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:
     file.write_text("t,x,y\n0,-0.4,0.1\n0.5,0.3,0.2\n0.7,0.3,0.2\n1.3,0.5,0.6\n")
     motion = {"path": "points", "file": str(file), "law": "trapezoidal", "horizon": 1.5}
     of = posed(**motion)
-    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 2.0, 3.0)]
-    profile = Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, of.cell_counts)
-    arms = do.build_arms(of, partition, profile)
-    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    together = evaluate_batch(scenes, partition, arms, x, profile)
+    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 3.0)]
+    built = built_of(of, MPI.COMM_SELF)
+    x = built.uniform()
+    together = evaluate_batch(scenes, built.partition, built.arms, x, built.profile)
     for scene, both in zip(scenes, together, strict=True):
         assert isinstance(both, tuple)
-        alone = do.evaluate(scene, partition, arms, x, profile)[0]
+        alone = replace(built, scene=scene).evaluate(x)[0]
         assert_close(both[0].max_deviation, alone.max_deviation, 2e-4)

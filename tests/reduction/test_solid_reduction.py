@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 from mpi4py import MPI
+from remainders import built_of
 from runs import ROOT
 from solids import DENSITY, HEIGHT, LENGTH, POISSON, THICKNESS, YOUNG
 
 import dolfinopt as do
-from dolfinopt.arms.arm import uniform_design
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import box_arm
@@ -114,10 +114,8 @@ def test_automatic_order_in_space():
     for method, fewest in (("modal", 1), ("krylov", 6), ("craig-bampton", 6)):
         scene = do.load_scene(demo, (*changes, f"reduction.method={method}"))
         assert scene.reduction.fewest_of(scene.arms[1]) == fewest
-    profile = do.Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, profile)
-    design = uniform_design(scene, partition, arms, 0.5)
-    choice = do.choose_coordinates(scene, partition, arms, design, profile)
+    built = built_of(scene, MPI.COMM_SELF)
+    place = scene, built.partition, built.arms
+    choice = do.choose_coordinates(*place, built.uniform(), built.profile)
     assert choice is not None and choice.error < 0.5
     assert [count for count, _ in choice.tried] == [6]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from machines import GAINS, loop_tree
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
@@ -118,10 +119,8 @@ def test_a_number_of_a_machine_at_its_limit_runs_or_is_refused_in_one_line(key, 
     try:
         scene = scene_from_dict(tree_at(key, value))
         check_motion(scene)
-        partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), do.Profile()
-        arms = do.build_arms(scene, partition, profile)
-        x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-        evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
+        built = built_of(scene, MPI.COMM_SELF)
+        evaluation, trajectory = built.evaluate(built.uniform())
         assert np.isfinite(evaluation.objective)
         assert np.isfinite(trajectory.joint_forces).all()
     except (InputError, ConvergenceError) as error:
