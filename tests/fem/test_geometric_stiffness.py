@@ -410,38 +410,3 @@ def test_gradient(element, modal):
         left.append(abs(change - h * slope))
     rates = np.diff(np.log(left)) / np.diff(np.log(steps))
     assert (np.abs(rates - 2.0) < 0.1).all()  # the next term is a tenth of it at the first step
-
-
-@pytest.mark.serial  # ranks: test_ranks of test_elements
-def test_gradient_by_constraint_modes():
-    """The interface's loads by way of the constraint modes: as by solves of their own, and fewer.
-
-    d Psi and dS by central differences, the rest is the same Taylor test.
-    """
-    case = Case()
-
-    def static_modes(h):
-        design = case.at(h)[0].arm
-        modes = design.constraint_modes()
-        return modes.field.copy(), modes.stiffness.copy()
-
-    step = 1e-4
-    before, after = static_modes(-step), static_modes(step)
-    d_field, d_stiffness = ((b - a) / (2.0 * step) for a, b in zip(before, after, strict=True))
-    loads = case.at(0.0)[0]
-    V = loads.arm.constraint_modes().field
-    weights = np.cos(np.arange(63.0)).reshape(7, 3, 3)
-    weights /= np.abs(loads.geometric_stiffness(V)).max(axis=(1, 2), keepdims=True)
-
-    def slope(static):
-        before = loads.arm.profile.counts.solves
-        found = loads.gradient(V, weights, static=static)
-        solves = loads.arm.profile.counts.solves - before
-        owned = found.by_young @ case.d_young + found.by_density @ case.d_density
-        total = COMM.allreduce(owned + float(np.sum(found.by_modes * d_field)))
-        return total + float(np.sum(found.by_stiffness * d_stiffness)), solves
-
-    (expected, all_solves), (found, fewer) = slope(False), slope(True)
-    assert (all_solves, fewer) == (7, 4)
-    # The central differences: measured 1e-8 of the larger of the parts.
-    assert found == pytest.approx(expected, rel=1e-6)
