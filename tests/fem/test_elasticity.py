@@ -146,6 +146,7 @@ def test_designs_of_one_arm_do_not_disturb_each_other():
     plain.interior_mass()
     mine = young.copy()
     arm, expected = used.at(mine, density), make_arm(mesh).at(young, density)
+    assert used.at(young.copy(), density.copy()) is arm  # of the same materials: nothing is made
     mine *= 2.0  # the arm keeps its own copy
     # One operation after the other is the same on one rank; MUMPS may add in another order.
     for u, v in ((arm.solve(right), expected.solve(right)), (plain.solve(right), before)):
