@@ -120,6 +120,7 @@ def test_ways_of_a_cell_without_energy():
     assert values[:, 6].min() > 2e-3 * values[:, -1].max()
 
 
+@pytest.mark.serial  # ranks: tests/arms/test_solid_arm.py
 def test_compliance_of_a_beam():
     """Stretch, both bendings with shear, torsion; the clamp stiffens by about a height's length.
 
