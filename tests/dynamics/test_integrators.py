@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics import newton as factors
-from dolfinopt.dynamics import radau as march
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
     Solution,
@@ -46,6 +45,12 @@ ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
 
 # -- problems --------------------------------------------------------------------------------
+
+
+def still(t: np.ndarray) -> RigidMotion:
+    """Return no motion."""
+    rest = np.zeros((len(t), 3))
+    return RigidMotion(rest + HOMES[:3], rest, rest)
 
 
 def swing(t: np.ndarray) -> RigidMotion:
@@ -188,12 +193,7 @@ def test_step_response_of_an_oscillator(integrator: str, damping: float) -> None
 @BOTH
 def test_rest_under_gravity_is_static_equilibrium(integrator: str) -> None:
     """Starts where the potential is stationary, and stays there."""
-    still = RigidMotion(HOMES[None, :3], np.zeros((1, 3)), np.zeros((1, 3)))
-
-    def motion(t: np.ndarray) -> RigidMotion:
-        return RigidMotion(*(np.repeat(x, len(t), axis=0) for x in (still.q, still.qd, still.qdd)))
-
-    problem, chain = two_arms(motion, (0.0, 0.5), gravity=(1.0, -9.81), damping=0.0)
+    problem, chain = two_arms(still, (0.0, 0.5), gravity=(1.0, -9.81), damping=0.0)
     q = problem.initial_state()[0][0]
     unit = np.eye(6)
 
@@ -416,14 +416,14 @@ def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _ = two_arms(payload=2.0, bending=3.0)
     edges = even_steps(problem, 100)
     plain = radau.on_grid(problem, edges, 1e-8, 3)
-    windows, newton = [], march.newton
+    windows, newton = [], radau.newton
 
     def spy(stages, *arguments, **options):  # type: ignore[no-untyped-def]
         answer = newton(stages, *arguments, **options)
         windows.append((len(stages.h), answer.converged[0]))
         return answer
 
-    monkeypatch.setattr(march, "newton", spy)
+    monkeypatch.setattr(radau, "newton", spy)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, matrices=2))
     marched = radau.on_grid(problem, edges, 1e-8, 3)
     assert windows[0] == (100, False)
@@ -583,7 +583,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     monkeypatch: pytest.MonkeyPatch, on_grids, stages: int
 ) -> None:
     """Undamped vibrations that feed on themselves: two grids are enough to tell, and few sweeps."""
-    work, told, newton = [], [], march.newton
+    work, told, newton = [], [], radau.newton
     grids = on_grids(lambda number, true, grid: true())
 
     def seen_newton(stages, *others, **options):  # type: ignore[no-untyped-def]
@@ -591,7 +591,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
         work.append(found.iterations[0] * len(stages.h))
         return found
 
-    monkeypatch.setattr(march, "newton", seen_newton)
+    monkeypatch.setattr(radau, "newton", seen_newton)
     monkeypatch.setattr("dolfinopt.progress.SILENT", 0.0)
     monkeypatch.setattr("dolfinopt.progress.log.info", lambda *words: told.append(words))
     changes = ["arms.element=linear", "payload.mass=11.2", "motion.duration=0.87"]
@@ -600,7 +600,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     with pytest.raises(ConvergenceError, match=r"material\.young_modulus.*motion\.duration"):
         arms_of_a_scene(*changes, f"simulation.stages={stages}", cells=(40, 4))
     assert len(grids) <= 2
-    assert sum(work) <= march.SWEEPS * sum(grids) + march.LONGEST * march.MAX_ITERATIONS
+    assert sum(work) <= radau.SWEEPS * sum(grids) + radau.LONGEST * radau.MAX_ITERATIONS
     assert len(told) >= 2
 
 
@@ -631,12 +631,7 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
 @BOTH
 def test_nothing_moves_without_loads(integrator: str) -> None:
     """Zero, not a division by it."""
-
-    def motion(t: np.ndarray) -> RigidMotion:
-        rest = np.zeros((len(t), 3))
-        return RigidMotion(rest + HOMES[:3], rest, rest)
-
-    problem, _ = two_arms(motion, (0.0, 1.0))
+    problem, _ = two_arms(still, (0.0, 1.0))
     solution = solve(integrator, problem, 1e-4)
     assert solution.error == 0.0
     assert not solution.sample(np.linspace(0.0, 1.0, 11)).any()
@@ -682,11 +677,6 @@ def slow_up_to(monkeypatch: pytest.MonkeyPatch, limits: tuple[float, ...]) -> No
     """Treat coordinates densely up to these angles, tried in turn."""
     monkeypatch.setattr(factors, "LIMITS", limits)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, limits=limits))
-
-
-def dense(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Treat all coordinates as slow."""
-    slow_up_to(monkeypatch, (np.inf,))
 
 
 @pytest.fixture
@@ -758,7 +748,7 @@ def test_fast_coordinates_change_nothing(
     problem = fine_arms(5, 1, damping)
     edges = even_steps(problem, 60)
     found = radau.on_grid(problem, edges, tolerance, 3)
-    dense(monkeypatch)
+    slow_up_to(monkeypatch, (np.inf,))
     expected = radau.on_grid(problem, edges, tolerance, 3)
     # Newton's own goal is a millionth of the tolerance.
     assert distance(problem, found, expected) <= 3e-6 * tolerance + 1e-12
@@ -818,7 +808,7 @@ def test_dense_matrices_are_kept_small(
     problem = fine_arms(5, 1)
     edges = even_steps(problem, 60)
     t = np.linspace(0.0, 1.0, 21)
-    dense(monkeypatch)
+    slow_up_to(monkeypatch, (np.inf,))
     whole = radau.on_grid(problem, edges, 1e-8, 3)
     slopes = Adjoint(problem, whole).gradient(t, whole.sample(t))
     monkeypatch.setattr(factors, "MEMORY_BYTES", 1e6)
@@ -849,23 +839,11 @@ def test_adjoint_is_exact_with_fast_coordinates(
     found = Adjoint(problem, solution).gradient(t, by_q)
     assert min(size for _, size in matrices) < 16
     assert (max(size for _, size in matrices) == 16) == (limits[0] < 1.0)
-    dense(monkeypatch)
+    slow_up_to(monkeypatch, (np.inf,))
     for a, b in zip(found, Adjoint(problem, solution).gradient(t, by_q), strict=True):
         for name in ("C", "M", "G", "K", "outboard"):
             # Multipliers are corrected to 1e-8, largest component.
             assert_close(getattr(a, name), getattr(b, name), 1e-8)
-
-
-def test_adjoint_through_the_beginning() -> None:
-    """Of a motion that begins unloaded there is none; the vibrations are the simulation's."""
-    heavy = fine_arms(3, 1)
-    problem = replace(heavy, mechanism=replace(heavy.mechanism, gravity=(0.0, 0.0)))
-    by_q = np.ones(problem.num_coordinates)
-    assert problem.start_gradient(np.zeros_like(by_q), by_q) == []
-    q = heavy.initial_state()[0][0]
-    assert q.any()
-    assert heavy.start_gradient(q, by_q)[0].K.any()
-    assert problem.preconditioner() is problem.preconditioner()
 
 
 # -- warm start, counts, sampling ------------------------------------------------------------
