@@ -2,9 +2,8 @@
 
 Counters tell how often the costly things were done, see `profile.Counts`; those of an optimisation
 are its iterations'. What they cannot tell, imports and files, is looked at itself. That a part of
-the program does nothing twice is tested where that part is: stiffness, mass and factors in
-test_elasticity, bases in test_reduction, scenarios of one design in test_scenarios and test_cases,
-the exact gradient's factors in test_sensitivity, time steps that start warm in test_integrators and
+the program does nothing twice is tested where that part is: materials in test_elasticity, scenarios
+of one design in test_scenarios and test_cases, time steps that start warm in test_integrators and
 test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
 """
 
