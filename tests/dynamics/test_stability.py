@@ -323,6 +323,10 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
         np.testing.assert_allclose(values, exact[:modes], rtol=1e-7)
         gram = vectors.T @ dense(M) @ vectors
         np.testing.assert_allclose(gram, np.eye(modes), atol=1e-10)
+        # From modes of a nearby design, too, of which there may be as many or fewer.
+        for start in (vectors, vectors[:, :1], vectors[:, ::-1]):
+            warm, _ = lowest_eigenpairs(interior_pencil(elastic), modes, start)
+            np.testing.assert_allclose(warm, exact[:modes], rtol=1e-7)
 
 
 # -- motions ---------------------------------------------------------------------------------

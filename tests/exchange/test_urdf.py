@@ -14,7 +14,13 @@ from runs import run
 from dolfinopt.arms.arm import build_arms, uniform_design
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
 from dolfinopt.exchange.urdf.read import read_robot
-from dolfinopt.exchange.urdf.robot import MASSLESS, Robot, default_tool, scene_bodies
+from dolfinopt.exchange.urdf.robot import (
+    MASSLESS,
+    Robot,
+    default_tool,
+    roll_pitch_yaw_of,
+    scene_bodies,
+)
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
@@ -22,6 +28,7 @@ from dolfinopt.mesh.geometry import TENSOR
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.end_effector import end_effector
+from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -146,6 +153,17 @@ def test_drive_forces_against_pinocchio(imported):
             column = names.index(scene_names([joint.name])[joint.name])
             expected = forces[model.joints[index].idx_v]
             assert found[k, column] == pytest.approx(expected, abs=1e-10)
+
+
+def test_roll_pitch_yaw_comes_back():
+    rng = np.random.default_rng(4)
+    some = [exponential(rng.normal(scale=2.0, size=3)) for _ in range(20)]
+    quarter = 0.5 * np.pi
+    upright = [roll_pitch_yaw((a, p, b)) for a, b in rng.normal(size=(5, 2)) for p in
+               (quarter, -quarter, quarter - 1e-9, 1e-8 - quarter)]  # fmt: skip
+    for R in (*some, *upright):
+        R = some[0].T @ (some[0] @ R)  # to rounding, as products of poses are
+        assert np.abs(roll_pitch_yaw(roll_pitch_yaw_of(R)) - R).max() < 1e-14
 
 
 # -- solids ----------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from dolfinopt.reduction import Basis, Options, balanced, basis_errors, craig_ba
 from dolfinopt.reduction.eigenproblem import (
     Operators,
     Pencil,
+    _passes_over,
     complement_solve,
     interior_pencil,
     lowest_eigenpairs,
@@ -481,6 +482,15 @@ def test_vectors_that_are_nearly_dependent(shared_arm):
         with pytest.raises(ConvergenceError, match="ask for fewer"):
             ritz(arm, near)
     assert ritz(arm, V).V.shape == V.shape
+
+
+def test_modes_that_a_search_has_passed_over():
+    """Of two modes of one frequency a Krylov sequence finds the sum alone; nearby modes tell."""
+    K, unit = np.array([1.0, 1.0, 4.0, 9.0]), np.eye(4)
+    arm = SimpleNamespace(comm=MPI.COMM_SELF)
+    pencil = Pencil(arm, lambda v: v / K, lambda v: v.copy(), lambda: (None, None), None)
+    for found, over in (([0, 2], True), ([0, 1], False)):
+        assert _passes_over(pencil, (K[found], unit[:, found]), unit[:, :3]) == over
 
 
 @pytest.mark.serial
