@@ -20,16 +20,12 @@ from typing import NamedTuple
 
 import pytest
 from mpi4py import MPI
+from runs import tomllib
 
 import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.scene.load import describe_keys
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

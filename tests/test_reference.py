@@ -16,7 +16,6 @@ from dolfinopt.parallel import gather_arms, partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import load_cases
 from dolfinopt.responses.evaluation import evaluate, gradient
-from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
@@ -179,88 +178,3 @@ def test_slow_motion_against_geometrically_exact_beams():
     # Measured: 0.54 %; small deformations in a floating frame explain up to 0.6 %.
     error = np.hypot(*(run.deviation[samples] - reference).T)
     assert error.max() < 0.006 * largest
-
-
-# -- the gradient of the frozen problem by differences --------------------------------------------
-
-
-def frozen_problem(arm, displacements):
-    """Return the function x -> sum_j f_j' K(x)^-1 f_j with f_j = K u_j held at the present x.
-
-    Dense, over all nodes of an arm on one rank; the loads' own basis plays no part in it.
-
-    Args:
-        arm: reduced at the present design.
-        displacements: u_j, (n_nodes, 2, cases).
-    """
-    elastic, options = arm.elastic, arm.scene.interpolation
-    unit = np.eye(elastic.num_dofs)
-    T = elastic.expand(unit[:-3], unit[-3:]).reshape(-1, elastic.num_dofs)
-    dofs = (2 * elastic.operators.cells[:, :, None] + [0, 1]).reshape(arm.mesh.num_cells, -1)
-    on_cells = T[dofs]  # (cells, 8, dofs)
-
-    def stiffness(x):
-        young = options.floor + (1.0 - options.floor) * x**options.penalty
-        young *= arm.scene.material.young_modulus
-        parts = young[:, None, None] * elastic.operators.stiffness
-        return np.einsum("eia,eij,ejb->ab", on_cells, parts, on_cells, optimize=True)
-
-    below, outboard = elastic.restrict(elastic.stiffness_times(displacements))
-    loads = np.vstack([below, outboard])
-
-    def compliance(x):
-        return float(np.sum(loads * np.linalg.solve(stiffness(x), loads)))
-
-    return compliance
-
-
-def along(function, x, direction, step):
-    """Return the derivative along `direction` by central differences of fourth order."""
-    near = function(x + step * direction) - function(x - step * direction)
-    far = function(x + 2.0 * step * direction) - function(x - 2.0 * step * direction)
-    return (8.0 * near - far) / (12.0 * step)
-
-
-@pytest.mark.parametrize(
-    ("method", "q"), [("craig-bampton", 3), ("craig-bampton", 6), ("modal", 5)]
-)
-def test_esl_gradient_against_differences_of_the_frozen_problem(method, q):
-    """The simulation's own load cases, along random directions in the space of designs."""
-    run = simulate(
-        ["wave", "wave"],
-        f'reduction.method="{method}"',
-        f"reduction.coordinates={q}",
-        "arms.0.cells=[24, 3]",
-        "arms.1.cells=[24, 3]",
-        "objective.load_cases=10",
-    )
-    assert len(run.cases.indices) == 10
-    for k, slope in gradient(run.scene, run.partition, run.arms, run.trajectory, Profile()).items():
-        arm = run.arms[k]
-        x = wave(arm.mesh.centroid)
-        displacements = arm.basis.V @ run.q_e[k][run.cases.indices].T
-        compliance = frozen_problem(arm, displacements)
-        own = run.compliance[run.cases.indices, k].sum()
-        # Dense solves lose digits to the condition of K. Measured: 4e-11.
-        assert compliance(x) == pytest.approx(own, rel=1e-8)
-        rng = np.random.default_rng(k)
-        for _ in range(5):
-            direction = rng.uniform(-1.0, 1.0, len(x))
-            expected = along(compliance, x, direction, 2e-3)
-            # A random direction's terms cancel: against their size, not against the rest.
-            size = np.linalg.norm(slope * direction)
-            # Measured: 4e-8, the rounding of the dense solves over the step.
-            assert abs(slope @ direction - expected) < 1e-6 * size
-
-
-def test_esl_gradient_does_not_depend_on_how_many_cases_there_are():
-    """Energies of the moments' eigenvectors are those of the cases, one by one."""
-    run = simulate(["wave", "wave"], "arms.0.cells=[24, 3]", "arms.1.cells=[24, 3]")
-    for k, arm in run.arms.items():
-        q = run.q_e[k][run.cases.indices]
-        assert len(q) == 30 > q.shape[1]
-        whole = esl_gradient(arm.current, q.T @ q)
-        one_by_one = sum(esl_gradient(arm.current, np.outer(case, case)) for case in q)
-        assert (whole < 0.0).all()  # more material is always stiffer
-        # Directions of Q below 1e-14 of the largest are left out.
-        assert np.abs(whole - one_by_one).max() < 1e-11 * np.abs(whole).max()

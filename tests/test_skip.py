@@ -2,9 +2,8 @@
 
 Counters tell how often the costly things were done, see `profile.Counts`; those of an optimisation
 are its iterations'. What they cannot tell, imports and files, is looked at itself. That a part of
-the program does nothing twice is tested where that part is: stiffness, mass and factors in
-test_elasticity, bases in test_reduction, scenarios of one design in test_scenarios and test_cases,
-the exact gradient's factors in test_sensitivity, time steps that start warm in test_integrators and
+the program does nothing twice is tested where that part is: materials in test_elasticity, scenarios
+of one design in test_scenarios and test_cases, time steps that start warm in test_integrators and
 test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
 """
 
@@ -191,13 +190,6 @@ def test_a_simulation_needs_no_gradient(run: Run) -> None:
     found = counts(run("simulate", EXACT))
     assert found["adjoints"] == found["energy_fields"] == 0
     assert found["factorisations"] == ARMS and found["simulations"] == 1
-
-
-@pytest.mark.parametrize("overrides", [[SHARED], [RIGID]], ids=" ".join)
-def test_one_mesh_and_one_filter(overrides: list[str]) -> None:
-    """Mesh and filter belong to an `Arm`, of which there is one."""
-    built = build(*overrides)
-    assert WORLD.allreduce(len(built.arms)) == 1
 
 
 @pytest.mark.parametrize("kind", ["static", "eigenfrequency"])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
@@ -98,9 +99,7 @@ def test_large_plane_arms_take_mumps(monkeypatch):
     for name, rows in (("petsc", np.inf), ("mumps", 100)):
         monkeypatch.setattr(interior, "MUMPS_ROWS", rows)
         scene = do.load_scene(TWO_ARM, ["arms.cells=[24,4]", "design.filter_radius=0"])
-        partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-        arms = do.build_arms(scene, partition, do.Profile())
-        x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-        found[name] = do.evaluate(scene, partition, arms, x, do.Profile())[0].objective
-        assert arms[0].substructure.interior.solver_name == name
+        built = built_of(scene, MPI.COMM_SELF)
+        found[name] = built.evaluate(built.uniform())[0].objective
+        assert built.arms[0].substructure.interior.solver_name == name
     assert found["mumps"] == pytest.approx(found["petsc"], rel=3e-10)

@@ -22,13 +22,7 @@ from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output import checkpoint, design, run, summary, views
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
-from dolfinopt.parallel import (
-    RaisedElsewhere,
-    _pickled,
-    on_root,
-    partition_arms,
-    together,
-)
+from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, partition_arms, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
@@ -40,6 +34,7 @@ from dolfinopt.study.uncertainty import sample_cases
 
 COMM = MPI.COMM_WORLD
 LONE = min(1, COMM.size - 1)  # the rank that fails; with two arms it has one of them
+ON_RANKS = pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
 COARSE = ("arms.cells=[12,3]", "design.filter_radius=0.2", "optimizer.max_iterations=2")
 
 
@@ -309,6 +304,7 @@ PLACES = [
 ]
 
 
+@ON_RANKS
 @pytest.mark.parametrize(
     ("prepare", "rank", "owner", "name", "more"),
     [(*place[:4], place[4:]) for place in PLACES],
@@ -353,6 +349,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 # -- arms that several ranks share -----------------------------------------------------------
 
 
+@ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
     [
@@ -383,6 +380,7 @@ def payloads(*overrides):
     return [Case(scene, "optimize", label=f"{k}") for k, scene in enumerate(scenes)]
 
 
+@ON_RANKS
 @pytest.mark.parametrize("name", ["_optimise", "_read"])
 def test_cases(name, monkeypatch, shared_tmp_path):
     """A rank that fails ends the others' work, too; what they have finished stays."""
@@ -394,10 +392,9 @@ def test_cases(name, monkeypatch, shared_tmp_path):
     assert not run_cases(payloads(), shared_tmp_path, COMM, shown=False).failures
 
 
+@ON_RANKS
 def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
     """An optimisation that would go on for long ends in the iteration in which it hears of it."""
-    if COMM.size == 1:
-        pytest.skip("needs two ranks")
     long = payloads("optimizer.max_iterations=100000", "optimizer.tolerance=1e-300")
     fail_on(monkeypatch, LONE, store, "_optimise")
     with pytest.raises(Unusual):
@@ -405,6 +402,7 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
     COMM.Barrier()
 
 
+@ON_RANKS
 def test_samples(monkeypatch, shared_tmp_path):
     scene = load_scene(paper_scene(), COARSE)
     samples = [(), *((f"payload.mass={mass}",) for mass in np.linspace(4.0, 6.0, 60))]
@@ -414,6 +412,7 @@ def test_samples(monkeypatch, shared_tmp_path):
     COMM.Barrier()
 
 
+@ON_RANKS
 def test_tables(monkeypatch, shared_tmp_path):
     scene = load_scene(paper_scene(), COARSE)
     fail_on(monkeypatch, LONE, study, "tabulated")

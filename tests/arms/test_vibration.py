@@ -426,6 +426,3 @@ def test_a_motor_at_the_elbow_lowers_the_frequency(key: str, mass: float, inerti
     expected = euler_values(RigidIntegrals(mass, 0j, inertia), 0.02, 1)[0]
     # Shear, the beam's own and that of its elements: measured 2.4e-4.
     assert found == pytest.approx(np.sqrt(expected) / (2.0 * np.pi), rel=5e-4)
-
-
-# -- gradients -------------------------------------------------------------------------------

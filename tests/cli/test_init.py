@@ -7,7 +7,7 @@ import sys
 
 import jsonschema
 import pytest
-from runs import ROOT, TWO_ARM, refusal, run, shell
+from runs import ROOT, TWO_ARM, refusal, run, shell, tomllib
 
 import dolfinopt
 from dolfinopt.cli.main import TEMPLATES
@@ -16,11 +16,6 @@ from dolfinopt.dynamics.build import check_motion
 from dolfinopt.scene.load import describe_keys, load_scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.schema import scene_schema
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))

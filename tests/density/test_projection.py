@@ -93,22 +93,6 @@ def test_slope_is_the_derivative(beta, eta):
 
 
 @pytest.mark.serial
-def test_slopes_at_the_ends():
-    """From the closed form: beta (1 - tanh^2) / (tanh + tanh)."""
-    beta, eta = 5.0, 0.4
-    scale = beta / (np.tanh(beta * eta) + np.tanh(beta * (1.0 - eta)))
-    ends = project(np.array([0.0, 1.0]), beta, eta).slope
-    expected = scale / np.cosh(beta * np.array([eta, 1.0 - eta])) ** 2
-    assert ends == pytest.approx(expected, rel=1e-14)
-
-
-@pytest.mark.serial
-def test_backward_at_a_fixed_threshold():
-    y = project(X, 4.0, 0.5)
-    assert np.array_equal(y.backward(2.0 + X), (2.0 + X) * y.slope)
-
-
-@pytest.mark.serial
 def test_input_is_left_alone():
     x, area = cells()
     before = x.copy(), area.copy()
@@ -184,19 +168,6 @@ def test_crisp_designs_stay(value, beta):
     for crisp in (x, x[1:]):
         assert preserving_threshold(crisp, area[: len(crisp)], beta, SELF) == 0.5
         assert np.array_equal(kept(crisp, area[: len(crisp)], beta, SELF), crisp)
-
-
-@pytest.mark.serial
-def test_grayness_falls_with_sharpness():
-    x, area = cells()
-
-    def grayness(beta):
-        y = kept(x, area, beta, SELF)
-        return 4.0 * area @ (y * (1.0 - y)) / area.sum()
-
-    values = [grayness(beta) for beta in (0.0, 2.0, 8.0, 32.0, 128.0, 512.0)]
-    assert (np.diff(values) < 0.0).all()
-    assert values[0] > 0.3 and values[-1] < 0.02
 
 
 @pytest.mark.serial

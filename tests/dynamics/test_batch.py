@@ -9,18 +9,8 @@ import pytest
 from bodies import beam, random_cloud
 
 from dolfinopt.dynamics import batch, radau
-from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.collocation import (
-    Solution,
-    even_steps,
-    radau_iia,
-    residual_at,
-    stages_of,
-    step_beginnings,
-    step_ends,
-)
-from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
-from dolfinopt.dynamics.newton import factorise, simplified_newton_matrix
+from dolfinopt.dynamics.collocation import Solution
+from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
@@ -150,60 +140,6 @@ def test_related_bodies():
     assert stiffer is None and rigid is None
 
 
-# -- Newton's matrix -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("stages", [1, 2, 3, 4])
-def test_held_matrix_is_exact_where_the_tangent_rests(stages):
-    """At rest and without motion, stage by stage the same tangent: both matrices are one."""
-    moving = two_arms()
-    resting = replace(moving, motion=lambda t: moving.motion(np.zeros_like(t)))
-    modes, method = modes_of(resting), radau_iia(stages)
-    own = stages_of(modes, method, even_steps(resting, 12))
-    count = len(own.h)
-    slow = np.arange(6)
-    zero = np.zeros((count, stages, 6))
-    exact = factorise(own, zero, zero, zero, slow)
-    flat = np.zeros((count, 6))
-    found = simplified_newton_matrix(own, (flat, flat), zero, slow)
-    rows = np.random.default_rng(1).normal(size=zero.shape)
-    for mine, theirs in zip(
-        found.solve(rows, np.zeros((2, 6))), exact.solve(rows, np.zeros((2, 6))), strict=True
-    ):
-        np.testing.assert_allclose(mine, theirs, atol=1e-8 * np.abs(theirs).max())
-
-
-def test_runs_begin_anew():
-    """Steps of two runs: each is solved as by itself."""
-    problem = two_arms()
-    modes, method = modes_of(problem), radau_iia(3)
-    own = stages_of(modes, method, even_steps(problem, 20))
-    twice = replace(
-        own,
-        h=np.tile(own.h, 2),
-        instants=own.instants[np.tile(np.arange(len(own.instants)), 2)],
-        middle=own.middle[np.tile(np.arange(len(own.middle)), 2)],
-        runs=2,
-    )
-    rng = np.random.default_rng(2)
-    a = rng.normal(size=(len(twice.h), 3, 6))
-    state = rng.normal(size=(2, 2, 6))
-    half = len(own.h)
-    q, qd = step_beginnings(twice, (state[0], state[1]), a)
-    zero = np.zeros_like(a)
-    slow = np.array([2, 5])
-    rows = residual_at(twice, zero, zero, a)
-    both = factorise(twice, zero, zero, zero, slow).solve(rows, np.zeros((2, 6)))
-    for k, part in enumerate((slice(0, half), slice(half, None))):
-        alone = step_ends(own, (state[0][k], state[1][k]), a[part])
-        np.testing.assert_allclose(q[part], alone[0][:-1], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(qd[part], alone[1][:-1], rtol=1e-12, atol=1e-12)
-        one = factorise(own, zero[part], zero[part], zero[part], slow)
-        single = one.solve(rows[part], np.zeros((2, 6)))
-        for mine, theirs in zip(both, single, strict=True):
-            np.testing.assert_allclose(mine[part], theirs, atol=1e-9 * np.abs(theirs).max())
-
-
 # -- the whole -------------------------------------------------------------------------------
 
 
@@ -298,22 +234,6 @@ def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
     found, _ = solve(problems)
     assert alone == [problems[2]]
     assert all(one.error <= TOLERANCE for one in found)
-
-
-def test_adjoint_of_a_solution_from_the_batch():
-    """Slopes through a solution of the batch are those through the same one found alone."""
-    problems = [two_arms(), two_arms(payload=1.5)]
-    found = batch.integrate(problems, TOLERANCE, 3, Profile(), [None] * 2, radau.GOAL)
-    problem, one = problems[1], found[1]
-    same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
-    t = np.linspace(0.1, 1.0, 7)
-    by_q = np.random.default_rng(4).normal(size=(7, 6))
-    here, there = (Adjoint(problem, x).gradient(t, by_q) for x in (one, same))
-    for mine, theirs in zip(here, there, strict=True):
-        for name in ("K", "M", "C", "outboard"):
-            expected = getattr(theirs, name)
-            got = getattr(mine, name)
-            np.testing.assert_allclose(got, expected, atol=1e-7 * np.abs(expected).max())
 
 
 def test_bodies_without_coordinates(alone):

@@ -149,10 +149,9 @@ def test_stiff_springs_are_rigid_drives() -> None:
     assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
 
 
-@pytest.mark.parametrize("joints", [{}, SOFT, SOFT | ROTORS], ids=["rigid", "light", "rotors"])
-def test_generalised_alpha(joints: Tree) -> None:
+def test_generalised_alpha() -> None:
     """The conventional method finds the same motion, to the error it says it has."""
-    tree = small(joints, motion={"horizon": 1.0, "duration": 1.0}, payload={"mass": 2.0})
+    tree = small(SOFT | ROTORS, motion={"horizon": 1.0, "duration": 1.0}, payload={"mass": 2.0})
     options = {"integrator": "generalized-alpha", "tolerance": 3e-3}
     other, _ = machine(simulated(with_keys(tree, {"simulation": options})))
     trajectory, _ = machine(simulated(tree))

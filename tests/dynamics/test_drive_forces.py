@@ -110,28 +110,6 @@ def test_by_coordinates_and_rates(kind: str, count: int, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_tangent(kind: str, folder: Path) -> None:
-    """The derivative of the residual, along random directions of coordinates and of rates."""
-    system = moved(kind, folder).problem
-    t, rates, sizes = state(moved(kind, folder), 3)
-    instants, rng = system.at(t), np.random.default_rng(4)
-    matrix = instants.linearise(*rates).dense().reshape(3, len(sizes[0]), 3, -1)
-    for order, size in enumerate(sizes):
-        direction = 0.1 * size * rng.uniform(-1.0, 1.0, size=rates[order].shape)
-
-        def along(h: float, order: int = order, direction: np.ndarray = direction) -> np.ndarray:
-            return instants.residual(
-                *(x + h * direction * (k == order) for k, x in enumerate(rates))
-            )
-
-        found = np.einsum("nij,nj->ni", matrix[:, :, order], direction)
-        bound = np.einsum("nij,nj->ni", np.abs(matrix[:, :, order]), np.abs(direction))
-        # Rounding of residuals of a thousand newtons.
-        rounding = 1e-11 * np.abs(instants.residual(*rates)).max()
-        assert (np.abs(derivative(along, 0.05) - found) <= near(kind) * bound + rounding).all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_by_bodies(kind: str, folder: Path) -> None:
     """By every constant: inverse dynamics of prescribed drives, feed-forward, the loop's lever."""
     trajectory = moved(kind, folder)

@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics import newton as factors
-from dolfinopt.dynamics import radau as march
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
     Solution,
@@ -24,7 +23,6 @@ from dolfinopt.dynamics.collocation import (
     even_steps,
     residual_at,
     stages_of,
-    step_ends,
 )
 from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
 from dolfinopt.dynamics.newton import NewtonMatrix, factorise, simplified_newton_matrix
@@ -47,6 +45,12 @@ ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
 
 # -- problems --------------------------------------------------------------------------------
+
+
+def still(t: np.ndarray) -> RigidMotion:
+    """Return no motion."""
+    rest = np.zeros((len(t), 3))
+    return RigidMotion(rest + HOMES[:3], rest, rest)
 
 
 def swing(t: np.ndarray) -> RigidMotion:
@@ -127,35 +131,17 @@ def distance(problem: ElasticSystem, one: Solution, other: Solution, count: int 
 # -- coefficients ----------------------------------------------------------------------------
 
 
-def test_radau_coefficients() -> None:
-    """Of one, two and three stages: Hairer & Wanner (1996), tables IV.5.5 and IV.5.6."""
-    root = np.sqrt(6.0)
-    tables = {
-        1: ([1.0], [[1.0]]),
-        2: ([1 / 3, 1.0], [[5 / 12, -1 / 12], [3 / 4, 1 / 4]]),
-        3: (
-            [(4 - root) / 10, (4 + root) / 10, 1.0],
-            [
-                [(88 - 7 * root) / 360, (296 - 169 * root) / 1800, (-2 + 3 * root) / 225],
-                [(296 + 169 * root) / 1800, (88 + 7 * root) / 360, (-2 - 3 * root) / 225],
-                [(16 - root) / 36, (16 + root) / 36, 1 / 9],
-            ],
-        ),
-    }
-    for stages, (c, A) in tables.items():
-        method = radau.radau_iia(stages)
-        assert_close(method.c, c, 1e-14)
-        assert_close(method.A, A, 1e-14)
-        assert_close(method.A2, np.array(A) @ np.array(A), 1e-14)
-
-
-@pytest.mark.parametrize("stages", [2, 3, 4, 5])
-def test_radau_integrates_polynomials(stages: int) -> None:
-    """The last row is of order 2 s - 1: it integrates t^k exactly for k <= 2 s - 2."""
+@pytest.mark.parametrize("stages", [1, 2, 3, 4, 5])
+def test_radau_coefficients(stages: int) -> None:
+    """c_s = 1, B(2 s - 1) and C(s), which nothing else fulfils (Hairer & Wanner 1996, IV.5)."""
     method = radau.radau_iia(stages)
+    c, A = method.c, method.A
+    assert c[-1] == pytest.approx(1.0, abs=1e-14) and len(c) == stages
     for k in range(2 * stages - 1):
-        assert_close(method.A[-1] @ method.c**k, 1.0 / (k + 1), 1e-13)
-    assert abs(method.A[-1] @ method.c ** (2 * stages - 1) - 0.5 / stages) > 1e-6
+        assert_close(A[-1] @ c**k, 1.0 / (k + 1), 1e-13)
+    for k in range(stages):
+        assert_close(A @ c**k, c ** (k + 1) / (k + 1), 1e-13)
+    assert_close(method.A2, A @ A, 1e-14)
 
 
 @pytest.mark.parametrize("rho_inf", [0.0, 0.5, 0.8, 1.0])
@@ -207,12 +193,7 @@ def test_step_response_of_an_oscillator(integrator: str, damping: float) -> None
 @BOTH
 def test_rest_under_gravity_is_static_equilibrium(integrator: str) -> None:
     """Starts where the potential is stationary, and stays there."""
-    still = RigidMotion(HOMES[None, :3], np.zeros((1, 3)), np.zeros((1, 3)))
-
-    def motion(t: np.ndarray) -> RigidMotion:
-        return RigidMotion(*(np.repeat(x, len(t), axis=0) for x in (still.q, still.qd, still.qdd)))
-
-    problem, chain = two_arms(motion, (0.0, 0.5), gravity=(1.0, -9.81), damping=0.0)
+    problem, chain = two_arms(still, (0.0, 0.5), gravity=(1.0, -9.81), damping=0.0)
     q = problem.initial_state()[0][0]
     unit = np.eye(6)
 
@@ -243,9 +224,7 @@ def fitted_order(
     exact = reference.sample(t, rate)
     errors = [
         relative_error(
-            problem.mechanism,
-            on_grid(even_steps(problem, count)).sample(t, rate) - exact,
-            exact,
+            problem.mechanism, on_grid(even_steps(problem, count)).sample(t, rate) - exact, exact
         )
         for count in counts
     ]
@@ -270,8 +249,8 @@ def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
     [
         *(("smooth", *one) for one in ((1, (200, 800)), (2, (40, 160)), (3, (40, 160)))),
         ("smooth", 4, (20, 40)),
-        *(("trapezoidal", *one) for one in ((2, (40, 160)), (3, (40, 160)), (4, (40, 80)))),
-        *(("s-curve", *one) for one in ((2, (40, 160)), (3, (40, 160)), (4, (40, 80)))),
+        *(("trapezoidal", *one) for one in ((2, (40, 160)), (4, (40, 80)))),
+        ("s-curve", 3, (40, 160)),
     ],
 )
 def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None:
@@ -315,14 +294,11 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
         assert order == pytest.approx(2.0, abs=0.1)
 
 
-# -- energy ----------------------------------------------------------------------------------
-
-
 # -- error control ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
-@pytest.mark.parametrize("stages", [2, 3, 4])
+@pytest.mark.parametrize("stages", [2, 4])
 def test_radau_meets_the_tolerance(stages: int, damping: float) -> None:
     """The true error is below it, and the estimate is near the true error."""
     problem, _ = two_arms(damping=damping)
@@ -408,15 +384,6 @@ def test_agrees_with_scipy() -> None:
         assert relative_error(problem.mechanism, q - expected, expected) <= tolerance
 
 
-@pytest.mark.parametrize("arms", [1, 3])
-def test_integrators_agree_on_other_chains(arms: int) -> None:
-    """One arm and three."""
-    size = (0.2, 1.0, -0.8, 0.5)[: 1 + arms]
-    problem, _ = two_arms(lambda t: reach(t, size), arms=arms, damping=2e-3)
-    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 3e-3)
-    assert distance(problem, other, one) <= 3e-3 + 1e-5
-
-
 # -- robustness ------------------------------------------------------------------------------
 
 Answer = Callable[[int, Callable[[], Solution], np.ndarray], Solution]
@@ -449,14 +416,14 @@ def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, _ = two_arms(payload=2.0, bending=3.0)
     edges = even_steps(problem, 100)
     plain = radau.on_grid(problem, edges, 1e-8, 3)
-    windows, newton = [], march.newton
+    windows, newton = [], radau.newton
 
     def spy(stages, *arguments, **options):  # type: ignore[no-untyped-def]
         answer = newton(stages, *arguments, **options)
         windows.append((len(stages.h), answer.converged[0]))
         return answer
 
-    monkeypatch.setattr(march, "newton", spy)
+    monkeypatch.setattr(radau, "newton", spy)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, matrices=2))
     marched = radau.on_grid(problem, edges, 1e-8, 3)
     assert windows[0] == (100, False)
@@ -468,7 +435,9 @@ def test_windows_give_the_same_answer(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_large_deflections_are_solved_from_rest() -> None:
     """Arms that bend by half a radian: far from where Newton starts."""
     problem, _ = two_arms(payload=2.0, bending=1.0, axial=100.0, damping=0.0)
-    one, other = solve("radau", problem, 1e-5), solve("generalized-alpha", problem, 1e-2)
+    one, told = solve("radau", problem, 1e-5), Profile()
+    other = solve("generalized-alpha", problem, 1e-2, told)
+    assert told.counts.newton_iterations == other.iterations > len(other.a)
     turn = np.kron(np.eye(2), problem.mechanism.bodies[0].outboard[2])
     assert np.abs(one.q @ turn.T).max() > 0.5
     assert distance(problem, other, one) <= 1e-2
@@ -614,7 +583,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     monkeypatch: pytest.MonkeyPatch, on_grids, stages: int
 ) -> None:
     """Undamped vibrations that feed on themselves: two grids are enough to tell, and few sweeps."""
-    work, told, newton = [], [], march.newton
+    work, told, newton = [], [], radau.newton
     grids = on_grids(lambda number, true, grid: true())
 
     def seen_newton(stages, *others, **options):  # type: ignore[no-untyped-def]
@@ -622,7 +591,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
         work.append(found.iterations[0] * len(stages.h))
         return found
 
-    monkeypatch.setattr(march, "newton", seen_newton)
+    monkeypatch.setattr(radau, "newton", seen_newton)
     monkeypatch.setattr("dolfinopt.progress.SILENT", 0.0)
     monkeypatch.setattr("dolfinopt.progress.log.info", lambda *words: told.append(words))
     changes = ["arms.element=linear", "payload.mass=11.2", "motion.duration=0.87"]
@@ -631,7 +600,7 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     with pytest.raises(ConvergenceError, match=r"material\.young_modulus.*motion\.duration"):
         arms_of_a_scene(*changes, f"simulation.stages={stages}", cells=(40, 4))
     assert len(grids) <= 2
-    assert sum(work) <= march.SWEEPS * sum(grids) + march.LONGEST * march.MAX_ITERATIONS
+    assert sum(work) <= radau.SWEEPS * sum(grids) + radau.LONGEST * radau.MAX_ITERATIONS
     assert len(told) >= 2
 
 
@@ -662,12 +631,7 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
 @BOTH
 def test_nothing_moves_without_loads(integrator: str) -> None:
     """Zero, not a division by it."""
-
-    def motion(t: np.ndarray) -> RigidMotion:
-        rest = np.zeros((len(t), 3))
-        return RigidMotion(rest + HOMES[:3], rest, rest)
-
-    problem, _ = two_arms(motion, (0.0, 1.0))
+    problem, _ = two_arms(still, (0.0, 1.0))
     solution = solve(integrator, problem, 1e-4)
     assert solution.error == 0.0
     assert not solution.sample(np.linspace(0.0, 1.0, 11)).any()
@@ -709,21 +673,10 @@ def some_stages(problem: ElasticSystem, count: int = 5) -> Stages:
     return stages_of(modes_of(problem), radau.radau_iia(3), edges)
 
 
-def some_factors(stages: Stages, slow: np.ndarray) -> NewtonMatrix:
-    """Return Newton's matrix at a state of rest that is not an equilibrium."""
-    rest = np.zeros((len(stages.h), 3, stages.preconditioner.system.num_coordinates))
-    return factorise(stages, rest, rest, rest, slow)
-
-
 def slow_up_to(monkeypatch: pytest.MonkeyPatch, limits: tuple[float, ...]) -> None:
     """Treat coordinates densely up to these angles, tried in turn."""
     monkeypatch.setattr(factors, "LIMITS", limits)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, limits=limits))
-
-
-def dense(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Treat all coordinates as slow."""
-    slow_up_to(monkeypatch, (np.inf,))
 
 
 @pytest.fixture
@@ -766,17 +719,6 @@ def test_modes_are_a_change_of_coordinates() -> None:
     assert_close(modes.gradient_from_modes(found), rows, 1e-12)
 
 
-def test_frequencies_of_the_modes() -> None:
-    """One arm on its own: det(K - w^2 M) = 0, M with the payload by the work it does."""
-    arm = beam()
-    chain = Chain((arm,), 0.7, 0.02, (0.0, 0.0), 0.0)
-    modes = modes_of(ElasticSystem(chain.mechanism(), lambda t: reach(t, (0.2, 1.0)), ENDS))
-    payload = np.array([0.7, 0.7, 0.02])  # kg, kg, kg m2
-    M = arm.body().M + arm.outboard.T @ (payload[:, None] * arm.outboard)
-    squares = np.linalg.eigvals(np.linalg.solve(M, arm.K))
-    assert_close(np.sort(modes.frequencies[0]), np.sort(np.sqrt(squares.real)), 1e-12)
-
-
 def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
     """A step takes the rows' linear part away, and reports the change of q it makes."""
     problem, _ = two_arms()
@@ -797,43 +739,6 @@ def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
     assert_close(at_stages(stages, state, a + step)[0], at[0] + shift, 1e-12)
 
 
-def test_fast_coordinates_alone_are_oscillators() -> None:
-    """A chain of one arm, fast but for one: their rows' diagonal, step by step."""
-    arm = fine_beam(4, 2)
-    chain = Chain((arm,), 1.0, 0.0, (0.0, 0.0), 0.0)
-
-    def still(t: np.ndarray) -> RigidMotion:
-        rest = np.zeros((len(t), 2))
-        return RigidMotion(rest, rest, rest)
-
-    stages = some_stages(ElasticSystem(chain.mechanism(), still, ENDS))
-    rows = np.random.default_rng(5).normal(size=(5, 3, 6))
-    slow = np.array([5])
-    rows[:, :, slow] = 0.0  # and so they stay: nothing couples slow rows to fast columns
-    fast, _ = some_factors(stages, slow).solve(rows, np.zeros((2, 6)))
-    full, _ = some_factors(stages, np.arange(6)).solve(rows, np.zeros((2, 6)))
-    # At rest the arm's vibrations are not coupled: the diagonal is the whole matrix.
-    assert_close(fast, full, 1e-9)
-
-
-@pytest.mark.parametrize("slow", [[0, 3, 4, 9, 15], list(range(16))])
-def test_transposed_matrix(slow: list[int]) -> None:
-    """by_a . step + by_y . states = multipliers . rows for any rows and slopes."""
-    stages = some_stages(fine_arms())
-    rng = np.random.default_rng(6)
-    matrix = some_factors(stages, np.array(slow))
-    rows, by_a = rng.normal(size=(2, 5, 3, 16))
-    by_y, after = rng.normal(size=(5, 2, 16)), rng.normal(size=(2, 16))
-    zero = np.zeros((2, 16))
-    step, _ = matrix.solve(rows, zero)
-    q, qd = step_ends(stages, (zero[0], zero[1]), step)
-    states = np.stack([q, qd], axis=1)
-    expected = np.sum(by_a * step) + np.sum(by_y * states[:-1]) + np.sum(after * states[-1])
-    multipliers = matrix.solve_transposed(by_a, by_y, after)
-    # The terms cancel over stiffnesses that lie eight decades apart.
-    assert np.sum(multipliers * rows) == pytest.approx(expected, rel=1e-9)
-
-
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
 def test_fast_coordinates_change_nothing(
@@ -843,7 +748,7 @@ def test_fast_coordinates_change_nothing(
     problem = fine_arms(5, 1, damping)
     edges = even_steps(problem, 60)
     found = radau.on_grid(problem, edges, tolerance, 3)
-    dense(monkeypatch)
+    slow_up_to(monkeypatch, (np.inf,))
     expected = radau.on_grid(problem, edges, tolerance, 3)
     # Newton's own goal is a millionth of the tolerance.
     assert distance(problem, found, expected) <= 3e-6 * tolerance + 1e-12
@@ -851,9 +756,9 @@ def test_fast_coordinates_change_nothing(
     assert found.iterations <= expected.iterations + 10
 
 
-@pytest.mark.parametrize("bending", [10.0, 100.0, 1000.0])
+@pytest.mark.parametrize("bending", [10.0, 1000.0])
 @pytest.mark.parametrize("stages", [3, 4])
-@pytest.mark.parametrize("steps", [8, 12, 20])
+@pytest.mark.parametrize("steps", [8, 20])
 def test_estimate_of_vibrations_that_are_not_resolved(
     bending: float, stages: int, steps: int
 ) -> None:
@@ -903,7 +808,7 @@ def test_dense_matrices_are_kept_small(
     problem = fine_arms(5, 1)
     edges = even_steps(problem, 60)
     t = np.linspace(0.0, 1.0, 21)
-    dense(monkeypatch)
+    slow_up_to(monkeypatch, (np.inf,))
     whole = radau.on_grid(problem, edges, 1e-8, 3)
     slopes = Adjoint(problem, whole).gradient(t, whole.sample(t))
     monkeypatch.setattr(factors, "MEMORY_BYTES", 1e6)
@@ -934,23 +839,11 @@ def test_adjoint_is_exact_with_fast_coordinates(
     found = Adjoint(problem, solution).gradient(t, by_q)
     assert min(size for _, size in matrices) < 16
     assert (max(size for _, size in matrices) == 16) == (limits[0] < 1.0)
-    dense(monkeypatch)
+    slow_up_to(monkeypatch, (np.inf,))
     for a, b in zip(found, Adjoint(problem, solution).gradient(t, by_q), strict=True):
         for name in ("C", "M", "G", "K", "outboard"):
             # Multipliers are corrected to 1e-8, largest component.
             assert_close(getattr(a, name), getattr(b, name), 1e-8)
-
-
-def test_adjoint_through_the_beginning() -> None:
-    """Of a motion that begins unloaded there is none; the vibrations are the simulation's."""
-    heavy = fine_arms(3, 1)
-    problem = replace(heavy, mechanism=replace(heavy.mechanism, gravity=(0.0, 0.0)))
-    by_q = np.ones(problem.num_coordinates)
-    assert problem.start_gradient(np.zeros_like(by_q), by_q) == []
-    q = heavy.initial_state()[0][0]
-    assert q.any()
-    assert heavy.start_gradient(q, by_q)[0].K.any()
-    assert problem.preconditioner() is problem.preconditioner()
 
 
 # -- warm start, counts, sampling ------------------------------------------------------------
@@ -983,35 +876,6 @@ def test_start_of_other_stages_or_size_is_used_or_ignored() -> None:
     start = radau.integrate(single, 1e-5, 3, Profile())
     other = radau.integrate(problem, 1e-5, 3, Profile(), start)
     assert distance(problem, other, cold) <= 2e-5
-
-
-def test_generalized_alpha_counts_its_iterations() -> None:
-    """At least one a step and grid; the coarser grids count too."""
-    problem, _ = two_arms()
-    profile = Profile()
-    solution = generalized_alpha.integrate(problem, 1e-2, 0.8, profile)
-    assert profile.counts.newton_iterations == solution.iterations > len(solution.a)
-
-
-@BOTH
-def test_sample_is_one_motion(integrator: str) -> None:
-    """Continuous over the steps, with derivatives that are derivatives, and its own ends."""
-    problem, _ = two_arms()
-    solution = solve(integrator, problem, 1e-3)
-    assert_close(solution.sample(solution.time_grid[:-1]), solution.q, 1e-12)
-    assert_close(solution.sample(solution.time_grid[:-1], 1), solution.qd, 1e-12)
-    assert not solution.sample(np.zeros(1)).any()
-
-    h = np.diff(solution.time_grid)
-    inside = solution.time_grid[:-1] + 0.4 * h
-    step = 0.1 * h.min()  # three of them stay in the step: differences are exact up to degree 6
-    for order in (1, 2):
-        expected = solution.sample(inside, order)
-
-        def integral(t: float, below: int = order - 1) -> np.ndarray:
-            return solution.sample(inside + t, below)
-
-        assert_close(derivative(integral, step), expected, 1e-9)  # rounding over step
 
 
 def test_sample_of_known_polynomials() -> None:

@@ -19,8 +19,7 @@ from runs import overrides as options
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics import newton, radau
-from dolfinopt.dynamics import radau as march
+from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import Trajectory
@@ -235,6 +234,11 @@ def test_connectivity() -> None:
         outcomes.add(found := arm.substructure.connectivity.floats(young[column, row]))
         assert found == (worst > 1e6)
     assert outcomes == {True, False}
+    # An island that is itself softer than the rest, in void of 1e-9: it hangs or not by its own.
+    for island, floating in ((0.1, True), (1e-4, False)):
+        young = np.where(np.arange(nx)[:, None] < 4, 1.0, np.full((nx, ny), 1e-9))
+        young[8:10, 2] = island
+        assert arm.substructure.connectivity.floats(70e9 * young[column, row]) == floating
 
 
 def test_designs_that_hang_together_cost_nothing_more() -> None:
@@ -319,33 +323,10 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
         np.testing.assert_allclose(values, exact[:modes], rtol=1e-7)
         gram = vectors.T @ dense(M) @ vectors
         np.testing.assert_allclose(gram, np.eye(modes), atol=1e-10)
-
-
-def test_ordinary_modes_cost_what_they_did() -> None:
-    """Of a warm start one sweep of count + 4 solves, and three of the constraint modes."""
-    arm = one_arm(cells=(60, 6))
-    arm.reduce(arm.uniform(0.5))
-    before = arm.profile.counts.solves
-    arm.reduce(arm.uniform(0.5) + 0.01 * np.sin(30.0 * arm.mesh.centroid[:, 0]))
-    assert arm.profile.counts.solves - before <= 3 + 10
-    assert arm.profile.counts.eigenproblems == 2
-
-
-@pytest.mark.parametrize("method", ["craig-bampton", "modal", "krylov"])
-@pytest.mark.parametrize("field", [checkerboard, gap, solid])
-def test_a_hundred_coordinates(method: str, field: Field) -> None:
-    """Of checkerboards, too: orthonormal, and the tip as compliant as without reduction."""
-    arm = one_arm(f"reduction.method={method}", "reduction.coordinates=100", cells=(40, 4))
-    body = arm.reduce(field(0, *arm.mesh.centroid.T))
-    normal = slice(3, None) if method == "craig-bampton" else slice(None)
-    np.testing.assert_allclose(
-        body.M[normal, normal], np.eye(len(body.M[normal, normal])), atol=1e-10
-    )
-    if method != "modal":  # statically exact
-        tip = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
-        exact = np.linalg.inv(arm.elastic.constraint_modes().stiffness)
-        scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
-        np.testing.assert_allclose(tip / scale, exact / scale, atol=1e-6)
+        # From modes of a nearby design, too, of which there may be as many or fewer.
+        for start in (vectors, vectors[:, :1], vectors[:, ::-1]):
+            warm, _ = lowest_eigenpairs(interior_pencil(elastic), modes, start)
+            np.testing.assert_allclose(warm, exact[:modes], rtol=1e-7)
 
 
 # -- motions ---------------------------------------------------------------------------------
@@ -418,7 +399,7 @@ def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> N
         moved(*overrides)
     said = str(refusal.value)
     deflection = re.search(r"deflects by ([0-9.]+) % of its length: beyond 50 %", said)
-    assert deflection is not None and float(deflection[1]) > 100.0 * march.VALID
+    assert deflection is not None and float(deflection[1]) > 100.0 * radau.VALID
     assert "material.young_modulus" in said and "motion.duration" in said and "\n" not in said
 
 
@@ -468,17 +449,17 @@ def mass_matrix(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.
 
 
 def test_undamped_energy_does_not_drift() -> None:
-    """28 s after the motion the arms still vibrate with the energy they were left with."""
+    """13 s after the motion the arms still vibrate with the energy they were left with."""
     trajectory = moved(
         "damping.stiffness_proportional=0.0",
-        "motion.horizon=30.0",
+        "motion.horizon=15.0",
         "simulation.stages=5",
         "simulation.sample=0.01",
         cells=(12, 2),
     )
     K, solution = trajectory.mechanism.stiffness(), trajectory.solution
     energies = []
-    for t in np.linspace(2.0, 30.0, 57):
+    for t in np.linspace(2.0, 15.0, 27):
         at = np.array([t])
         q, qd = solution.sample(at)[0], solution.sample(at, 1)[0]
         M = mass_matrix(trajectory.mechanism, trajectory.problem.motion(at), q)
@@ -488,18 +469,6 @@ def test_undamped_energy_does_not_drift() -> None:
     largest = 0.5 * trajectory.compliance.sum(axis=1).max()
     assert np.ptp(energies) < 4e-4 * np.sqrt(largest * energies[0])
     assert energies[0] > 1e-6 * largest
-
-
-@pytest.mark.slow
-def test_tolerances() -> None:
-    """From 1e-2 to 1e-9, against a solution of 1e-11."""
-    overrides = ["simulation.stages=5", "motion.horizon=2.0", "simulation.sample=0.01"]
-    best = moved(*overrides, "simulation.tolerance=1e-11", field=wave)
-    for tolerance in (1e-2, 1e-4, 1e-6, 1e-9):
-        solution = radau.integrate(
-            best.problem, tolerance, 3 if tolerance > 1e-7 else 5, do.Profile()
-        )
-        assert distance(best, solution) < tolerance
 
 
 # -- what broke Newton -----------------------------------------------------------------------
@@ -535,24 +504,6 @@ def test_designs_of_modal_truncation_with_many_coordinates() -> None:
     for stages in (3, 4, 5):
         rough = radau.integrate(trajectory.problem, 1e-2, stages, do.Profile())
         assert distance(trajectory, rough) < 1e-2
-
-
-def test_newton_that_fails_over_the_horizon_marches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Deflections of 28 %: with Newton's method refused for more than 20 steps, the same motion."""
-    trajectory = moved("material.young_modulus=1.5e9", "motion.horizon=1.9")
-    assert len(trajectory.solution.time_grid) > 21
-    method, refused = newton.newton, []
-
-    def stubborn(stages, state, a, *others, **options):
-        if len(stages.h) > 20:
-            refused.append(len(stages.h))
-            return newton.Iterate(a, np.zeros(1, dtype=bool), np.zeros(1), np.ones(1, dtype=int))
-        return method(stages, state, a, *others, **options)
-
-    monkeypatch.setattr(march, "newton", stubborn)
-    again = radau.integrate(trajectory.problem, 1e-4, 5, do.Profile())
-    assert refused
-    assert distance(trajectory, again) < 2e-4
 
 
 # -- units -----------------------------------------------------------------------------------

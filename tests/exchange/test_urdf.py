@@ -8,15 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from robots import (
-    DEMO,
-    DEMO_MOTION,
-    frames_of,
-    mechanism_of,
-    run_import,
-    tree_of,
-    write_uneven,
-)
+from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_of, write_uneven
 from runs import run
 
 from dolfinopt.arms.arm import build_arms, uniform_design
@@ -170,6 +162,7 @@ def test_roll_pitch_yaw_comes_back():
     upright = [roll_pitch_yaw((a, p, b)) for a, b in rng.normal(size=(5, 2)) for p in
                (quarter, -quarter, quarter - 1e-9, 1e-8 - quarter)]  # fmt: skip
     for R in (*some, *upright):
+        R = some[0].T @ (some[0] @ R)  # to rounding, as products of poses are
         assert np.abs(roll_pitch_yaw(roll_pitch_yaw_of(R)) - R).max() < 1e-14
 
 
@@ -285,18 +278,6 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     assert found == pytest.approx(expected, rel=0.01)  # of the filter's ends
     fractions = [arm.volume_fraction(start[k]) for k, arm in arms.items()]
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
-
-
-@pytest.mark.parametrize("radius", [0.0331, 0.0575, 0.0704])
-def test_the_filter_is_wide_enough_for_the_cells(tmp_path, radius):
-    """What the command writes, the run does not warn of."""
-    text = DEMO.read_text().replace('cylinder radius="0.055"', f'cylinder radius="{radius}"')
-    assert text != DEMO.read_text()
-    (tmp_path / "robot.urdf").write_text(text)
-    run_import(tmp_path / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "a")
-    scene = load_scene(tmp_path / "a" / "robot.toml")
-    sizes = {k: scene.arms[k].cell_size for k in scene.designed}
-    assert None not in sizes.values() and filter_warnings(scene, sizes) == []
 
 
 # -- shapes ----------------------------------------------------------------------------------

@@ -123,6 +123,7 @@ def distorted(shape, element):
     return solids.elastic_link(name, mesh), size, 1.0
 
 
+@pytest.mark.serial  # ranks: test_ranks
 @pytest.mark.parametrize(("shape", "element"), SHAPES, ids=repr)
 def test_patch(shape, element):
     """Constant strain: exact energy and stress, and nodes inside in balance."""
@@ -162,23 +163,7 @@ def test_patch(shape, element):
         assert np.abs(forces.reshape(-1, d)[inner]).max(initial=0.0) < 1e-12 * force
 
 
-@pytest.mark.serial  # ranks: test_ranks, test_patch
-@pytest.mark.parametrize(
-    ("shape", "element"), [one for one in SHAPES if one[0] != "triangle"], ids=repr
-)
-def test_tension(shape, element):
-    """Uniaxial stress on distorted cells: the ends carry all of it."""
-    stretch = 1e-3
-    arm, size, thickness = distorted(shape, element)
-    field = (arm.points * (stretch * np.array([1.0, -NU, -NU])[: len(size)]))[:, :, None]
-    forces, outboard = arm.restrict(arm.stiffness_times(field))
-    pull = YOUNG * stretch * size[1:].prod() * thickness
-    assert np.abs(forces).max(initial=0.0) < ROUNDING * pull
-    assert outboard[0, 0] == pytest.approx(pull, rel=ROUNDING)
-    assert np.abs(outboard[1:]).max() < ROUNDING * pull
-
-
-@pytest.mark.serial  # ranks: test_ranks, test_patch
+@pytest.mark.serial  # ranks: test_ranks
 @pytest.mark.parametrize(
     ("element", "exact"), zip(OF_QUADRILATERALS, [True, False, True, True]), ids=repr
 )
@@ -201,7 +186,7 @@ def test_pure_bending_of_the_reduced_arm(element, exact):
     assert np.abs(found[:, :, 1:]).max(initial=0.0) < 1e-9 * HEIGHT / bending
 
 
-@pytest.mark.serial  # ranks: test_ranks, test_patch
+@pytest.mark.serial  # ranks: test_ranks
 def test_incompatible_modes_are_assumed_stresses_on_parallelograms():
     """Two elements of other variational principles are the same there, and stay close elsewhere."""
     nu = 0.33
@@ -221,7 +206,7 @@ def test_incompatible_modes_are_assumed_stresses_on_parallelograms():
         assert least * size <= apart <= most * size
 
 
-@pytest.mark.serial  # ranks: test_ranks, test_patch
+@pytest.mark.serial  # ranks: test_ranks
 @EVERY
 def test_energy_of_the_strain_operator(element):
     """u' k_e u = int (B u)' C B u t dA on parallelograms, also of what was condensed."""
@@ -255,7 +240,7 @@ def smooth(points, nu):
     return np.stack([u * S * C, v * S * C], axis=1), -YOUNG / (1 - nu**2) * np.stack(load, axis=1)
 
 
-@pytest.mark.serial  # ranks: test_ranks, test_patch
+@pytest.mark.serial  # ranks: test_ranks
 @pytest.mark.parametrize("distort", [False, True], ids=["rectangles", "distorted"])
 @pytest.mark.parametrize(("name", "order"), [("incompatible", 2), ("linear", 2), ("quadratic", 4)])
 def test_rates_of_convergence(name, order, distort):
@@ -303,7 +288,7 @@ def test_ranks(name, triangles):
 # -- by name --------------------------------------------------------------------------------------
 
 
-@pytest.mark.serial  # ranks: test_ranks, test_patch
+@pytest.mark.serial  # ranks: test_ranks
 def test_element_of_a_mesh():
     quadrilaterals, triangles = meshed((4, 2)), meshed((4, 2), triangles=True)
     for name, element in ELEMENTS.items():

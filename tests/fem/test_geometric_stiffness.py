@@ -100,7 +100,7 @@ def beam(request):
 # -- against beams ----------------------------------------------------------------------------
 
 
-@pytest.mark.serial  # ranks: test_ranks
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize(("speed", "first"), [(2.0, 4.1373), (12.0, 13.1702)])
 def test_rotating_beam(beam, speed, first):
     """Out-of-plane frequencies of a rotating beam without hub: Wright et al. (1982), table 1.
@@ -150,7 +150,7 @@ def test_lateral_buckling_of_a_strip(beam):
         assert bent[1] == pytest.approx(critical, rel=0.025)
 
 
-@pytest.mark.serial  # ranks: test_ranks
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize("dim", [2, 3])
 def test_pulled_beam(dim):
     """K0 of a unit pull in the interface's coordinates: the beam's geometric stiffness matrix.
@@ -183,7 +183,7 @@ def test_pulled_beam(dim):
     assert np.abs(K0[beam == 0.0]).max() < 1e-6 * np.abs(K0).max()
 
 
-@pytest.mark.serial  # ranks: test_ranks
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_pinned_column():
     """A column between pins buckles under pi^2 EI / L^2, in the frame that turns with its root.
 
@@ -384,7 +384,7 @@ def with_modes(loads, V):
     return loads.with_modes(V, loads.arm.mass_times(V))
 
 
-@pytest.mark.serial  # ranks: test_ranks
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize("modal", [False, True], ids=["frame", "modes"])
 @pytest.mark.parametrize("element", [*ELEMENTS])
 def test_gradient(element, modal):
@@ -410,48 +410,3 @@ def test_gradient(element, modal):
         left.append(abs(change - h * slope))
     rates = np.diff(np.log(left)) / np.diff(np.log(steps))
     assert (np.abs(rates - 2.0) < 0.1).all()  # the next term is a tenth of it at the first step
-
-
-@pytest.mark.serial  # ranks: test_ranks
-def test_gradient_by_constraint_modes():
-    """The interface's loads by way of the constraint modes: as by solves of their own, and fewer.
-
-    d Psi and dS by central differences, the rest is the same Taylor test.
-    """
-    case = Case()
-
-    def static_modes(h):
-        design = case.at(h)[0].arm
-        modes = design.constraint_modes()
-        return modes.field.copy(), modes.stiffness.copy()
-
-    step = 1e-4
-    before, after = static_modes(-step), static_modes(step)
-    d_field, d_stiffness = ((b - a) / (2.0 * step) for a, b in zip(before, after, strict=True))
-    loads = case.at(0.0)[0]
-    V = loads.arm.constraint_modes().field
-    weights = np.cos(np.arange(63.0)).reshape(7, 3, 3)
-    weights /= np.abs(loads.geometric_stiffness(V)).max(axis=(1, 2), keepdims=True)
-
-    def slope(static):
-        before = loads.arm.profile.counts.solves
-        found = loads.gradient(V, weights, static=static)
-        solves = loads.arm.profile.counts.solves - before
-        owned = found.by_young @ case.d_young + found.by_density @ case.d_density
-        total = COMM.allreduce(owned + float(np.sum(found.by_modes * d_field)))
-        return total + float(np.sum(found.by_stiffness * d_stiffness)), solves
-
-    (expected, all_solves), (found, fewer) = slope(False), slope(True)
-    assert (all_solves, fewer) == (7, 4)
-    # The central differences: measured 1e-8 of the larger of the parts.
-    assert found == pytest.approx(expected, rel=1e-6)
-
-
-def test_ranks():
-    """The same matrices on any number of ranks."""
-    loads, V = Case().at(0.0)
-    alone, own = Case(MPI.COMM_SELF).at(0.0)
-    expected = with_modes(alone, own).geometric_stiffness(own)
-    found = with_modes(loads, V).geometric_stiffness(V)
-    # Factorisations on different ranks round differently; contrast 1e4, measured 1e-12.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())

@@ -16,8 +16,6 @@ from dolfinopt.fem.elements import ELEMENTS, _condensed, _full, _recovery
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.profiling import Profile
 
-COMM = MPI.COMM_WORLD
-SIZE = LENGTH, HEIGHT, THICKNESS
 # CalculiX 2.20, 50 x 4 x 8 C3D20R, one face fully clamped, Hz: two bending planes in turn, then
 # the third mode over the thickness and torsion. Quadratic hexahedra graded to the clamp (48 x 8 x
 # 6, symmetry used) give 0.02 to 0.04 % less, and fall by 0.03 % on halved cells.
@@ -122,6 +120,7 @@ def test_ways_of_a_cell_without_energy():
     assert values[:, 6].min() > 2e-3 * values[:, -1].max()
 
 
+@pytest.mark.serial  # ranks: tests/arms/test_solid_arm.py
 def test_compliance_of_a_beam():
     """Stretch, both bendings with shear, torsion; the clamp stiffens by about a height's length.
 

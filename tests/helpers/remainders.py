@@ -53,6 +53,10 @@ class Built:
         """Return the product over all cells of all arms, on all ranks."""
         return float(sum_over_arms(self.partition, {k: np.array(a[k] @ b[k]) for k in self.arms}))
 
+    def uniform(self, density: float = 0.5) -> Cells:
+        """Return every arm's own uniform design."""
+        return {k: arm.uniform(density) for k, arm in self.arms.items()}
+
     def fields(self, function: Field) -> Cells:
         """Return function(arm, x, y) of the cells' centroids over the arm's length."""
         out = {}

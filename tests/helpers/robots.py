@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runs import ROOT, run
+from runs import ROOT, run, tomllib
 
 from dolfinopt.multibody.spatial.mechanism import (
     GROUND,
@@ -19,11 +18,6 @@ from dolfinopt.multibody.spatial.mechanism import (
     rigid_spatial_body,
 )
 from dolfinopt.scene.load import load_scene
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 DEMO = ROOT / "demos" / "robot.urdf"
 DEMO_MOTION = ROOT / "demos" / "robot_motion.csv"

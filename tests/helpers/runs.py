@@ -20,6 +20,11 @@ from dolfinopt.cli.main import commands
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 
+if sys.version_info >= (3, 11):
+    import tomllib as tomllib  # for all tests
+else:
+    import tomli as tomllib  # noqa: F401
+
 ROOT = Path(__file__).parents[2]
 TWO_ARM = ROOT / "demos" / "two_arm.toml"
 # The tables that every scene states, for tests of one arm's mesh, filter or keys.
@@ -90,9 +95,5 @@ def command(*words: object, ranks: int = 0) -> list[str]:
 def shell(*words: object, ranks: int = 0) -> subprocess.CompletedProcess:
     """Run dolfinopt in a process of its own, or under mpirun; return status and output."""
     return subprocess.run(
-        command(*words, ranks=ranks),
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env=environment(),
+        command(*words, ranks=ranks), capture_output=True, text=True, timeout=120, env=environment()
     )

@@ -28,6 +28,7 @@ def solid_scene(
     coordinates: int = 6,
     stiffening: bool = False,
     filter_radius: float = 0.0,
+    shifts: tuple[float, ...] = (0.0,),
     **keys: Any,
 ) -> Scene:
     """Return a scene with this arm alone, whatever its motion would be."""
@@ -36,7 +37,7 @@ def solid_scene(
     arm = scene.arms[0].model_copy(update=size | {"cells": cells, "passive": 0.02} | keys)
     told = {
         "arms": (arm,),
-        "reduction": {"method": method, "coordinates": coordinates},
+        "reduction": {"method": method, "coordinates": coordinates, "shifts": shifts},
         "simulation": {"stiffening": stiffening},
         "design": {"filter_radius": filter_radius},
     }

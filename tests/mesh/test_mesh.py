@@ -86,7 +86,7 @@ def test_interfaces_are_the_short_sides(shaped):
 
 
 # A cell is passive when its centre is nearer to an end than `passive`; on the border it is not.
-@pytest.mark.serial  # ranks: test_ranks_that_share_an_arm_with_bores_agree
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize(
     ("along", "passive", "columns"),
     [
@@ -231,7 +231,7 @@ def solid(size, shape, comm=COMM):
     return np.sqrt(squares.min()) / (2.0 * np.pi), flexibility, body
 
 
-@pytest.mark.serial  # ranks: test_ranks_that_share_an_arm_with_bores_agree
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 def test_arm_with_bores_converges_to_the_same_frequency():
     """Triangles and quadrilaterals, clamped at one bore and rigid at the other: order 2."""
     limits = []
@@ -244,7 +244,7 @@ def test_arm_with_bores_converges_to_the_same_frequency():
     assert limits[0] == pytest.approx(limits[1], rel=1e-3)
 
 
-@pytest.mark.serial  # ranks: test_ranks_that_share_an_arm_with_bores_agree
+@pytest.mark.serial  # ranks: test_ranks of test_elements
 @pytest.mark.parametrize("shape", SHAPED)
 def test_arm_with_bores_is_a_beam_between_them(shape):
     """u_x, u_y and theta of the outboard bore about its centre; pulling does not bend."""
@@ -261,15 +261,6 @@ def test_arm_with_bores_is_a_beam_between_them(shape):
     scale = np.sqrt(np.outer(np.diag(flexibility), np.diag(flexibility)))
     assert np.abs((flexibility / scale)[0, 1:]).max() < 1e-7  # mirror images to 1e-9 of the curves
     assert np.array_equal(body.outboard_point, [0.5, 0.0])
-
-
-@pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
-@pytest.mark.parametrize("shape", SHAPED)
-def test_ranks_that_share_an_arm_with_bores_agree(shape):
-    shared, flexibility, _ = solid(0.01, shape)
-    alone, other, _ = solid(0.01, shape, MPI.COMM_SELF)
-    assert shared == pytest.approx(alone, rel=1e-9)
-    assert np.abs(flexibility - other).max() < 1e-9 * np.abs(other).max()
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,11 @@ def row(count: int = 3) -> tuple[np.ndarray, np.ndarray]:
     return points, np.arange(8) + 4 * np.arange(count)[:, None]
 
 
+# Three tetrahedra at one facet, the second one on its other side.
+FAN = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.1, 0.1, 1], [0.1, 0.1, -1], [0.3, 0.3, 1.0]])
+THREE = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])
+
+
 def changed(place: int, *value: float) -> np.ndarray:
     points = row()[0]
     points[place] = value
@@ -45,6 +50,7 @@ def test_sound_cells():
         (changed(5, 1.0, 0.0, 2.5), row()[1], ["1 cells", "folded", "(0.5, 0.5, "]),
         (row()[0], np.concatenate([row()[1], row()[1][:1]]), ["2 cells", "overlap"]),
         (row()[0], np.repeat(row()[1][:1], 3, axis=0), ["3 cells", "overlap"]),
+        (FAN, THREE, ["cells overlap"]),
         (changed(7, 0.2, 0.2, 0.2)[:8], FIVE, ["overlap", "inverted"]),
         (row()[0], row()[1][[0, 2]], ["2 separate parts"]),
     ],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from machines import controlled, loop
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
@@ -21,11 +22,11 @@ def left_by(scene, folder):
 
     Every array and column has its unit, and both files of the trajectory hold the same.
     """
-    partition, profile = do.partition_arms(WORLD, scene.cell_counts), do.Profile()
-    arms = do.build_arms(scene, partition, profile)
-    x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-    evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
-    one = Simulated(scene, partition, arms, x, evaluation, trajectory, profile)
+    built = built_of(scene)
+    x = built.uniform()
+    evaluation, trajectory = built.evaluate(x)
+    place = scene, built.partition, built.arms
+    one = Simulated(*place, x, evaluation, trajectory, built.profile)
     write_simulation(folder, one, 0.0, paraview=False)
     with np.load(folder / "trajectory.npz") as data:
         arrays = {name: data[name] for name in data.files}

@@ -6,6 +6,7 @@ import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
@@ -32,13 +33,9 @@ def result():
 
 
 def simulated(result):
-    scene, profile = do.load_scene(TWO_ARM, SMALL), do.Profile()
-    evaluation, trajectory = do.evaluate(
-        scene, result.partition, result.arms, result.x_phys, profile
-    )
-    return Simulated(
-        scene, result.partition, result.arms, result.x_phys, evaluation, trajectory, profile
-    )
+    profile = do.Profile()
+    design = do.load_scene(TWO_ARM, SMALL), result.partition, result.arms, result.x_phys
+    return Simulated(*design, *do.evaluate(*design, profile), profile)
 
 
 @pytest.mark.parametrize("paraview", [True, False])
@@ -107,10 +104,8 @@ def test_views_of_arms_without_a_current_design(element):
 
     Nodes between corners are not drawn.
     """
-    scene = do.load_scene(TWO_ARM, [*SMALL, f"arms.element={element}"])
-    partition = do.partition_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, partition, do.Profile())
-    views = gather_views(scene, partition, arms, {k: arm.uniform(0.5) for k, arm in arms.items()})
+    built = built_of(do.load_scene(TWO_ARM, [*SMALL, f"arms.element={element}"]))
+    views = gather_views(built.scene, built.partition, built.arms, built.uniform())
     if WORLD.rank == 0:
         assert [view.name for view in views] == ["arm1", "arm2"]
         for view in views:

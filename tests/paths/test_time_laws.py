@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,12 @@ import numpy as np
 import pytest
 from bodies import assert_close
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM, refusal
-from scipy.integrate import quad
 
-import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.multibody.motion import breakpoints, desired_path, rigid_motion
 from dolfinopt.paths.time_laws import Law, Limits, law_for
-from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import evaluate_batch
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
@@ -25,7 +24,6 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 
 LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)
-DEGREES = {"quintic": 5, "septic": 7, "trapezoidal": 2, "s-curve": 3}  # of s between knots
 SMOOTH = {"quintic": 2, "septic": 3, "trapezoidal": 1, "s-curve": 2}  # continuous derivatives
 
 
@@ -164,27 +162,6 @@ def posed(**motion: Any) -> Scene:
     return scene_from_dict(data | {"motion": {"path": "arc"} | motion}, "test.toml")
 
 
-@EVERY
-def test_path_runs_by_the_law(name: str) -> None:
-    """Against an independent quadrature of its own acceleration, by SciPy, twice."""
-    of = posed(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=name, duration=1.2)
-    ends = [0.0, *(t for t in breakpoints(of) if 0.0 < t <= 1.2)]
-
-    def speed(t: float) -> float:
-        return float(desired_path(np.array([t]), of.motion).pd[0, 0])
-
-    for order, expected in ((1, 1.2), (2, 0.0)):
-        gained = 0.0
-        for a, b in pairwise(ends):
-            integrand = (
-                speed
-                if order == 1
-                else lambda t: float(desired_path(np.array([t]), of.motion).pdd[0, 0])
-            )
-            gained += quad(integrand, a, b, epsabs=1e-12)[0]
-        assert_close(gained, expected, 1e-11, 1.0)
-
-
 def test_duration_follows_from_the_limits() -> None:
     """Unless stated; values that follow stay free in changes, and a short one is refused."""
     limits = {"law": "trapezoidal", "max_speed": 2.0, "max_acceleration": 5.0}
@@ -287,13 +264,11 @@ def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:
     file.write_text("t,x,y\n0,-0.4,0.1\n0.5,0.3,0.2\n0.7,0.3,0.2\n1.3,0.5,0.6\n")
     motion = {"path": "points", "file": str(file), "law": "trapezoidal", "horizon": 1.5}
     of = posed(**motion)
-    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 2.0, 3.0)]
-    profile = Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, of.cell_counts)
-    arms = do.build_arms(of, partition, profile)
-    x = {k: np.full(arm.mesh.num_cells, 0.5) for k, arm in arms.items()}
-    together = evaluate_batch(scenes, partition, arms, x, profile)
+    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 3.0)]
+    built = built_of(of, MPI.COMM_SELF)
+    x = built.uniform()
+    together = evaluate_batch(scenes, built.partition, built.arms, x, built.profile)
     for scene, both in zip(scenes, together, strict=True):
         assert isinstance(both, tuple)
-        alone = do.evaluate(scene, partition, arms, x, profile)[0]
+        alone = replace(built, scene=scene).evaluate(x)[0]
         assert_close(both[0].max_deviation, alone.max_deviation, 2e-4)

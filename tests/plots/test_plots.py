@@ -12,7 +12,7 @@ import pytest
 from machines import GAINS, controlled, loop
 from mpi4py import MPI
 from PIL import Image
-from runs import ROOT, TWO_ARM
+from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.multibody.end_effector import end_effector
@@ -110,14 +110,6 @@ def shown(figure) -> np.ndarray:
 # -- numbers ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("value", "expected"), [(1.3, 1.0), (1.5, 2.0), (3.1, 2.0), (3.3, 5.0), (7.2, 10.0)]
-)
-@pytest.mark.parametrize("decade", [1e-3, 1e4])
-def test_round_number(value, expected, decade):
-    assert style.round_number(value * decade) == pytest.approx(expected * decade)
-
-
 def test_magnification_is_round_from_1_to_100_and_turns_ends_no_further_than_arms_do():
     for largest, expected in ((0.0556, 5.0), (0.00775, 20.0), (1.0, 1.0), (1e-6, 100.0), (0, 1.0)):
         assert animation.round_magnification(largest, 2.0) == expected
@@ -155,14 +147,6 @@ def test_areas_and_volume_fraction_of_any_polygons():
     corners = np.array([[[0, 0], [0, 1], [3, 1], [3, 0]], [[3, 0], [4, 0], [4, 1], [3, 1]]], float)
     view = ArmView("a", corners, corners.mean(axis=1), np.array([1.0, 0.2]), np.zeros((2, 4, 2, 0)))
     assert shapes.volume_fraction(view) == pytest.approx(0.8)  # the first one is clockwise
-
-
-def test_outline_is_what_one_cell_has_alone():
-    corners = beam("a", 2.0, 1.0, 5, 3).corners
-    ends = shapes.sides(corners)[shapes.boundary(corners)]
-    assert len(ends) == 2 * (5 + 3)
-    assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() == pytest.approx(6.0)
-    assert len(shapes.boundary(np.delete(corners, 7, axis=0))) == 2 * (5 + 3) + 4
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -327,28 +311,6 @@ def test_figures_are_written(tmp_path):
 # -- motion ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arms", [1, 2, 3])
-def test_chain_ends_at_the_end_effector(arms):
-    mechanism = manipulator(arms)[1]
-    random = np.random.default_rng(arms)
-    q_r, q_e = random.normal(size=(9, 1 + arms)), 0.2 * random.normal(size=(9, 2 * arms))
-    place = shapes.plane(shapes.chain(mechanism, q_r, q_e)[0])
-    np.testing.assert_allclose(place[:, -1], end_effector(mechanism, still(q_r), q_e), atol=1e-14)
-
-
-def test_undeformed_arms_lie_where_the_angles_say():
-    views, mechanism = manipulator(2)
-    q_r = np.array([[0.3, 0.5 * np.pi, -0.5 * np.pi]])
-    drawn = shapes.plane_motion(views, mechanism, None, q_r, np.zeros((1, 4)))
-    x, y = views[0].corners[..., 0], views[0].corners[..., 1]
-    upright = np.stack([0.3 - y, -0.5 + x], axis=-1)
-    np.testing.assert_allclose(drawn.cells(0, 0), upright, atol=1e-14)
-    level = np.add(views[1].corners, [0.3, 0.5])
-    np.testing.assert_allclose(drawn.cells(1, 0), level, atol=1e-14)
-    rim = shapes.sides(level)[shapes.boundary(level)]
-    np.testing.assert_allclose(drawn.outline(1, 0), rim, atol=1e-14)
-
-
 @pytest.mark.parametrize("magnification", [1.0, 20.0])
 def test_magnified_arms_join(magnification):
     views, mechanism = manipulator(3)
@@ -381,26 +343,6 @@ def test_film_runs_from_the_first_to_the_last_instant():
     chosen = animation.make_film(views, moving, None, 7).magnification
     assert chosen == animation.round_magnification(largest, sum(LENGTHS[:2]))
     assert len(animation.make_film(views, moving, 1.0, 1000).t) == len(moving.t)
-
-
-def test_bounds_hold_all_cells():
-    views, mechanism = manipulator(2)
-    views[0] = beam("plate", 1.0, 1.5, 20, 4)  # reaches far beyond joints and paths
-    drawn = animation.make_film(views, swinging(mechanism), 10.0, 9).motion
-    low, high = drawn.bounds()
-    cells = [drawn.cells(k, frame).reshape(-1, 2) for k in range(2) for frame in range(9)]
-    points = np.concatenate([*cells, drawn.base(0), drawn.base(8)])
-    np.testing.assert_allclose(low, points.min(axis=0))
-    np.testing.assert_allclose(high, points.max(axis=0))
-
-
-def test_common_colours_begin_with_the_most_frequent():
-    picture = np.full((20, 20, 3), 253, dtype=np.uint8)  # nearly white is white
-    picture[:3] = [0, 0, 0]
-    picture[5, :5] = [217, 95, 2]
-    white, black, orange = animation.common_colours(picture)[:3].astype(int)
-    assert (white == 255).all() and (black == 0).all()
-    assert np.abs(orange - [217, 95, 2]).max() <= 4
 
 
 @pytest.mark.parametrize(("arms", "magnification"), [(1, 100.0), (3, 20000.0)])
@@ -438,26 +380,7 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
     assert (pictures[3] != pictures[0]).any(axis=2).sum() > 1000
 
 
-def test_real_arms_join():
-    changes = ["arms.cells=[10,2]", "simulation.tolerance=0.1", "motion.horizon=1.9"]
-    result = do.Model(do.load_scene(TWO_ARM, changes)).simulate()
-    film = animation.make_film(result.views, result.trajectory, 2.0, 3)
-    for frame in range(3):
-        for k, view in enumerate(result.views):
-            tip = np.all(np.abs(view.corners - [1.0, 0.0]) < 1e-9, axis=-1)
-            place = shapes.plane(film.motion.place[frame, k + 1])
-            assert tip.any()
-            np.testing.assert_allclose(film.motion.cells(k, frame)[tip] - place, 0.0, atol=1e-9)
-
-
 # -- the machine -----------------------------------------------------------------------------
-
-
-def test_poses_are_evenly_spaced_along_the_path():
-    slow_then_fast = np.linspace(0.0, 1.0, 401) ** 3 * (1.0 + 1.0j)
-    at = machine.poses_along(slow_then_fast, 5)
-    np.testing.assert_allclose(np.abs(slow_then_fast[at]) / np.sqrt(2), np.arange(5) / 4, atol=0.01)
-    np.testing.assert_array_equal(machine.poses_along(np.ones(9, dtype=complex), 5), [0])
 
 
 @pytest.mark.parametrize("arms", [1, 3])

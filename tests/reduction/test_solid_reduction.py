@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy.linalg
 from mpi4py import MPI
+from remainders import built_of
 from runs import ROOT
 from solids import DENSITY, HEIGHT, LENGTH, POISSON, THICKNESS, YOUNG
 
 import dolfinopt as do
-from dolfinopt.arms.arm import uniform_design
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import box_arm
@@ -99,34 +99,6 @@ def test_response_of_the_full_model(full, method):
     assert not basis.V[full.arm.inboard].any()
 
 
-def test_statics_are_exact(full):
-    """Six constraint modes give the interface's compliance, twelve Krylov vectors all statics."""
-    exact = full.response(0.0)
-    for method, count, inputs in (("craig-bampton", 6, 6), ("krylov", 6, 6), ("krylov", 12, 12)):
-        basis = METHODS[method].reduce(full.arm, Options(count), None)
-        found = _response(*reduced(full.arm, basis), 0.0)
-        part = slice(inputs), slice(inputs)
-        assert distance(found[part], exact[part]) < 1e-9, method
-
-
-def test_moments_of_krylov_subspaces(full):
-    """Twelve vectors match value and derivative by the square of the frequency, at any shift.
-
-    The derivative of B' (K - s M)^-1 B by s is B' (K - s M)^-1 M (K - s M)^-1 B.
-    """
-    for shift in (0.0, 40.0):
-        options = Options(12, shifts=(shift,))
-        K, M, inputs = reduced(full.arm, METHODS["krylov"].reduce(full.arm, options, None))
-        s = (2.0 * np.pi * shift) ** 2
-        exact, found = (
-            np.linalg.solve(K - s * M, inputs)
-            for K, M, inputs in ((full.K, full.M, full.inputs), (K, M, inputs))
-        )
-        for left, right in ((found.T @ inputs, exact.T @ full.inputs),
-                            (found.T @ M @ found, exact.T @ full.M @ exact)):  # fmt: skip
-            assert distance(left, right) < 1e-7, shift
-
-
 def test_automatic_order_in_space():
     """As few coordinates as a loose tolerance allows, but those of the interface."""
     changes = (
@@ -142,10 +114,8 @@ def test_automatic_order_in_space():
     for method, fewest in (("modal", 1), ("krylov", 6), ("craig-bampton", 6)):
         scene = do.load_scene(demo, (*changes, f"reduction.method={method}"))
         assert scene.reduction.fewest_of(scene.arms[1]) == fewest
-    profile = do.Profile()
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, profile)
-    design = uniform_design(scene, partition, arms, 0.5)
-    choice = do.choose_coordinates(scene, partition, arms, design, profile)
+    built = built_of(scene, MPI.COMM_SELF)
+    place = scene, built.partition, built.arms
+    choice = do.choose_coordinates(*place, built.uniform(), built.profile)
     assert choice is not None and choice.error < 0.5
     assert [count for count, _ in choice.tried] == [6]

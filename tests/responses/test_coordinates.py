@@ -106,8 +106,7 @@ def padded_error(built: Built, x, few: int, many: int) -> float:
 @pytest.mark.slow
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
-    ("name", "overrides"),
-    [*((name, ()) for name in DESIGNS), ("uniform", SHAKEN)],
+    ("name", "overrides"), [*((name, ()) for name in DESIGNS), ("uniform", SHAKEN)]
 )
 def test_estimate_is_the_error(name, overrides):
     """Against twice as many coordinates as the estimate compares with, integrated more finely.

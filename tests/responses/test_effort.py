@@ -172,20 +172,6 @@ def test_a_limit_of_the_drives_is_met(limit: str) -> None:
     assert -5e-3 < max(one.excess for one in asked) <= 1e-3
 
 
-@pytest.mark.serial
-@pytest.mark.slow
-def test_least_effort_at_the_accuracy_of_least_compliance() -> None:
-    """Lighter arms do as well, and the drives feel it."""
-    changes = ["arms.cells=[24,3]", "payload.mass=0.5", "design.filter_radius=0.05"]
-    changes += ["simulation.tolerance=1e-3", "motion.horizon=2.2", "optimizer.max_iterations=15"]
-    stiff = do.optimize(scene(*changes, "constraints.effort=1e3"))
-    kept = f"constraints.deviation={stiff.evaluation.max_deviation}"
-    lazy = do.optimize(scene(*changes, EFFORT, kept))
-    assert not lazy.violated
-    before = stiff.evaluation.values_of("effort")[0]
-    assert lazy.evaluation.objective < 0.95 * before  # 0.912
-
-
 @pytest.mark.serial  # ranks have no part in it
 def test_effort_demo(shared_tmp_path: Path) -> None:
     """Runs, tables and draws on few cells."""

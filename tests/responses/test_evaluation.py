@@ -177,16 +177,6 @@ def test_own_material_scales_one_body() -> None:
     np.testing.assert_array_equal(other.K, body_of(index=0).K)
 
 
-def test_own_materials_of_all_arms_are_the_scenes() -> None:
-    """Stated arm by arm or once: the same bits."""
-    keys = {"density": 5400.0, "young_modulus": 200e9, "poisson_ratio": 0.2}
-    found = []
-    for table in ("arms", "material"):
-        built = build(*(f"{table}.{key}={value}" for key, value in keys.items()))
-        found.append(built.evaluate(built.fields(wave))[0])
-    assert found[0] == found[1]
-
-
 # -- frozen loads ----------------------------------------------------------------------------
 
 
@@ -352,24 +342,6 @@ def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None
             return beside_volume(built.evaluate({k: x[k] + h * d[k] for k in x})[0])[j]
 
         assert rates(value, built.dot(row, d), (1e-3, 2.5e-4)) == pytest.approx(2.0, abs=0.1)
-
-
-# -- what is left out ------------------------------------------------------------------------
-
-
-def test_a_moving_objective_always_moves() -> None:
-    built = build()
-    evaluation, _ = built.evaluate(built.fields(wave), simulated=False)
-    assert evaluation.objective == pytest.approx(evaluation.compliance, rel=1e-12)
-
-
-def test_loaded_frequencies_are_in_the_order_of_the_arms() -> None:
-    """The inboard arm carries more: slower. A rigid arm has none."""
-    built = build("objective.kind=eigenfrequency")
-    first, second = built.evaluate(built.fields(same))[0].loaded_frequencies
-    assert first < second
-    alone = build("objective.kind=eigenfrequency", "arms.arm1.rigid=true")
-    assert alone.evaluate(alone.fields(same))[0].loaded_frequencies == (second,)
 
 
 # -- what is refused, and what is shared -----------------------------------------------------

@@ -180,37 +180,6 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert rates(value, built.dot(row, d), (4e-2, 1e-2)) == pytest.approx(2.0, abs=0.2)
 
 
-@pytest.mark.slow
-@pytest.mark.serial
-def test_deviation_is_limited_and_compliance_minimised() -> None:
-    """Through the registry alone: the limit, tighter than the free design is, is met."""
-    options = [*QUICK, "objective.kind=compliance", "objective.gradient=exact"]
-    scene = do.load_scene(TWO_ARM, [*options, "optimizer.max_iterations=60"])
-    free, built = do.optimize(scene), build(*options)
-    measured = rebuilt(built, limited(built.scene, deviation=1.0)).evaluate(free.x_phys)[0]
-    limit = 0.99 * measured.values_of("deviation")[0]
-    kept = do.optimize(limited(scene, deviation=limit))
-    one = next(one for one in kept.limits if one.quantity == "deviation")
-    assert (one.arm, one.unit, one.met) == ("", "m", True)
-    assert kept.evaluation.objective > free.evaluation.objective
-
-
-@pytest.mark.serial
-def test_the_volume_is_minimised_under_a_limit() -> None:
-    """The volume is a response like the others: least material that is stiff enough."""
-    options = [*QUICK, "objective.kind=static", "optimizer.max_iterations=80"]
-    scene = do.load_scene(TWO_ARM, [*options, "design.volume_fraction=0.9", "design.initial=0.8"])
-    built = build(*QUICK)
-    full = built.fields(lambda k, x, y: np.ones(len(x)))
-    solid = rebuilt(built, limited(built.scene, tip_deflection=1.0)).evaluate(full)[0]
-    limit = 2.0 * max(solid.tip_deflections)
-    result = do.optimize(minimised(limited(scene, tip_deflection=limit), "volume_fraction"))
-    tips = [one for one in result.limits if one.quantity == "tip_deflection"]
-    assert all(one.met and one.value == pytest.approx(limit, rel=1e-3) for one in tips)
-    fractions = [one.value for one in result.limits if one.quantity == "volume_fraction"]
-    assert max(fractions) < 0.7  # a beam's stiffness grows faster than its material
-
-
 def test_needs_are_stated_by_the_responses() -> None:
     """What the scenes' words say of themselves; the work itself is counted in test_skip."""
     asked = {

@@ -80,10 +80,7 @@ def test_a_body_without_change_stays():
             assert np.array_equal(getattr(same, name), getattr(body, name))
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["esl", *(pytest.param(k, marks=pytest.mark.serial) for k in ("compliance", "deviation"))],
-)
+@pytest.mark.parametrize("kind", ["esl", pytest.param("deviation", marks=pytest.mark.serial)])
 def test_figures_are_those_of_the_scenes_alone(kind):
     """Each scenario is what its scene gives alone; the objective is their weighted sum."""
     changes = [PATH, (DAMPING,)]
@@ -108,12 +105,12 @@ def test_figures_are_those_of_the_scenes_alone(kind):
 def test_one_reduction_for_all_scenarios():
     """Factorisations, eigenproblems and solves do not depend on how many scenarios there are."""
     counts = []
-    for changes in ([], [PATH], [PATH, MATERIAL, (DAMPING,), ("payload.mass=4",)]):
+    for changes in ([], [PATH, MATERIAL, (DAMPING,), ("payload.mass=4",)]):
         built = build(*([scenarios(*changes)] if changes else []))
         built.evaluate(built.fields(wave))
         counted = built.profile.counts
         counts.append((counted.assemblies, counted.factorisations, counted.solves))
-    assert counts[0] == counts[1] == counts[2]
+    assert counts[0] == counts[1]
 
 
 @pytest.mark.serial  # ranks have no part in it

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bodies import CONSTANTS, Chain, assert_close, beam, change_of, changed, derivative
 from mpi4py import MPI
-from remainders import build, taylor, wave
+from remainders import taylor, wave
 from runs import TWO_ARM, demo, environment, overrides, refused, run, scene
 from scipy.optimize import brentq
 from spatial_beams import DURATION, quintic_motion, reference_chain
@@ -27,7 +27,6 @@ from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import scaled
 from dolfinopt.optimization.gradient_check import TaylorTest
-from dolfinopt.parallel import sum_over_arms
 from dolfinopt.reduction import METHODS, AdjointFields, Method
 
 WORLD = MPI.COMM_WORLD
@@ -250,22 +249,6 @@ def test_repeated_frequencies(apart: float) -> None:
 
 
 # -- cost and ranks --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", ["craig-bampton", "modal"])
-def test_exact_gradient_factorises_nothing(method: str) -> None:
-    """Beside the ESL one: a few more solves, with the factors at hand."""
-    counts = {}
-    for kind in ("esl", "exact"):
-        built = build(f"reduction.method={method}", f"objective.gradient={kind}", *QUICK)
-        slopes = built.gradient(built.evaluate(built.fields(wave))[1])
-        assert sum_over_arms(built.partition, {k: np.array(g @ g) for k, g in slopes.items()}) > 0.0
-        counts[kind] = built.profile.counts
-    solves = counts["exact"].solves - counts["esl"].solves
-    adjoint = {"solves": 0, "adjoints": 0, "energy_fields": 0}
-    assert replace(counts["exact"], **adjoint) == replace(counts["esl"], **adjoint)
-    # Three for the constraint modes; conjugate gradients take some ten for each normal mode.
-    assert 3 * len(built.arms) <= solves <= 200 * len(built.arms)
 
 
 # The command with even small arms cut in pieces where there are more ranks than arms.

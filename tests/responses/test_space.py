@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import built_of
 from runs import ROOT, overrides, run
 
 import dolfinopt as do
-from dolfinopt.arms.arm import uniform_design
 
 pytestmark = pytest.mark.serial
 DEMO = ROOT / "demos" / "spatial_arm.toml"
@@ -82,10 +82,7 @@ def test_no_geometric_stiffness_is_built_where_none_is_asked_for(monkeypatch, st
     unit_loads = design_state.unit_loads
     monkeypatch.setattr(design_state, "unit_loads", counted)
     scene = do.load_scene(DEMO, (*COARSE, f"simulation.stiffening={stiffening}"))
-    partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), do.Profile()
-    arms = do.build_arms(scene, partition, profile)
-    x_phys = uniform_design(scene, partition, arms, 0.5)
-    _, trajectory = do.evaluate(scene, partition, arms, x_phys, profile)
-    do.gradient(scene, partition, arms, trajectory, profile)
+    machine = built_of(scene, MPI.COMM_SELF)
+    machine.gradient(machine.evaluate(machine.uniform())[1])
     assert bool(built) == (stiffening == "auto")
-    assert (stiffening_of(arms).estimate is None) == (stiffening == "false")
+    assert (stiffening_of(machine.arms).estimate is None) == (stiffening == "false")

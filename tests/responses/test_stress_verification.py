@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mpi4py import MPI
+from remainders import built_of
 
-import dolfinopt as do
-from dolfinopt.arms.arm import Arm, build_arms
+from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.fem.stress import places_of, stress_operator
-from dolfinopt.parallel import partition_arms
-from dolfinopt.profiling import Profile
 from dolfinopt.responses.stress import arm_loads
 from dolfinopt.scene.load import scene_from_dict
 
@@ -39,11 +36,9 @@ def turned(arm: dict[str, Any], speed: float, duration: float, damping: float):
         "design": {"initial": 1.0, "volume_fraction": 1.0},
         "simulation": {"tolerance": 1e-6, "stiffening": True},
     })  # fmt: skip
-    partition, profile = partition_arms(MPI.COMM_WORLD, scene.cell_counts), Profile()
-    arms = build_arms(scene, partition, profile)
-    solid = {0: np.ones(arms[0].mesh.num_cells)}
-    _, trajectory = do.evaluate(scene, partition, arms, solid, profile)
-    return arms[0], trajectory
+    built = built_of(scene)
+    _, trajectory = built.evaluate({0: np.ones(built.arms[0].mesh.num_cells)})
+    return built.arms[0], trajectory
 
 
 def stress_at(arm: Arm, trajectory: Trajectory, points: np.ndarray, sample: int):

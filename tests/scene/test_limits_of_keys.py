@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from machines import GAINS, loop_tree
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
@@ -48,12 +49,7 @@ USED = {
     "arms.mesh_size": ["arms.mesh=meshes/arm_bores.geo", "arms.passive=0.001"],
 }
 # Loads and weights have tests of their own; the smallest tolerances run for minutes.
-NO_LIMITS = {
-    "objective.loads",
-    "scenarios.weight",
-    "reduction.tolerance",
-    "simulation.tolerance",
-}
+NO_LIMITS = {"objective.loads", "scenarios.weight", "reduction.tolerance", "simulation.tolerance"}
 
 
 MACHINE_KEYS = ("control.", "closure.", "arms.joint", "arms.rotor", "arms.gear", "motion.speed")
@@ -123,10 +119,8 @@ def test_a_number_of_a_machine_at_its_limit_runs_or_is_refused_in_one_line(key, 
     try:
         scene = scene_from_dict(tree_at(key, value))
         check_motion(scene)
-        partition, profile = do.partition_arms(MPI.COMM_SELF, scene.cell_counts), do.Profile()
-        arms = do.build_arms(scene, partition, profile)
-        x = {k: arm.uniform(0.5) for k, arm in arms.items()}
-        evaluation, trajectory = do.evaluate(scene, partition, arms, x, profile)
+        built = built_of(scene, MPI.COMM_SELF)
+        evaluation, trajectory = built.evaluate(built.uniform())
         assert np.isfinite(evaluation.objective)
         assert np.isfinite(trajectory.joint_forces).all()
     except (InputError, ConvergenceError) as error:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from machines import CRANK, ROD, controlled, loop
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM, refusal
 
-import dolfinopt as do
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
 from dolfinopt.scene.load import pose_scenarios
 
@@ -101,9 +101,8 @@ def test_a_table_of_forces_adds_to_the_drives_until_it_ends(tmp_path):
 
 
 def bodies_of(scene):
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, do.Profile())
-    return [arm.reduce(arm.uniform(0.5)) for arm in arms.values()]
+    built = built_of(scene, MPI.COMM_SELF)
+    return [arm.reduce(arm.uniform(0.5)) for arm in built.arms.values()]
 
 
 def test_scenarios_change_gains_and_closures():

@@ -1,20 +1,14 @@
 """Materials by name: in place of [material], in it, and of an arm; where they are listed."""
 
 import json
-import sys
 
 import pytest
-from runs import TWO_ARM, refusal, run
+from runs import TWO_ARM, refusal, run, tomllib
 
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.schema import scene_schema
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 pytestmark = pytest.mark.serial
 
