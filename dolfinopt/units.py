@@ -15,6 +15,8 @@ SUMMARY = {
     "designed_mass": "kg",
     "grayness": "-",
     "volume_fraction": "-",
+    "connected": "-",
+    "contacts": "-",
     "minimum_member_measured": "m",
     "minimum_gap_measured": "m",
     "first_frequency": "Hz",

@@ -14,6 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, stiffening_of
+from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.members import thinnest
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
@@ -45,8 +46,15 @@ if TYPE_CHECKING:
 # out. The rotation tells where soft material at the end gives way: arms fold there, undeflected.
 SMALL = 0.1
 SMALL_TURN = 0.2  # rad
+# Radius of the filter in cells, and erosion of the robust projection, from which on its designs had
+# no contacts that mattered (docs/pages/develop/decisions.md).
+LEAST_CELLS, EROSION = 1.5, 0.25
 # Radius of the filter in cells from which on no chains of cells that touch in corners remain.
 FILTER_CELLS = 2.0
+NO_JOINTS = (
+    "the design cut at a density of one half joins its interfaces by contacts alone: without them "
+    "there is nothing to simulate"
+)
 FALLS_APART = (
     "the motion of the design cut at a density of one half cannot be simulated: what is left is "
     "too weak; let the optimisation go on (optimizer.max_iterations) until the design is crisp"
@@ -102,6 +110,7 @@ class _Traits:
         volume_fraction, grayness: of the physical densities.
         cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3.
         notes: of the mesh.
+        contacts: how the design cut at one half hangs together.
         widths: of member and gap of the design cut at one half, m.
         frequency: first one of the arm by itself, Hz; None where it is not reduced.
         error: by how much that of the reduced model exceeds it, relative.
@@ -112,6 +121,7 @@ class _Traits:
     cell_size: float
     volume: float
     notes: tuple[str, ...]
+    contacts: Contacts
     widths: tuple[float | None, float | None] = (None, None)
     frequency: float | None = None
     error: float | None = None
@@ -152,6 +162,8 @@ def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]
     return {
         "grayness": float(np.average(grays, weights=volumes)),
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
+        "connected": max((one.contacts.pieces for one in traits.values()), default=0),
+        "contacts": {name: _contacts(one.contacts) for name, one in by_arm.items()},
         "minimum_member_measured": {name: one.widths[0] for name, one in by_arm.items()},
         "minimum_gap_measured": {name: one.widths[1] for name, one in by_arm.items()},
         "first_frequency": _first_frequencies(run, by_arm),
@@ -159,6 +171,18 @@ def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]
             name: one.error for name, one in by_arm.items() if one.error is not None
         },
         "loaded_frequency": dict(loaded),
+    }
+
+
+def _contacts(found: Contacts) -> dict[str, Any]:
+    """Return the entry of an arm's contacts."""
+    return {
+        "pieces": found.pieces,
+        "corners": found.corners,
+        "edges": found.edges,
+        "places": found.places.tolist(),
+        "left_out": found.left_out,
+        "remaining": found.remaining,
     }
 
 
@@ -190,7 +214,6 @@ def _of_responses(run: Simulated) -> dict[str, Any]:
 
 
 def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
-    sizes = {k: one.cell_size for k, one in traits.items()}
     return [
         *implausible(run.scene),
         *(note for one in traits.values() for note in one.notes),
@@ -198,12 +221,7 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
         *_limits_exceeded(run.trajectory),
-        *(filter_warnings(run.scene, sizes) if run.iterations else ()),
-        *(
-            [FALLS_APART]
-            if run.iterations and run.scene.design.projection and run.crisp is None
-            else ()
-        ),
+        *_contact_warnings(run, traits),
     ]
 
 
@@ -350,7 +368,46 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         scene.arms[index].cell_size or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
+        arm.contacts(x_phys > 0.5),
     )
+
+
+def _contact_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
+    """Return a sentence on every arm with contacts, and one where its crisp design falls apart."""
+    scene, found = run.scene, []
+    rated = run.iterations > 0 and bool(scene.design.projection)
+    for k, one in traits.items():
+        contacts, arm = one.contacts, scene.arms[k]
+        if not contacts.count:
+            continue
+        kinds = {"corner": contacts.corners, "edge": contacts.edges}
+        counts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in kinds.items() if n]
+        pieces = "1 piece" if contacts.pieces == 1 else f"{contacts.pieces} pieces"
+        place = ", ".join(f"{x:.4g}" for x in contacts.places[0])
+        text = (
+            f"arm {arm.name!r}: cells of the design cut at a density of one half meet in "
+            f"{' and '.join(counts)} alone, the worst at ({place}) m; by faces it is {pieces}: "
+            "such contacts are stiff in the model, and no joints in a workshop"
+        )
+        if rated and run.crisp is not None:
+            text += f"; crisp is without them and {100.0 * contacts.left_out:.2g} % of the solid"
+            if contacts.remaining:
+                text += f", but for {contacts.remaining} that cannot be opened without a cut"
+        found.append(f"{text}; {_against_contacts(scene, k, one.cell_size)}")
+    if rated and run.crisp is None:
+        joined = all(one.contacts.joins for one in traits.values())
+        found.append(FALLS_APART if joined else NO_JOINTS)
+    return found
+
+
+def _against_contacts(scene: Scene, index: int, size: float) -> str:
+    """Return what keeps contacts out of the next design of an arm."""
+    radius = scene.filter_radius(index)
+    wide = scene.design.projection == "robust" and scene.design.erosion >= EROSION
+    if wide or radius < LEAST_CELLS * size * (1.0 - 1e-9):
+        larger = max(radius + 0.5 * size, LEAST_CELLS * size)
+        return f"set design.filter_radius = {larger:.4g} or more, or use finer cells"
+    return f'set design.projection = "robust" and design.erosion = {EROSION:g}, or use finer cells'
 
 
 def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
