@@ -19,6 +19,7 @@ SUMMARY = {
     "contacts": "-",
     "minimum_member_measured": "m",
     "minimum_gap_measured": "m",
+    "too_narrow": "m",
     "first_frequency": "Hz",
     "first_frequency_error": "-",
     "loaded_frequency": "Hz",

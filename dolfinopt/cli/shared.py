@@ -238,7 +238,7 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         ending = f"{_counted(summary)} ({ending}), {_sought(summary)}"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
-        f"{_largest(summary)}, {_stress(summary)}{_contacts(summary)}"
+        f"{_largest(summary)}, {_stress(summary)}{_contacts(summary)}{_narrow(summary)}"
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
     )
@@ -296,6 +296,15 @@ def _contacts(summary: Mapping[str, Any]) -> str:
         return ""
     pieces, s = sum(one["pieces"] for one in found), "s" if count > 1 else ""
     return f"{pieces} pieces by faces and {count} contact{s} without one, "
+
+
+def _narrow(summary: Mapping[str, Any]) -> str:
+    """Return the widths that the design misses, and a comma; "" where it misses none."""
+    return "".join(
+        f"{one['what']} of {1e3 * one['width']:.3g} mm in {one['arm']} "
+        f"({1e3 * one['asked']:.4g} asked for), "
+        for one in summary["too_narrow"]
+    )
 
 
 def _minimised(summary: Mapping[str, Any]) -> str:

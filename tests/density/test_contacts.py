@@ -194,7 +194,8 @@ def test_contacts_are_told_and_robust_designs_have_none(projection, radius, tmp_
     (text,) = told
     x, y = own["places"][0]
     assert f"the worst at ({x:.4g}, {y:.4g}) m" in text and f"{own['corners']} corners" in text
-    assert f"design.filter_radius = {1.5 * CELL:.4g} or more" in text and text in printed.err
+    cure = f'"robust", design.erosion = 0.25 and design.filter_radius = {2.0 * CELL:.4g}'
+    assert cure in text and text in printed.err
     counted = f"{own['pieces']} pieces by faces and {own['corners']} contacts without one"
     assert counted in printed.out
     assert summary["crisp"]["objective"] > 0.0
