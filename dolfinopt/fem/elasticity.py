@@ -9,6 +9,7 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -31,6 +32,7 @@ from dolfinopt.fem.interface import (
     ConstraintModes,
     InterfaceTransformation,
     StaticFields,
+    joins,
     static_fields,
     static_modes,
 )
@@ -125,11 +127,19 @@ class Substructure:
     @cached_property
     def connectivity(self) -> Connectivity:
         """Which cells share a facet, and which lie at the interfaces."""
+        return Connectivity(*self._graph)
+
+    def joins(self, solid: np.ndarray) -> bool:
+        """Return whether the solid ones (n_cells,) of its cells join all interfaces."""
+        return joins(*self._graph, solid)
+
+    @property
+    def _graph(self) -> tuple[MPI.Comm, Any, np.ndarray, list[np.ndarray]]:
         operators, T = self.operators, self.T
         nodes = operators.cells
         if T.dim == 3:
             nodes = nodes[:, : compat.cell_corner_count(self.mesh.mesh)]
-        return Connectivity(T.comm, operators.space, nodes, [T.inboard, *T.ends])
+        return T.comm, operators.space, nodes, [T.inboard, *T.ends]
 
     @cached_property
     def _rigid_forces(self) -> tuple[np.ndarray, np.ndarray]:

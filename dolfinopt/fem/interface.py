@@ -552,3 +552,33 @@ class Connectivity:
                 return True
             level *= 0.1
         return False
+
+
+def joins(
+    comm: MPI.Comm,
+    space: Any,
+    cells: np.ndarray,
+    interfaces: list[np.ndarray],
+    solid: np.ndarray,
+) -> bool:
+    """Return whether solid cells that share nodes lead from the first interface to all others.
+
+    Collective on `comm`, the same on all ranks.
+
+    Args:
+        comm, space, cells, interfaces: as of `Connectivity`.
+        solid: (n_cells,) True for the owned cells that count.
+    """
+    number = space.dofmap.index_map.local_to_global
+    nodes = number(cells[solid].ravel().astype(np.int32)).reshape(-1, cells.shape[1])
+    nodes = np.concatenate(comm.allgather(nodes))
+    ends = [
+        np.concatenate(comm.allgather(number(np.flatnonzero(mask).astype(np.int32))))
+        for mask in interfaces
+    ]
+    first, second = np.repeat(nodes[:, 0], nodes.shape[1]), nodes.ravel()
+    size = space.dofmap.index_map.size_global
+    graph = sp.coo_matrix((np.ones(first.size), (first, second)), shape=(size, size))
+    _, group = connected_components(graph, directed=False)
+    at = [group[np.intersect1d(end, second)] for end in ends]
+    return all(np.intersect1d(at[0], other).size for other in at[1:])

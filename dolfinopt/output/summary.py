@@ -471,8 +471,8 @@ def _contact_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str
                 text += f", but for {contacts.remaining} that cannot be opened without a cut"
         found.append(f"{text}; {_against_contacts(scene, k, one.cell_size)}")
     if rated and run.crisp is None:
-        joined = all(one.contacts.joins for one in traits.values())
-        found.append(FALLS_APART if joined else NO_JOINTS)
+        hanging = any(one.contacts.count and not one.contacts.joins for one in traits.values())
+        found.append(NO_JOINTS if hanging else FALLS_APART)
     return found
 
 

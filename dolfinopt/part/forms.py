@@ -124,9 +124,8 @@ def _simulated(
 def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
     """Return the columns of the densities and of the crisp design.
 
-    The crisp design is without what hangs on it by contacts alone. None of one whose solid cells do
-    not join the interfaces, or that is so weak that its simulation takes `PATIENCE` times the work
-    of the densities'.
+    None of a crisp design whose solid cells do not join the interfaces, or that is so weak that
+    its simulation takes `PATIENCE` times the work of the densities'.
     """
     from dolfinopt.output.design import read_design
 
@@ -134,10 +133,9 @@ def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
     x_phys = read_design(folder / "design.npz", partition, arms)
     with counted() as work:
         density = _design_column(_simulated(scene, partition, arms, x_phys))
-    found = {k: arms[k].contacts(crisp(x, arms[k].mesh.area) > 0.0) for k, x in x_phys.items()}
-    if not all(one.joins for one in found.values()):
+    cut = {k: crisp(x, arms[k].mesh.area) for k, x in x_phys.items()}
+    if not all(arms[k].substructure.joins(x > 0.0) for k, x in cut.items()):
         return density, None
-    cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
     try:
         with counted(PATIENCE * work.done):
             return density, _design_column(_simulated(scene, partition, arms, cut))

@@ -137,8 +137,8 @@ def test_three_interfaces():
     solid = COMM.allreduce(int(arm.mesh.passive.sum()))
     assert solid == 8
     ends = np.abs(arm.mesh.centroid[:, 0] - 0.25) > 0.1
-    assert arm.contacts(np.ones(len(ends), dtype=bool)).joins
-    assert not arm.contacts(ends).joins
+    assert arm.substructure.joins(np.ones(len(ends), dtype=bool))
+    assert not arm.substructure.joins(ends)
 
 
 @pytest.mark.serial

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.density.contacts import contacts_of
 from dolfinopt.optimization.certificate import _crisp
 from dolfinopt.optimization.problem import Evaluator
+from dolfinopt.output.summary import _contact_warnings
 
 WORLD = MPI.COMM_WORLD
 STEP = 0.25  # a power of two: corners are the same to the last bit
@@ -199,3 +201,18 @@ def test_contacts_are_told_and_robust_designs_have_none(projection, radius, tmp_
     counted = f"{own['pieces']} pieces by faces and {own['corners']} contacts without one"
     assert counted in printed.out
     assert summary["crisp"]["objective"] > 0.0
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("solid", "contacts"), [("#.##", 0), ("##..|..##", 1)])
+def test_why_there_is_no_crisp_design(solid, contacts):
+    """A gap between the ends is another thing than ends that a corner joins."""
+    cells, crisp = drawn(*solid.split("|"))
+    one = found(cells, crisp)
+    assert one.count == contacts and not one.joins
+    scene = do.load_scene(TWO_ARM, ("design.projection=heaviside",))
+    run_ = SimpleNamespace(scene=scene, iterations=3, crisp=None)
+    told = _contact_warnings(run_, {0: SimpleNamespace(contacts=one, cell_size=0.005)})
+    assert len(told) == 1 + contacts
+    assert ("contacts alone" in told[-1]) == bool(contacts)
+    assert ("too weak" in told[-1]) == (not contacts)

@@ -138,8 +138,8 @@ def test_crisp_design_that_void_alone_holds_is_not_simulated(made, monkeypatch):
     folder, scene = made[0], scene_of(made[0])
     _, arms = forms._built(scene)
     x = {k: (np.abs(arm.mesh.centroid[:, 0] - 0.4) > 0.011) * 1.0 for k, arm in arms.items()}
-    assert not arms[0].contacts(x[0] > 0.0).joins
-    assert arms[0].contacts(np.ones(arms[0].mesh.num_cells, dtype=bool)).joins
+    assert not arms[0].substructure.joins(x[0] > 0.0)
+    assert arms[0].substructure.joins(np.ones(arms[0].mesh.num_cells, dtype=bool))
     simulated = []
 
     def column(one):
