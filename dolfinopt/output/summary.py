@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 SMALL = 0.1
 SMALL_TURN = 0.2  # rad
 # Radius of the filter in cells, and erosion of the robust projection, from which on its designs had
-# no cells that meet in corners or edges alone (docs/pages/develop/decisions.md).
+# few or no cells that meet in corners or edges alone (docs/pages/develop/decisions.md).
 FILTER_CELLS, EROSION = 2.0, 0.25
 NO_JOINTS = (
     "the design cut at a density of one half joins its interfaces by contacts alone: without them "
