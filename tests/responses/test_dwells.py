@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -10,8 +11,15 @@ from runs import TWO_ARM, overrides, refused, run, scene
 
 import dolfinopt as do
 from dolfinopt.dynamics.build import rests_of
+from dolfinopt.part.scene_file import toml_text
 from dolfinopt.responses.constraints import deviation_limits, limits_of
 from dolfinopt.responses.response import find
+from dolfinopt.scene.load import scene_from_dict
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 pytestmark = pytest.mark.serial
 # A fast stroke, a dwell, and a slow one: the first leaves the larger vibration.
@@ -108,3 +116,12 @@ def test_the_summary_tells_the_same(tmp_path):
     inside = (trajectory.t >= 0.4 - 1e-9) & (trajectory.t <= 0.6 + 1e-9)
     assert summary["settling"] == trajectory.distance[inside].max()
     assert summary["scene"]["motion"]["dwells"] is True
+
+
+def test_dwells_stand_in_the_scene_of_a_part():
+    """part.toml is written by the same function."""
+    told = scene("motion.dwells=[[0.4,0.5],[1.2,1.6]]", "constraints.settling_after=0.05")
+    again = scene_from_dict(tomllib.loads(toml_text(told.to_tree())))
+    assert rests_of(again) == rests_of(told) == ((0.45, 0.5), (1.25, 1.6), (1.95, 3.0))
+    none = scene_from_dict(tomllib.loads(toml_text(scene("motion.dwells=false").to_tree())))
+    assert none.motion.dwells is False
