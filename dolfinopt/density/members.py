@@ -27,11 +27,13 @@ class Width:
         size: its width, m.
         place: where it is, (d,) m.
         to: accuracy of the width, m.
+        fixed: whether no design changes what is there.
     """
 
     size: float
     place: tuple[float, ...]
     to: float
+    fixed: bool = False
 
 
 Widths = tuple[Width | None, Width | None]

@@ -187,6 +187,7 @@ class _Narrow:
         width, asked: m.
         place: (d,) where it is, m.
         to: accuracy of the width, m.
+        fixed: whether no design changes what is there.
     """
 
     arm: str
@@ -195,6 +196,7 @@ class _Narrow:
     asked: float
     place: tuple[float, ...]
     to: float
+    fixed: bool
 
     @property
     def sentence(self) -> str:
@@ -202,10 +204,13 @@ class _Narrow:
         place = ", ".join(f"{x:.4g}" for x in self.place)
         kind = "thinnest member" if self.what == "member" else "narrowest gap"
         key = f"design.minimum_{self.what}"
+        cure = f"raise design.sharpness, use finer cells or a larger {key}"
+        if self.fixed:
+            cure = "it lies in what stays solid or void (arms.passive, arms.regions): widen that"
         return (
             f"arm {self.arm!r}: its {kind}, at ({place}) m, is {1e3 * self.width:.3g} mm wide to "
-            f"{1e3 * self.to:.2g} mm, below {key} = {1e3 * self.asked:.4g} mm; raise "
-            f"design.sharpness, use finer cells or a larger {key}"
+            f"{1e3 * self.to:.2g} mm, below {key} = {1e3 * self.asked:.4g} mm; "
+            f"{cure}"
         )
 
 
@@ -215,7 +220,7 @@ def _too_narrow(run: Simulated, traits: Mapping[int, _Traits]) -> list[_Narrow]:
     if not (run.iterations and design.controls_widths):
         return []
     return [
-        _Narrow(run.scene.arms[k].name, what, width.size, asked, width.place, width.to)
+        _Narrow(run.scene.arms[k].name, what, width.size, asked, width.place, width.to, width.fixed)
         for k, one in traits.items()
         for what, width, asked in zip(
             ("member", "gap"), one.widths, design.least_widths, strict=True
@@ -398,7 +403,7 @@ def _widths(
 ) -> dict[int, Widths]:
     """Return the widths of member and gap of the designs cut at one half; on the root."""
     # Of solid arms where the scene asks for a width: voxels take seconds.
-    corners, solid, asked = {}, {}, {}
+    corners, solid, fixed, asked = {}, {}, {}, {}
     with together(partition.world):
         for k, arm in arms.items():
             mesh, design = arm.mesh, arm.scene.design
@@ -409,20 +414,28 @@ def _widths(
                 points = _lowest(mesh.comm, points)
             if points.shape[1:] == (4, 2):
                 points = points[:, [0, 1, 3, 2]]
-            corners[k], solid[k] = points, x_phys[k] > 0.5
+            corners[k], solid[k], fixed[k] = points, x_phys[k] > 0.5, mesh.fixed
             asked[k] = max(design.least_widths)
-    whole, cut = gather_cells(partition, corners), gather_cells(partition, solid)
+    whole, cut, stays = (gather_cells(partition, one) for one in (corners, solid, fixed))
     asked = gather_arms(partition, asked)
     with together(partition.world):
-        return {k: _thinnest(whole[k], cut[k], asked[k]) for k in whole}
+        return {k: _thinnest(whole[k], cut[k], stays[k], asked[k]) for k in whole}
 
 
-def _thinnest(corners: np.ndarray, solid: np.ndarray, asked: float) -> Widths:
+def _thinnest(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: float) -> Widths:
     """Return the widths of one arm; cells without corners in the plane are left out."""
-    if corners.shape[2] == 2:
-        known = np.isfinite(corners).all(axis=(1, 2))
-        return thinnest(corners[known], solid[known])
-    return thinnest_solid(corners, solid, asked)
+    known = np.isfinite(corners).all(axis=(1, 2))
+    corners, solid, fixed = corners[known], solid[known], fixed[known]
+    plane, middle = corners.shape[2] == 2, corners.mean(axis=1)
+    found = thinnest(corners, solid) if plane else thinnest_solid(corners, solid, asked)
+
+    def placed(width: Width | None) -> Width | None:
+        if width is None:
+            return None
+        away = np.linalg.norm(middle - width.place, axis=1)
+        return replace(width, fixed=bool(fixed[np.argmin(away)]))
+
+    return placed(found[0]), placed(found[1])
 
 
 def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
