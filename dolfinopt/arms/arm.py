@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState, InitialVectors, options, same_basis
 from dolfinopt.arms.vibration import Carried, LoadedModes
+from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import AxisSymmetry, Extrusion, HelmholtzFilter
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
@@ -21,11 +22,12 @@ from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of
 from dolfinopt.fem.interior import Guesses
+from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
-from dolfinopt.parallel import Partition, sum_over_arms, together
+from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
@@ -419,6 +421,27 @@ class Arm:
         parts = np.array([self.mesh.area @ (4.0 * x_phys * (1.0 - x_phys)), self.mesh.area.sum()])
         grey, total = self.mesh.comm.allreduce(parts)
         return float(grey / total)
+
+    def contacts(self, solid: np.ndarray) -> Contacts:
+        """Return how solid cells hang together; `kept` are this rank's (collective on the arm).
+
+        Args:
+            solid: (n_cells,) True for this rank's cells that are.
+        """
+        mesh, T = self.mesh, self.substructure.T
+        corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
+        nodes = self.substructure.operators.cells[:, : corners.shape[1]]
+        held = np.zeros(nodes.shape, dtype=int)
+        for number, at in enumerate([T.inboard, *T.ends], start=1):
+            held[at[nodes]] = number
+        parts = mesh.comm.gather((corners, solid, held, mesh.area), root=0) or ()
+
+        def found() -> Contacts:
+            return contacts_of(*map(np.concatenate, zip(*parts, strict=True)))
+
+        whole: Contacts = on_root(mesh.comm, found)
+        first = sum(mesh.comm.allgather(mesh.num_cells)[: mesh.comm.rank])
+        return replace(whole, kept=whole.kept[first : first + mesh.num_cells])
 
 
 def _averages(mesh: ArmMesh, arm: scenes.Arm) -> list[AxisSymmetry | Extrusion]:

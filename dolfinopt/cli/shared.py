@@ -238,7 +238,7 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         ending = f"{_counted(summary)} ({ending}), {_sought(summary)}"
     click.echo(
         f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
-        f"{_largest(summary)}, {_stress(summary)}"
+        f"{_largest(summary)}, {_stress(summary)}{_contacts(summary)}{_narrow(summary)}"
         f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
         f"{folder}"
     )
@@ -282,6 +282,28 @@ def _stress(summary: Mapping[str, Any]) -> str:
     return (
         f"largest stress {1e-6 * found['value']:.4g} MPa in {found['arm']} at ({place}) m "
         f"and {found['instant']:.3f} s, "
+    )
+
+
+def _contacts(summary: Mapping[str, Any]) -> str:
+    """Return in how many corners and edges alone cells meet, and a comma; "" where there are none.
+
+    E.g. "22 pieces by faces and 52 contacts without one, ".
+    """
+    found = summary["contacts"].values()
+    count = sum(one["corners"] + one["edges"] for one in found)
+    if not count:
+        return ""
+    pieces, s = sum(one["pieces"] for one in found), "s" if count > 1 else ""
+    return f"{pieces} pieces by faces and {count} contact{s} without one, "
+
+
+def _narrow(summary: Mapping[str, Any]) -> str:
+    """Return the widths that the design misses, and a comma; "" where it misses none."""
+    return "".join(
+        f"{one['what']} of {1e3 * one['width']:.3g} mm in {one['arm']} "
+        f"({1e3 * one['asked']:.4g} asked for), "
+        for one in summary["too_narrow"]
     )
 
 

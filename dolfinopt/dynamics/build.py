@@ -27,6 +27,7 @@ from dolfinopt.multibody.motion import (
     breakpoints,
     check_plane_motion,
     curve_of_table,
+    rests,
     rigid_motion,
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -111,8 +112,14 @@ def family_of(scene: Scene) -> Family:
 
 
 def check_motion(scene: Scene) -> None:
-    """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
+    """Raise `InputError` when the scene's path cannot be followed, or a stop is too short."""
     family_of(scene).check(scene)
+    rests_of(scene)
+
+
+def rests_of(scene: Scene) -> tuple[tuple[float, float], ...]:
+    """Return the intervals in which settling counts, see `motion.rests`, s."""
+    return rests(scene, family_of(scene).curve)
 
 
 def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.build import build_system, desired_motion
+from dolfinopt.dynamics.build import build_system, desired_motion, rests_of
 from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
@@ -315,19 +315,21 @@ class Trajectory:
 
     @property
     def settling(self) -> float:
-        """Largest deviation after the motion has ended, t >= motion.duration, m.
+        """Largest deviation in any rest: after the motion and in its dwells, see `rests`, m.
 
         With a horizon that ends with the motion, the deviation at its end.
         """
-        return float(self.distance[self.after_motion].max())
+        return float(self.distance[self.at_rest].max())
 
     @property
-    def after_motion(self) -> np.ndarray:
-        """Which instants are not before the motion's end (n,); the last one is in any case."""
-        motion = self.scene.motion
-        after: np.ndarray = self.t >= motion.duration - 1e-9 * motion.horizon
-        after[-1] = True
-        return after
+    def at_rest(self) -> np.ndarray:
+        """Which instants are in a rest (n,); the last one is in any case."""
+        rounding = 1e-9 * self.scene.motion.horizon
+        found = np.zeros(len(self.t), dtype=bool)
+        for begin, end in rests_of(self.scene):
+            found |= (self.t >= begin - rounding) & (self.t <= end + rounding)
+        found[-1] = True
+        return found
 
     @property
     def drives(self) -> tuple[np.ndarray, np.ndarray]:

@@ -148,6 +148,38 @@ def breakpoints(
     return (0.0, *instants[apart].tolist(), motion.horizon)
 
 
+def rests(
+    scene: Scene, curve_of: Callable[[Scene], tuple[Curve, bool]] = curve_of_table
+) -> tuple[tuple[float, float], ...]:
+    """Return the intervals in which settling counts, the delay of each taken off; s.
+
+    After the motion, up to the horizon, and in its dwells: those that the scene states, or the
+    stops of its path. Rests that follow each other without a gap are one.
+
+    Raises:
+        InputError: the delay is longer than a stop of the path.
+    """
+    motion, delay = scene.motion, scene.constraints.settling_after
+    dwells = motion.stated_dwells
+    if motion.dwells is True and motion.path in ("points", "joints"):
+        dwells = curve_of(scene)[0].stops
+    joined: list[tuple[float, float]] = []
+    for begin, end in sorted([*dwells, (motion.duration, motion.horizon)]):
+        if joined and begin <= joined[-1][1] + SAME_TIME * motion.duration:
+            begin, last = joined.pop()
+            end = max(last, end)
+        joined.append((begin, end))
+    for begin, end in joined[:-1]:
+        if end - begin <= delay:
+            raise InputError(
+                f"{scene.source}: constraints.settling_after = {delay:g}: expected less than "
+                f"{end - begin:.6g} [s], the stop of the path from {begin:g} to {end:g} s; shorten "
+                "it, stop longer, or state the dwells that count as motion.dwells = "
+                "[[start, end], ...]"
+            )
+    return tuple((begin + delay, end) for begin, end in joined)
+
+
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration

@@ -20,7 +20,7 @@ from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.problem import EvaluatedDesign, Evaluator, Problem, problem_of
 from dolfinopt.optimization.state import FurtherMemory, FurtherRow, fields_of
 from dolfinopt.optimization.stopping import Sum, kkt_residual
-from dolfinopt.parallel import sum_over_arms
+from dolfinopt.parallel import sum_over_arms, together
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.evaluation import Evaluation
@@ -367,8 +367,9 @@ class Assessment:
 
     Attributes:
         evaluation: of the design, with the motion.
-        crisp: of the design cut at x_phys = 1/2; None without a projection, or where the motion
-            of what is left cannot be simulated.
+        crisp: of the design cut at x_phys = 1/2 without what hangs on it by contacts alone, see
+            `Contacts.kept`; None without a projection, or where the interfaces do not hang together
+            or the motion of what is left cannot be simulated.
         initial: trajectory of the uniform initial design where the iterations had no motion.
         selection: of the coordinates, with the error that they make of this design's motion.
     """
@@ -415,8 +416,7 @@ def assess(
         evaluator.evaluate_densities(uniform, simulated=True)
         initial = evaluator.trajectory
     if scene.design.projection:
-        cut = {k: np.where(x > 0.5, 1.0, 0.0) for k, x in x_phys.items()}
-        crisp = _crisp(evaluator, cut)
+        crisp = _crisp(evaluator, x_phys)
     if scene.design.projection or not moves:
         for k, arm in arms.items():
             arm.initial_vectors = vectors[k]
@@ -424,12 +424,18 @@ def assess(
     return Assessment(evaluation, crisp, initial, selection)
 
 
-def _crisp(evaluator: Evaluator, cut: Mapping[int, np.ndarray]) -> Evaluation | None:
-    """Return the evaluation of a cut design; None where it falls apart, on all ranks."""
+def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+    """Return the evaluation of the design cut at 1/2, its contacts opened; None if it falls apart.
+
+    On all ranks alike.
+    """
     arms, trajectory = evaluator.arms, evaluator.trajectory
-    whole = all([arms[k].substructure.joins(x > 0.0) for k, x in cut.items()])
+    with together(evaluator.partition.world):
+        found = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
+    whole = all(one.joins for one in found.values())
     if not evaluator.partition.world.allreduce(whole, MPI.MIN):
         return None
+    cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
     steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
     with suppress(ConvergenceError), counted(PATIENCE * steps):
         return evaluator.evaluate_densities(cut, simulated=True)

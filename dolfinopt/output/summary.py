@@ -14,7 +14,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, stiffening_of
-from dolfinopt.density.members import thinnest
+from dolfinopt.density.contacts import Contacts
+from dolfinopt.density.members import Width, Widths, thinnest, thinnest_solid
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
@@ -44,8 +45,13 @@ if TYPE_CHECKING:
 # out. The rotation tells where soft material at the end gives way: arms fold there, undeflected.
 SMALL = 0.1
 SMALL_TURN = 0.2  # rad
-# Radius of the filter in cells from which on no chains of cells that touch in corners remain.
-FILTER_CELLS = 2.0
+# Radius of the filter in cells, and erosion of the robust projection, from which on its designs had
+# few or no cells that meet in corners or edges alone (docs/pages/develop/decisions.md).
+FILTER_CELLS, EROSION = 2.0, 0.25
+NO_JOINTS = (
+    "the design cut at a density of one half joins its interfaces by contacts alone: without them "
+    "there is nothing to simulate"
+)
 FALLS_APART = (
     "the motion of the design cut at a density of one half cannot be simulated: what is left is "
     "too weak; let the optimisation go on (optimizer.max_iterations) until the design is crisp"
@@ -101,7 +107,8 @@ class _Traits:
         volume_fraction, grayness: of the physical densities.
         cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3.
         notes: of the mesh.
-        widths: of member and gap of the design cut at one half, m.
+        contacts: how the design cut at one half hangs together.
+        widths: of member and gap of the design cut at one half.
         frequency: first one of the arm by itself, Hz; None where it is not reduced.
         error: by how much that of the reduced model exceeds it, relative.
     """
@@ -111,7 +118,8 @@ class _Traits:
     cell_size: float
     volume: float
     notes: tuple[str, ...]
-    widths: tuple[float | None, float | None] = (None, None)
+    contacts: Contacts
+    widths: Widths = (None, None)
     frequency: float | None = None
     error: float | None = None
 
@@ -151,13 +159,84 @@ def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]
     return {
         "grayness": float(np.average(grays, weights=volumes)),
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
-        "minimum_member_measured": {name: one.widths[0] for name, one in by_arm.items()},
-        "minimum_gap_measured": {name: one.widths[1] for name, one in by_arm.items()},
+        "connected": max((one.contacts.pieces for one in traits.values()), default=0),
+        "contacts": {name: _contacts(one.contacts) for name, one in by_arm.items()},
+        "minimum_member_measured": {name: _size(one.widths[0]) for name, one in by_arm.items()},
+        "minimum_gap_measured": {name: _size(one.widths[1]) for name, one in by_arm.items()},
+        "too_narrow": [asdict(one) for one in _too_narrow(run, traits)],
         "first_frequency": _first_frequencies(run, by_arm),
         "first_frequency_error": {
             name: one.error for name, one in by_arm.items() if one.error is not None
         },
         "loaded_frequency": dict(loaded),
+    }
+
+
+def _size(width: Width | None) -> float | None:
+    return None if width is None else width.size
+
+
+@dataclass(frozen=True)
+class _Narrow:
+    """A width that an optimised design misses.
+
+    Attributes:
+        arm: its name.
+        what: "member" or "gap".
+        width, asked: m.
+        place: (d,) where it is, m.
+        to: accuracy of the width, m.
+        fixed: whether no design changes what is there.
+    """
+
+    arm: str
+    what: str
+    width: float
+    asked: float
+    place: tuple[float, ...]
+    to: float
+    fixed: bool
+
+    @property
+    def sentence(self) -> str:
+        """E.g. "arm 'arm1': its thinnest member, at (0.2, 0.01) m, is 5.6 mm wide ...; raise"."""
+        place = ", ".join(f"{x:.4g}" for x in self.place)
+        kind = "thinnest member" if self.what == "member" else "narrowest gap"
+        key = f"design.minimum_{self.what}"
+        cure = f"raise design.sharpness, use finer cells or a larger {key}"
+        if self.fixed:
+            cure = "it lies in what stays solid or void (arms.passive, arms.regions): widen that"
+        return (
+            f"arm {self.arm!r}: its {kind}, at ({place}) m, is {1e3 * self.width:.3g} mm wide to "
+            f"{1e3 * self.to:.2g} mm, below {key} = {1e3 * self.asked:.4g} mm; "
+            f"{cure}"
+        )
+
+
+def _too_narrow(run: Simulated, traits: Mapping[int, _Traits]) -> list[_Narrow]:
+    """Return every least width that the design cut at one half misses."""
+    design = run.scene.design
+    if not (run.iterations and design.controls_widths):
+        return []
+    return [
+        _Narrow(run.scene.arms[k].name, what, width.size, asked, width.place, width.to, width.fixed)
+        for k, one in traits.items()
+        for what, width, asked in zip(
+            ("member", "gap"), one.widths, design.least_widths, strict=True
+        )
+        if width is not None and width.size < asked * (1.0 - 1e-9)
+    ]
+
+
+def _contacts(found: Contacts) -> dict[str, Any]:
+    """Return the entry of an arm's contacts."""
+    return {
+        "pieces": found.pieces,
+        "corners": found.corners,
+        "edges": found.edges,
+        "places": found.places.tolist(),
+        "left_out": found.left_out,
+        "remaining": found.remaining,
     }
 
 
@@ -189,7 +268,6 @@ def _of_responses(run: Simulated) -> dict[str, Any]:
 
 
 def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
-    sizes = {k: one.cell_size for k, one in traits.items()}
     return [
         *implausible(run.scene),
         *(note for one in traits.values() for note in one.notes),
@@ -197,12 +275,8 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
         *_limits_exceeded(run.trajectory),
-        *(filter_warnings(run.scene, sizes) if run.iterations else ()),
-        *(
-            [FALLS_APART]
-            if run.iterations and run.scene.design.projection and run.crisp is None
-            else ()
-        ),
+        *_contact_warnings(run, traits),
+        *(one.sentence for one in _too_narrow(run, traits)),
     ]
 
 
@@ -325,20 +399,53 @@ def _frequencies(
 
 def _widths(
     partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
-) -> dict[int, tuple[float | None, float | None]]:
-    """Return the widths of member and gap of the designs cut at one half, m; on the root."""
-    # Those of arms in the plane: members of solid ones are not measured.
-    corners, solid = {}, {}
+) -> dict[int, Widths]:
+    """Return the widths of member and gap of the designs cut at one half; on the root."""
+    # Of solid arms where the scene asks for a width: voxels take seconds.
+    corners, solid, fixed, asked = {}, {}, {}, {}
     with together(partition.world):
         for k, arm in arms.items():
-            if arm.mesh.dim == 3:
+            mesh, design = arm.mesh, arm.scene.design
+            if mesh.dim == 3 and not design.controls_widths:
                 continue
-            points = compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)[:, :, :2]
-            corners[k] = points[:, [0, 1, 3, 2]] if points.shape[1] == 4 else points
-            solid[k] = x_phys[k] > 0.5
-    whole, cut = gather_cells(partition, corners), gather_cells(partition, solid)
+            points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
+            if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
+                points = _lowest(mesh.comm, points)
+            if points.shape[1:] == (4, 2):
+                points = points[:, [0, 1, 3, 2]]
+            corners[k], solid[k], fixed[k] = points, x_phys[k] > 0.5, mesh.fixed
+            asked[k] = max(design.least_widths)
+    whole, cut, stays = (gather_cells(partition, one) for one in (corners, solid, fixed))
+    asked = gather_arms(partition, asked)
     with together(partition.world):
-        return {k: thinnest(whole[k], cut[k]) for k in whole}
+        return {k: _thinnest(whole[k], cut[k], stays[k], asked[k]) for k in whole}
+
+
+def _thinnest(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: float) -> Widths:
+    """Return the widths of one arm; cells without corners in the plane are left out."""
+    known = np.isfinite(corners).all(axis=(1, 2))
+    corners, solid, fixed = corners[known], solid[known], fixed[known]
+    plane, middle = corners.shape[2] == 2, corners.mean(axis=1)
+    found = thinnest(corners, solid) if plane else thinnest_solid(corners, solid, asked)
+
+    def placed(width: Width | None) -> Width | None:
+        if width is None:
+            return None
+        away = np.linalg.norm(middle - width.place, axis=1)
+        return replace(width, fixed=bool(fixed[np.argmin(away)]))
+
+    return placed(found[0]), placed(found[1])
+
+
+def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
+    """Return the lower faces (n_cells, 4, 2) of a box's cells, m; nan but of the lowest layer.
+
+    Collective on the arm.
+    """
+    low = comm.allreduce(points[:, :, 2].min(initial=np.inf), op=MPI.MIN)
+    high = comm.allreduce(points[:, :, 2].max(initial=-np.inf), op=MPI.MAX)
+    at = points[:, :4, 2].max(axis=1, initial=-np.inf) <= low + 1e-9 * (high - low)
+    return np.where(at[:, None, None], points[:, :4, :2], np.nan)
 
 
 def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
@@ -349,7 +456,51 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         scene.arms[index].cell_size or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
+        arm.contacts(x_phys > 0.5),
     )
+
+
+def _contact_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
+    """Return a sentence on every arm with contacts, and one where its crisp design falls apart."""
+    scene, found = run.scene, []
+    rated = run.iterations > 0 and bool(scene.design.projection)
+    for k, one in traits.items():
+        contacts, arm = one.contacts, scene.arms[k]
+        if not contacts.count:
+            continue
+        kinds = {"corner": contacts.corners, "edge": contacts.edges}
+        counts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in kinds.items() if n]
+        pieces = "1 piece" if contacts.pieces == 1 else f"{contacts.pieces} pieces"
+        place = ", ".join(f"{x:.4g}" for x in contacts.places[0])
+        text = (
+            f"arm {arm.name!r}: cells of the design cut at a density of one half meet in "
+            f"{' and '.join(counts)} alone, the worst at ({place}) m; by faces it is {pieces}: "
+            "such contacts are stiff in the model, and no joints in a workshop"
+        )
+        if rated and run.crisp is not None:
+            text += f"; crisp is without them and {100.0 * contacts.left_out:.2g} % of the solid"
+            if contacts.remaining:
+                text += f", but for {contacts.remaining} that cannot be opened without a cut"
+        found.append(f"{text}; {_against_contacts(scene, k, one.cell_size)}")
+    if rated and run.crisp is None:
+        hanging = any(one.contacts.count and not one.contacts.joins for one in traits.values())
+        found.append(NO_JOINTS if hanging else FALLS_APART)
+    return found
+
+
+def _against_contacts(scene: Scene, index: int, size: float) -> str:
+    """Return what keeps contacts out of the next design of an arm."""
+    design, radius = scene.design, scene.filter_radius(index)
+    least = FILTER_CELLS * size
+    found = [] if design.projection == "robust" else ['design.projection = "robust"']
+    if found or design.erosion < EROSION:
+        found.append(f"design.erosion = {EROSION:g}")
+    if radius < least * (1.0 - 1e-9) or not found:
+        wider = max(least, radius + 0.5 * size)
+        key = "a larger design.minimum_member"
+        found.append(key if design.controls_widths else f"design.filter_radius = {wider:.4g}")
+    *rest, last = found
+    return f"set {', '.join(rest)}{' and ' if rest else ''}{last}, or use finer cells"
 
 
 def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:

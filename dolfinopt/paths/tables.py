@@ -45,12 +45,14 @@ class Curve:
         rests: whether the derivatives are zero at and behind both ends, as of a curve in its own
             time; else they are the functions'. Along a curve without times the law brings rest, and
             where it brakes until the last instant its acceleration there belongs to the motion.
+        stops: first and last instant of every rest behind a move, of a curve in its own time, s.
     """
 
     end: float
     derivatives: tuple[Callable[[np.ndarray], np.ndarray], ...]
     kinks: tuple[float, ...] = ()
     rests: bool = True
+    stops: tuple[tuple[float, float], ...] = ()
 
     def __call__(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the curve and two derivatives (n, k); it rests before 0 and behind `end`."""
@@ -153,7 +155,8 @@ def curve_in_time(table: Table) -> Curve:
 
         return value
 
-    return Curve(float(t[-1]), tuple(map(derivative, range(3))), _ends(table))
+    functions = tuple(map(derivative, range(3)))
+    return Curve(float(t[-1]), functions, _ends(table), stops=_stops(table))
 
 
 def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
@@ -176,7 +179,8 @@ def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
 
     knots = [t[i] + law.knots * (t[j] - t[i]) for i, j, law in laws]
     kinks = np.unique(np.concatenate([_ends(table), *knots]))
-    return Curve(float(t[-1]), tuple(map(derivative, range(3))), tuple(kinks.tolist()), rests=False)
+    functions, corners = tuple(map(derivative, range(3))), tuple(kinks.tolist())
+    return Curve(float(t[-1]), functions, corners, rests=False, stops=_stops(table))
 
 
 def _ends(table: Table) -> tuple[float, ...]:
@@ -184,6 +188,15 @@ def _ends(table: Table) -> tuple[float, ...]:
     assert table.t is not None
     ends = {float(table.t[k]) for move in moves(table.rows) for k in move}
     return tuple(sorted(ends - {float(table.t[0]), float(table.t[-1])}))
+
+
+def _stops(table: Table) -> tuple[tuple[float, float], ...]:
+    """Return the instants between which a table with times rests behind a move."""
+    assert table.t is not None
+    found = moves(table.rows)
+    begins, ends = [j for _, j in found], [*(i for i, _ in found[1:]), len(table.t) - 1]
+    pairs = zip(begins, ends, strict=False)  # without a move there is no rest behind one
+    return tuple((float(table.t[j]), float(table.t[i])) for j, i in pairs if i > j)
 
 
 def curve_by_chord(table: Table, measured: int | None = None) -> Curve:

@@ -206,7 +206,7 @@ def deviation_figure(
     deviation: np.ndarray,
     initial: np.ndarray | None = None,
     title: str = DEVIATION,
-    limits: Sequence[tuple[float, float]] = (),
+    limits: Sequence[tuple[float, float, float]] = (),
 ) -> Figure:
     """Return the picture of the end-effector's distance from its rigid or desired path.
 
@@ -217,7 +217,7 @@ def deviation_figure(
         deviation: (n, d) m.
         initial: (m, d) m, of the initial design, evenly over the same time, or None.
         title: above the picture, of what from what.
-        limits: m, and the instant from which each holds, s.
+        limits: m, each with the first and the last instant at which it holds, s.
     """
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
     axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
@@ -226,7 +226,7 @@ def deviation_figure(
         times = np.linspace(t[0], t[-1], len(initial))
         curves = [(INITIAL, times, initial), (OPTIMISED, t, deviation)]
     distances = [MILLI * lengths(vectors) for _, _, vectors in curves]
-    largest = [float(d.max()) for d in distances] + [MILLI * limit for limit, _ in limits]
+    largest = [float(d.max()) for d in distances] + [MILLI * one[0] for one in limits]
     top = 1.1 * max(largest) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)
     # A curve alone looks like the optimised design's.
@@ -285,11 +285,11 @@ def check_figure(check: Check, scene: Scene) -> Figure:
 
 
 def _over_time(
-    axes: Axes, t: np.ndarray, label: str, limits: Sequence[tuple[float, float]] = ()
+    axes: Axes, t: np.ndarray, label: str, limits: Sequence[tuple[float, float, float]] = ()
 ) -> None:
     """Label lengths over time, and draw their limits as broken lines."""
-    for limit, since in limits:
-        axes.hlines(MILLI * limit, since, t[-1], color=LIMIT, ls="--", lw=1.0)
+    for limit, first, last in limits:
+        axes.hlines(MILLI * limit, first, last, color=LIMIT, ls="--", lw=1.0)
     axes.set(xlim=(t[0], t[-1]), ylabel=label)
     axes.grid(True, alpha=0.3)
 

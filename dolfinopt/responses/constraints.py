@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinopt.dynamics.build import rests_of
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.motion import LoadCases, MotionResponse
@@ -132,11 +133,14 @@ def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
     return found
 
 
-def deviation_limits(scene: Scene) -> list[tuple[float, float]]:
-    """Return the limits of the deviation, m, and the instants from which they hold, s."""
-    limits = scene.constraints
-    since = ((limits.deviation, 0.0), (limits.settling, scene.motion.duration))
-    return [(limit, begin) for limit, begin in since if limit is not None]
+def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
+    """Return the limits of the deviation, m, with first and last instant of each, s."""
+    limits, found = scene.constraints, []
+    if limits.deviation is not None:
+        found.append((limits.deviation, 0.0, scene.motion.horizon))
+    if limits.settling is not None:
+        found += [(limits.settling, begin, end) for begin, end in rests_of(scene)]
+    return found
 
 
 def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:

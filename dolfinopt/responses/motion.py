@@ -308,18 +308,18 @@ class Deviation(MotionResponse):
         return p_norm_of_lengths(deviation, self.options.exponent, weights)
 
 
-# -- deviation of the end-effector after the motion has ended ------------------------------------
+# -- deviation of the end-effector at rest: after the motion and in its dwells --------------------
 
 
 @register
 class Settling(Deviation):
-    """The p-mean of the deviation from `motion.duration` on, m; its true value the largest."""
+    """The p-mean of the deviation in all rests together, m; its true value the largest."""
 
-    name, label = "settling", "p-mean of the deviation after the motion"
+    name, label = "settling", "p-mean of the deviation at rest"
 
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
         """Return the instants of the vibration that is left."""
-        indices = np.flatnonzero(trajectory.after_motion)
+        indices = np.flatnonzero(trajectory.at_rest)
         weights = all_instants(trajectory).weights[indices]
         return LoadCases(indices, weights)
 

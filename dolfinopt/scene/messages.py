@@ -202,8 +202,10 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
             return "an array of tables [[arms]], at least one"
         return "an array of tables"
     if origin is tuple:
-        rows = any(get_origin(kind) is tuple for kind in (args[0], *get_args(args[0])))
-        inner = "arrays of three numbers" if rows else _allowed_type(args[0], plural="s")
+        rows = [kind for kind in (args[0], *get_args(args[0])) if get_origin(kind) is tuple]
+        inner = _allowed_type(args[0], plural="s")
+        if rows:  # of a union the shortest
+            inner = f"arrays of {_COUNTS[len(get_args(rows[0]))]} numbers"
         count = "" if args[-1] is Ellipsis else f"{_COUNTS[len(args)]} "
         return f"an array of {count}{inner}"
     if annotation is Material:

@@ -85,7 +85,7 @@ def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
     for link in links:
         yield f"mass of {link}", summary["mass"][link], "kg"
     yield "largest tool deflection", millimetres("max_deviation"), "mm"
-    yield "deflection after the motion", millimetres("settling"), "mm"
+    yield "deflection at rest", millimetres("settling"), "mm"
     for link, frequency in links.items():
         yield f"first frequency of {link}", frequency, "Hz"
     joints = {one["name"]: one["type"] for one in summary["scene"].get("joints", ())}

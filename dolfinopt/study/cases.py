@@ -96,7 +96,7 @@ class Case:
         # The balanced reduction's Gramian knows the damping.
         fixed = {"reduction", "damping"} if scene.reduction.method == "balanced" else {"reduction"}
         kept = scene_content(scene, SCENARIO - fixed)
-        motion_alone = scene.objective.needs("motion") and not any(vars(scene.constraints).values())
+        motion_alone = scene.objective.needs("motion") and not scene.constraints.limits
         if motion_alone and scene.reduction.method in SCALABLE:
             for row in (kept["material"], *kept["arms"]):
                 for key in set(SCALING) - set(scene.arm_sizes):

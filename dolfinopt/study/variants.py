@@ -185,7 +185,7 @@ def posed(scene: Scene, kind: str) -> Scene:
     tree = scene.to_tree()
     tree["objective"] |= {"kind": kind, "direction": None}
     if kind not in LIGHTER:
-        tree["constraints"] = {}
+        tree["constraints"] = {"settling_after": scene.constraints.settling_after}
     elif scene.objective.kind not in LIGHTER or "volume_fraction" not in tree["design"]:
         tree["design"]["volume_fraction"] = None if kind == "mass" else 1.0
         if kind == "mass":

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM, refused
+from runs import TWO_ARM, overrides, refused, run
+from solids import solid_scene
 
 import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
-from dolfinopt.density.members import thinnest
+from dolfinopt.density.members import thinnest, thinnest_solid
 from dolfinopt.mesh.arm_mesh import structured_arm
 from dolfinopt.optimization.problem import Evaluator, problem_of
 from dolfinopt.output.summary import _widths, filter_warnings
@@ -57,9 +60,9 @@ def test_widths_of_drawn_designs(name, solid, member, gap, triangles):
     found_member, found_gap = thinnest(corners, crisp)
     # A triangle is half a square: its samples are closer, and hit edges less squarely.
     close = 0.25 if triangles else 0.01
-    assert found_member / CELL == pytest.approx(member, abs=close)
+    assert found_member.size / CELL == pytest.approx(member, abs=close)
     if gap is not None:
-        assert found_gap / CELL == pytest.approx(gap, abs=close)
+        assert found_gap.size / CELL == pytest.approx(gap, abs=close)
     elif name == "solid":
         assert found_gap is None
 
@@ -75,7 +78,7 @@ def test_corners_are_no_members():
     """A triangular island in the middle of a wide field: its corners are thin, it is not."""
     corners, i, j = cells(60, 60)
     member, _ = thinnest(corners, (j > 10) & (abs(2 * i - 59) < 50 - j))
-    assert member > 10.0 * CELL
+    assert member.size > 10.0 * CELL
 
 
 @pytest.mark.serial  # ranks have no part in it
@@ -159,8 +162,71 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
     assert volume == pytest.approx(0.5, abs=0.01)  # of the nominal design
     if WORLD.rank == 0:
         member, gap = widths[0]
-        assert member >= width - cell
-        assert gap >= width - cell
+        assert member.size >= width - cell
+        assert gap.size >= width - cell
+
+
+@pytest.mark.serial  # ranks have no part in it
+@pytest.mark.parametrize(("name", "place"), [("thin webs", None), ("neck", (0.5, 0.0))])
+def test_the_place_of_the_thinnest_member(name, place):
+    corners, i, j = cells()
+    (solid,) = (one[1](i, j) for one in DRAWN if one[0] == name)
+    member, _ = thinnest(corners, solid)
+    x, y = member.place
+    assert solid[np.argmin(np.hypot(*(corners.mean(axis=1) - member.place).T))]
+    if place is None:  # in one of the webs, which stand every 20 cells
+        assert (x / CELL) % 20.0 < 1.0 and 3.0 < y / CELL < 9.0
+    else:
+        assert x == pytest.approx(100.5 * CELL, abs=CELL) and y == pytest.approx(0.03, abs=CELL)
+    assert member.to == pytest.approx(CELL / 4.0)
+
+
+@pytest.mark.serial  # ranks have no part in it
+def test_widths_of_solids():
+    """A web of two cells over a window of four, in boxes and in tetrahedra; to a voxel."""
+    bits = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
+    places = np.indices((24, 10, 8)).reshape(3, -1).T
+    boxes = CELL * (places[:, None] + bits[None])
+    i, j, _ = places.T
+    ends = (i < 6) | (i >= 18)
+    solid = ends | (j < 4) | (j >= 8)
+    ways = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]]
+    sixths = np.concatenate([boxes[:, way] for way in ways])
+    # The side of a tetrahedron's cube is twice that of its own volume: voxels are as fine.
+    for corners, filled in ((boxes, solid), (sixths, np.tile(solid, 6))):
+        member, gap = thinnest_solid(corners, filled, 4.0 * CELL)
+        assert member.size == pytest.approx(2.0 * CELL, abs=CELL / 4.0)
+        x, y, z = np.array(member.place) / CELL
+        assert 5.0 < x < 19.0 and y == pytest.approx(9.0, abs=0.5) and 0.0 < z < 8.0
+        assert gap.size == pytest.approx(4.0 * CELL, abs=CELL / 4.0)
+        assert gap.place[1] / CELL == pytest.approx(6.0, abs=0.5)
+    assert thinnest_solid(boxes, np.zeros(len(boxes), dtype=bool), CELL) == (None, None)
+    whole, none = thinnest_solid(boxes, np.ones(len(boxes), dtype=bool), CELL)
+    assert none is None and whole.size == pytest.approx(8.0 * CELL, abs=CELL / 4.0)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("volume", "misses"), [(0.5, False), (0.3, True)])
+def test_widths_that_are_missed_are_told(volume, misses, tmp_path, capsys):
+    """Of a run that ends before its members are crisp, and of none that holds them."""
+    told = (*ROBUST, "design.minimum_member=0.012", "design.erosion=0.25")
+    told = (*told, f"design.volume_fraction={volume}", f"design.initial={volume}")
+    told = (*told, "optimizer.max_iterations=30")
+    run("optimize", TWO_ARM, "--out", tmp_path / "run", "--no-plots", *overrides(*told))
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    printed, missed = capsys.readouterr(), summary["too_narrow"]
+    measured = {"member": summary["minimum_member_measured"]["arm1"],
+                "gap": summary["minimum_gap_measured"]["arm1"]}  # fmt: skip
+    least = {what for what, width in measured.items() if width is not None and width < 0.012}
+    assert {one["what"] for one in missed} == least and bool(least) == misses
+    for one in missed:
+        assert one["asked"] == 0.012 and one["width"] == measured[one["what"]]
+        assert not one["fixed"]
+        (text,) = [t for t in summary["warnings"] if f"below design.minimum_{one['what']}" in t]
+        x, y = one["place"]
+        assert f"at ({x:.4g}, {y:.4g}) m" in text and "raise design.sharpness" in text
+        assert text in printed.err
+        assert f"{one['what']} of {1e3 * one['width']:.3g} mm in arm1 (12 asked for)" in printed.out
 
 
 @pytest.mark.slow
@@ -177,8 +243,8 @@ def test_a_gap_of_its_own_widens_the_gaps():
         widths = _widths(result.partition, result.arms, result.x_phys)
         if WORLD.rank == 0:
             member, found = widths[0]
-            assert member >= 0.01 - cell
-            gaps.append(found)
+            assert member.size >= 0.01 - cell
+            gaps.append(found.size)
     if WORLD.rank == 0:
         assert gaps[0] < 0.02 - cell and gaps[1] >= 0.02 - cell
 
@@ -261,3 +327,29 @@ def test_widths_need_three_cells_of_a_step_file_without_a_size(tmp_path):
     with refused("3 cells", "arm1", "0.015 [m]"):
         do.load_scene(TWO_ARM, (*told, "design.minimum_member=0.014"))
     do.load_scene(TWO_ARM, (*told, "design.minimum_member=0.015"))
+
+
+@pytest.mark.serial  # ranks have no part in it
+@pytest.mark.parametrize("extruded", [False, True])
+def test_widths_of_solid_arms_are_measured_where_they_are_asked_for(extruded):
+    """Of a design that is the same over the thickness in the plane: the arm's own is no member."""
+    told = {"cells": (20, 12, 2), "height": 0.06, "thickness": 0.01, "extruded": extruded}
+    scene = solid_scene(**told)
+    width = {"projection": "robust", "minimum_member": 0.015}
+    asked = scene.model_copy(update={"design": scene.design.model_copy(update=width)})
+    for one in (scene, asked):
+        arm = do.Arm(one, 0, MPI.COMM_SELF, do.Profile())
+        partition = do.partition_arms(MPI.COMM_SELF, {0: 480})
+        x, y = arm.mesh.centroid.T[:2]
+        solid = (x < 0.05) | (x > 0.45) | (np.abs(y) > 0.015)  # flanges of three cells
+        found = _widths(partition, {0: arm}, {0: solid * 1.0})
+        if one is scene:
+            assert found == {}
+            continue
+        member, gap = found[0]
+        # The shorter side of a cell is 5 mm; voxels are a quarter of its mean side, 8 mm.
+        assert member.size == pytest.approx(0.015 if extruded else 0.01, abs=0.003)
+        assert gap is None or gap.size > 0.02
+        assert not (extruded and member.fixed)  # the whole arm is as thin otherwise
+        stub = _widths(partition, {0: arm}, {0: arm.mesh.passive * 1.0})[0][0]
+        assert stub.fixed  # nothing but the solid ends

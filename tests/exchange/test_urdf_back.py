@@ -250,7 +250,7 @@ def test_before_and_after():
     assert frame.loc["largest tool deflection"].tolist() == [2.0, 1.0, -50.0, "mm"]
     assert frame.loc["peak of drive rail", "unit"] == "N"
     assert frame.loc["peak of drive yaw", "unit"] == "N m"
-    assert frame.loc["deflection after the motion", ["before", "after"]].isna().all()
+    assert frame.loc["deflection at rest", ["before", "after"]].isna().all()
     words = "other arms", "foot, link before", "link after"
     refusal(lambda: before_after(one, one | {"mass": {"link": 1.0}}), *words)
 

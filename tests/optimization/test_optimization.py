@@ -129,7 +129,8 @@ def test_constraints_keep_their_bounds():
 def test_projection_ends_crisp(kind, grayness):
     """From all grey, with a filter of one and a half cells, to no grey: cut it is the same design.
 
-    Volume limits hold, and the designs are as good as without a projection, or better.
+    But for cells that meet in corners alone: cut it is without them. Volume limits hold, and the
+    designs are as good as without a projection, or better.
     """
     statics = ["objective.kind=static", "arms.cells=[60,8]", "design.filter_radius=0.025"]
     projected = ["design.continuation=15", f"design.projection={kind}"]
@@ -140,7 +141,10 @@ def test_projection_ends_crisp(kind, grayness):
         assert last.grayness < grayness < 0.1 < grey.history[-1].grayness
         assert last.volume_fraction == pytest.approx(0.5, abs=1e-3)
         assert result.evaluation.max_deviation < grey.evaluation.max_deviation
-    assert result.crisp.objective == pytest.approx(result.evaluation.objective, rel=0.02)
+    cut = {k: arm.contacts(result.x_phys[k] > 0.5) for k, arm in result.arms.items()}
+    contacts = WORLD.allreduce(sum(one.count for one in cut.values()))
+    rise = result.crisp.objective / result.evaluation.objective - 1.0
+    assert rise > 0.05 if contacts else abs(rise) < 0.02
     assert result.evaluation.objective < grey.evaluation.objective
 
 

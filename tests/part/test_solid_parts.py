@@ -20,6 +20,7 @@ import dolfinopt as do
 import dolfinopt.part.solid_mesh as solid_mesh_module
 import dolfinopt.part.solid_part as solid_part_module
 from dolfinopt.cli.shared import scene_of
+from dolfinopt.density.members import narrowest
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.part.isosurface import Surface, cut, eighths, halved, nodal_densities, outside
@@ -28,7 +29,7 @@ from dolfinopt.part.solid import MM, triangle_bytes
 from dolfinopt.part.solid_domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
 from dolfinopt.part.solid_part import make_solid_part
-from dolfinopt.part.solid_widths import narrowest, rasterised
+from dolfinopt.part.solid_widths import rasterised
 from dolfinopt.part.step import solid_text
 from dolfinopt.part.three_mf import CORE, three_mf_bytes
 
@@ -291,13 +292,13 @@ def test_narrowest_place_of_voxels():
     h = 0.5
     assert narrowest(inside, h) is None
     inside[20:40, 8:-2, 2:-2] = False  # a plate of 6
-    assert narrowest(inside, h) == pytest.approx(6 * h, abs=h)
+    assert narrowest(inside, h)[0] == pytest.approx(6 * h, abs=h)
     inside[20:40, 2:8, 6:-2] = False  # a bar of 6 x 4
-    assert narrowest(inside, h) == pytest.approx(4 * h, abs=h)
+    assert narrowest(inside, h)[0] == pytest.approx(4 * h, abs=h)
     void = np.ones((70, 40, 30), dtype=bool)
     void[5:-5, 5:-5, 5:-5] = False
     void[30:40, :, 10:-10] = True  # a hole of 10 x 10
-    assert narrowest(void, h) == pytest.approx(10 * h, abs=h)
+    assert narrowest(void, h)[0] == pytest.approx(10 * h, abs=h)
     assert narrowest(void, h, 6 * h) is None
 
 

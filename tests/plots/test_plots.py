@@ -287,7 +287,7 @@ def test_the_picture_of_the_deviation_holds_its_labels(size):
 def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
     t = np.linspace(0.0, 3.0, 301)
     optimised = 0.007 * np.sin(t)[:, None] * [0.6, 0.8]
-    figure = curves.deviation_figure(t, optimised, 8.0 * optimised, limits=((0.01, 1.9),))
+    figure = curves.deviation_figure(t, optimised, 8.0 * optimised, limits=((0.01, 1.9, 3.0),))
     (axes,) = figure.axes
     for line, note, largest in zip(axes.lines, axes.texts, (56.0, 7.0), strict=True):
         np.testing.assert_allclose(line.get_ydata(), largest * np.sin(t))

@@ -41,6 +41,10 @@ BASES = {
     "fork": ("", ROUGHLY[2:]),
 }  # fmt: skip
 DRIVES = "t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n"
+# Strokes with a stop between them.
+STROKES = "t,cart,arm1,arm2\n0,0,2,-1.5\n0.6,0.1,1.5,-1\n0.9,0.1,1.5,-1\n1.9,0,1,-0.8\n"
+SPATIAL_STROKES = "t,yaw,shoulder,elbow\n0,0,0.4,-1.9\n0.2,0.4,0.7,-1.5\n0.3,0.4,0.7,-1.5\n"
+SPATIAL_STROKES += "0.5,1,1,-1\n"
 SKEW = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
 Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
@@ -84,6 +88,8 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
         for name, text in (("drives.csv", DRIVES), ("skew.geo", SKEW)):
             (folder / name).write_text(text)
         (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
+        (folder / "strokes.csv").write_text(STROKES)
+        (folder / "spatial.csv").write_text(SPATIAL_STROKES)
     WORLD.barrier()
     name, quick = BASES[base]
     told = [*quick, *(one.replace("FOLDER", str(folder)) for one in changes)]
@@ -111,6 +117,8 @@ COMPLIANCE, DEVIATION, STRESS = (
     f"objective.kind={kind}" for kind in ("compliance", "deviation", "stress")
 )
 EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
+SETTLING = "objective.kind=settling"
+IN_STROKES = ("motion.path=joints", "motion.file='FOLDER/strokes.csv'")
 STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
 JOINT = ("arms.arm2.joint_mass=0.5", "arms.arm2.joint_inertia=0.01")
@@ -224,6 +232,15 @@ CASES = [
     case("space", FREQUENCY, slow=True),
     case("fork", DEVIATION),
     case("fork", FREQUENCY),
+    # Settling in every rest.
+    case("two_arm", SETTLING, *IN_STROKES, "constraints.settling_after=0.05"),
+    case("two_arm", SETTLING, "motion.dwells=[[0.5,0.7],[1.0,1.2]]"),
+    case("controlled", SETTLING, *IN_STROKES, GRAVITY),
+    case("space", SETTLING, "motion.path=joints", "motion.file='FOLDER/spatial.csv'",
+         "motion.duration=0.5", "motion.horizon=0.6", slow=True),
+    case("space", SETTLING, "motion.dwells=[[0.1,0.2]]", "constraints.settling_after=0.02",
+         "motion.horizon=0.7",
+         "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}", slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
       for kind in NEEDS for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),

@@ -194,9 +194,8 @@ def test_needs_are_stated_by_the_responses() -> None:
     assert asked["static"] == {"stiffness"} == find("tip_deflection").needs
     assert find("volume_fraction").needs == frozenset()
     assert {name: find(name).needs for name in NEEDS} == NEEDS
-    assert {name: find_limited(name).needs for name in Constraints.model_fields} == {
-        name: NEEDS[name] for name in Constraints.model_fields
-    }
+    limited = NEEDS.keys() & Constraints.model_fields
+    assert {name: find_limited(name).needs for name in limited} == {n: NEEDS[n] for n in limited}
     built = build("constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6")
     names = [one.response.name for one in constraints_of(built.scene)]
     assert names == ["volume_fraction", "first_frequency", "tip_deflection"]

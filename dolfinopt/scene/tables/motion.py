@@ -28,6 +28,7 @@ TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
 Base = Literal["cart", "fixed"]
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
 Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
+Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 
 
@@ -111,6 +112,11 @@ class Motion(Table):
         description="simulated time, at least the duration, after which the machine stays at "
         "rest or keeps its speed; the default is the duration if that is longer [s]",
     )
+    dwells: bool | tuple[tuple[Instant, Instant], ...] = Field(
+        default=True,
+        description="rests in which settling counts besides that after the motion: true, every "
+        "stop of the path; false, none; or [start, end] of each [s]",
+    )
     base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
     base_position: Position = Field(
         default=0.0, description="x of the shoulder joint on a fixed base [m]"
@@ -181,6 +187,31 @@ class Motion(Table):
                 ("horizon",),
                 ("duration",),
             )
+
+    @property
+    def stated_dwells(self) -> tuple[tuple[float, float], ...]:
+        """The dwells that the scene states, s."""
+        return () if isinstance(self.dwells, bool) else self.dwells
+
+    @model_validator(mode="after")
+    def _check_dwells(self) -> Motion:
+        last = 0.0
+        for start, end in self.stated_dwells:
+            if not last <= start < end:
+                raise Refusal(
+                    "expected [start, end] of every dwell, start before end, one after the other "
+                    "[s]",
+                    ("dwells",),
+                )
+            last = end
+        if last > self.horizon:
+            raise Refusal(
+                f"expected dwells that end by motion.horizon = {self.horizon:g} [s]; end them "
+                "sooner or simulate longer",
+                ("dwells",),
+                ("horizon",),
+            )
+        return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""

@@ -12,6 +12,7 @@ from dolfinopt.scene.tables.base import Loc, Refusal, Table, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
+    from dolfinopt.scene.tables.motion import Motion
 
 ObjectiveKind = Literal[
     "esl",
@@ -295,6 +296,7 @@ class Objective(Table):
 Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
 Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
+Delay = Annotated[float, Field(ge=0, le=1e5)]  # s
 Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
@@ -322,7 +324,12 @@ class Constraints(Table):
     )
     settling: Distance | None = Field(
         default=None,
-        description="upper limit of the largest deviation from motion.duration on [m]",
+        description="upper limit of the largest deviation in every rest: after the motion, and in "
+        "motion.dwells [m]",
+    )
+    settling_after: Delay = Field(
+        default=0.0,
+        description="time from the beginning of each rest after which settling counts [s]",
     )
     stress: Pressure | None = Field(
         default=None,
@@ -364,7 +371,8 @@ class Constraints(Table):
     @property
     def limits(self) -> dict[str, Limit]:
         """What is limited, in the order of the keys."""
-        return {key: limit for key, limit in vars(self).items() if limit is not None}
+        stated = {key: limit for key, limit in vars(self).items() if limit is not None}
+        return {key: limit for key, limit in stated.items() if key != "settling_after"}
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse arrays that are not one limit for everything that has a value."""
@@ -378,6 +386,27 @@ class Constraints(Table):
             if isinstance(limit, tuple) and len(limit) != len(names):
                 number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
                 raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
+        self._check_delay(scene.motion, (*at, "settling_after"))
+
+    def _check_delay(self, motion: Motion, own: Loc) -> None:
+        """Refuse a delay that leaves nothing of a rest."""
+        left, delay = motion.horizon - motion.duration, self.settling_after
+        if delay > max(left, 0.0):
+            raise Refusal(
+                f"expected at most {left:.6g} [s], from motion.duration = {motion.duration:g} to "
+                f"motion.horizon = {motion.horizon:g}; shorten it or simulate longer",
+                own,
+                ("motion", "horizon"),
+                ("motion", "duration"),
+            )
+        for start, end in motion.stated_dwells:
+            if end - start <= delay:
+                raise Refusal(
+                    f"expected dwells longer than constraints.settling_after = {delay:g} [s], "
+                    f"found {shown([start, end])}; lengthen the dwell or shorten the delay",
+                    ("motion", "dwells"),
+                    own,
+                )
 
 
 # -- what the responses that a scene can name need; `dolfinopt.responses` computes them ----------

@@ -1,0 +1,297 @@
+"""Pieces that share faces, contacts that do not, and designs rated without these."""
+
+from __future__ import annotations
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import TWO_ARM, overrides, run
+from solids import solid_arm
+
+import dolfinopt as do
+from dolfinopt.arms.arm import Arm
+from dolfinopt.density.contacts import contacts_of
+from dolfinopt.optimization.certificate import _crisp
+from dolfinopt.optimization.problem import Evaluator
+from dolfinopt.output.summary import _contact_warnings
+
+WORLD = MPI.COMM_WORLD
+STEP = 0.25  # a power of two: corners are the same to the last bit
+
+
+def grid(*counts):
+    """Return the corners (n, 4 or 8, d) of cells, as tensor products, and the cells' places."""
+    places = np.indices(counts).reshape(len(counts), -1).T
+    bits = np.array([[(k >> i) & 1 for i in range(len(counts))] for k in range(2 ** len(counts))])
+    return STEP * (places[:, None] + bits[None]), places
+
+
+def found(corners, solid):
+    """Return the contacts of an arm from x = 0 to its other end."""
+    x = corners[:, :, 0]
+    held = np.where(x == 0.0, 1, np.where(x == x.max(), 2, 0))
+    return contacts_of(corners, solid, held, np.ones(len(corners)))
+
+
+def drawn(*rows):
+    """Return corners and solid cells of a drawing, its first line on top."""
+    lines = [list(row) for row in reversed(rows)]
+    corners, (i, j) = (one := grid(len(lines[0]), len(lines)))[0], one[1].T
+    return corners, np.array(lines)[j, i] == "#"
+
+
+PLANE = [  # the drawing, pieces, corners, what is kept of it, whether that joins the ends
+    (("####", "####"), 1, 0, 8, True),
+    (("##..", "..##"), 2, 1, 2, False),  # nothing but a corner between the halves
+    (("####", ".#..", "#...", "####"), 2, 1, 9, True),  # the interfaces hold two pieces
+    (("#####", "#...#", "##..#", "..#.#", "#####"), 1, 1, 16, True),  # a loop closed by a corner
+    (("#####", "#...#", "#.#..", "##..#", "#####"), 2, 1, 16, True),  # a single cell falls out
+    (("######", "#..###", "###..#", "######"), 1, 1, 19, True),
+    (("######", "#....#", "#.##.#", "######"), 1, 0, 18, True),
+    (("#.#.#", ".#.#.", "#.#.#"), 8, 8, 2, False),  # a chequerboard
+]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("rows", "pieces", "corners", "kept", "joins"), PLANE)
+def test_drawings(rows, pieces, corners, kept, joins):
+    cells, solid = drawn(*rows)
+    one = found(cells, solid)
+    assert (one.pieces, one.corners, one.edges) == (pieces, corners, 0)
+    assert one.joins == joins and not (one.kept & ~solid).any()
+    assert one.remaining == 0
+    assert one.left_out == pytest.approx(1.0 - one.kept.sum() / solid.sum())
+
+
+@pytest.mark.serial
+def test_the_order_of_cells_does_not_matter():
+    cells, solid = drawn("######", "#..###", "###..#", "######")
+    order = np.random.default_rng(0).permutation(len(cells))
+    one, other = found(cells, solid), found(cells[order], solid[order])
+    assert np.array_equal(one.kept[order], other.kept)
+    assert np.array_equal(one.places, other.places) and one.places.tolist() == [[0.75, 0.5]]
+
+
+@pytest.mark.serial
+def test_contacts_of_solids():
+    """Cubes meet in faces, edges or corners; a corner of cubes that share an edge is none more."""
+    cells, places = grid(4, 2, 2)
+    i, j, k = places.T
+    low, high = (i < 2) & (j == 0) & (k == 0), (i >= 2) & (k == 0)
+    by_face = found(cells, low | (high & (j == 0)))
+    assert (by_face.pieces, by_face.corners, by_face.edges, by_face.joins) == (1, 0, 0, True)
+    by_edge = found(cells, low | (high & (j == 1)))
+    assert (by_edge.pieces, by_edge.corners, by_edge.edges, by_edge.joins) == (2, 0, 1, False)
+    assert by_edge.places.tolist() == [[0.5, 0.25, 0.125]] and by_edge.left_out == 0.5
+    by_corner = found(cells, low | ((i >= 2) & (j == 1) & (k == 1)))
+    assert (by_corner.pieces, by_corner.corners, by_corner.edges) == (2, 1, 0)
+    assert by_corner.places.tolist() == [[0.5, 0.25, 0.25]]
+    # The same halves beside a bar that joins the ends: the contact is opened, the bar stays.
+    bar = found(cells, (j == 0) & (k == 1) | low | (high & (j == 1)))
+    assert bar.joins and bar.remaining == 0 and bar.kept[(j == 0) & (k == 1)].all()
+
+
+@pytest.mark.serial
+def test_triangles_and_tetrahedra():
+    quads, places = grid(4, 2)
+    first, second = quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]
+    halves = np.concatenate([first, second])
+    i, j = np.tile(places, (2, 1)).T
+    corner = found(halves, ((i < 2) & (j == 0)) | ((i >= 2) & (j == 1)))
+    assert (corner.pieces, corner.corners) == (2, 1) and not corner.joins
+    assert found(halves, j == 0).pieces == 1
+    cubes, places = grid(4, 2, 2)
+    ways = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]]
+    sixths = np.concatenate([cubes[:, way] for way in ways])
+    i, j, k = np.tile(places, (6, 1)).T
+    edge = found(sixths, (k == 0) & (((i < 2) & (j == 0)) | ((i >= 2) & (j == 1))))
+    assert (edge.pieces, edge.corners, edge.edges) == (2, 0, 1)
+
+
+def test_nothing_solid():
+    cells, solid = drawn("....", "....")
+    one = found(cells, solid)
+    assert (one.pieces, one.count, one.left_out, one.joins) == (0, 0, 0.0, False)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_an_arm_on_any_ranks(dim):
+    """Halves that meet at one corner, or one edge; one is kept, on whatever rank it lies."""
+
+    def arm(comm):
+        if dim == 3:
+            return solid_arm(comm, cells=(10, 4, 2))
+        return Arm(do.load_scene(TWO_ARM, ("arms.cells=[24,4]",)), 0, comm, do.Profile())
+
+    def contacts(one):
+        x, y = one.mesh.centroid.T[:2]
+        solid = (x < 0.5 * one.mesh.outboard_point[0]) == (y < 0.0)
+        found = one.contacts(solid)
+        assert (found.pieces, found.count, found.joins) == (2, dim - 1, False)
+        assert not found.kept[x > 0.5 * one.mesh.outboard_point[0]].any()
+        return one.mesh.comm.allreduce(int(found.kept.sum())), found.places
+
+    (kept, places), (alone, there) = contacts(arm(WORLD)), contacts(arm(MPI.COMM_SELF))
+    assert kept == alone and np.array_equal(places, there)
+    assert places[0][:2] == pytest.approx([0.25 if dim == 3 else 0.5, 0.0], abs=1e-12)
+
+
+QUICK = ("arms.cells=[24,6]", "arms.arm2.rigid=true", "arms.passive=0", "objective.kind=static",
+         "design.projection=heaviside", "design.filter_radius=0")  # fmt: skip
+
+
+@pytest.mark.serial
+def test_the_crisp_design_is_rated_without_contacts():
+    """A strut that hangs by a corner changes nothing; a chain alone is no crisp design."""
+    scene = do.load_scene(TWO_ARM, QUICK)
+    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
+    arms = do.build_arms(scene, partition, do.Profile())
+    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    i, j = (arms[0].mesh.centroid * [24.0, 100.0] + [0.0, 3.0]).astype(int).T
+
+    def crisp(solid):
+        return _crisp(evaluator, {0: np.where(solid, 1.0, 0.0)})
+
+    bars = (j == 0) | (j == 5) | (i < 2) | (i > 21)
+    end = (i == 13) & (j == 4)
+    strut = (i == 12) & (j > 0) & (j < 4)  # from the lower bar to a corner of that end
+    opened = crisp(bars | strut | end).objective
+    joined = evaluator.evaluate_densities({0: (bars | strut | end) * 1.0}).objective
+    assert opened > 1.01 * joined
+    assert opened in (crisp(bars | strut).objective, crisp(bars | end).objective,
+                      crisp(bars | end | (strut & (j < 3))).objective)  # fmt: skip
+    assert crisp((i < 12) & (j < 3) | (i >= 12) & (j >= 3)) is None
+
+
+TRUSS = ("arms.arm2.rigid=true", "arms.length=0.16", "arms.cells=[48,18]", "arms.passive=0",
+         "motion.radius=0.08", "motion.joint_height=-0.1", "objective.kind=static",
+         "objective.loads=[[0.0,100.0,0.0],[0.0,50.0,5.0]]", "design.volume_fraction=0.3",
+         "design.initial=0.3", "design.continuation=8", "design.sharpness=64",
+         "optimizer.max_iterations=200")  # fmt: skip
+CELL = 0.06 / 18  # m
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("projection", "radius"), [("heaviside", 1.0), ("robust", 2.0)], ids=["filter", "robust"]
+)
+def test_contacts_are_told_and_robust_designs_have_none(projection, radius, tmp_path, capsys):
+    """A filter of a cell leaves chains of cells; eroded by 1/4 the design must hold together."""
+    erosion = ("design.erosion=0.25",) * (projection == "robust")
+    told = (*TRUSS, f"design.projection={projection}", f"design.filter_radius={radius * CELL}")
+    run("optimize", TWO_ARM, "--out", tmp_path / "run", "--no-plots", *overrides(*told, *erosion))
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    printed = capsys.readouterr()
+    own = summary["contacts"]["arm1"]
+    told = [text for text in summary["warnings"] if "no joints in a workshop" in text]
+    if projection == "robust":
+        assert own["pieces"] == summary["connected"] == 1 and own["corners"] == own["left_out"] == 0
+        assert not told and "without one" not in printed.out
+        return
+    assert summary["connected"] == own["pieces"] > 1 and own["edges"] == 0
+    assert own["corners"] > 4 and len(own["places"]) == 3 and own["left_out"] > 0.0
+    (text,) = told
+    x, y = own["places"][0]
+    assert f"the worst at ({x:.4g}, {y:.4g}) m" in text and f"{own['corners']} corners" in text
+    cure = f'"robust", design.erosion = 0.25 and design.filter_radius = {2.0 * CELL:.4g}'
+    assert cure in text and text in printed.err
+    counted = f"{own['pieces']} pieces by faces and {own['corners']} contacts without one"
+    assert counted in printed.out
+    assert summary["crisp"]["objective"] > 0.0
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("solid", "contacts"), [("#.##", 0), ("##..|..##", 1)])
+def test_why_there_is_no_crisp_design(solid, contacts):
+    """A gap between the ends is another thing than ends that a corner joins."""
+    cells, crisp = drawn(*solid.split("|"))
+    one = found(cells, crisp)
+    assert one.count == contacts and not one.joins
+    scene = do.load_scene(TWO_ARM, ("design.projection=heaviside",))
+    run_ = SimpleNamespace(scene=scene, iterations=3, crisp=None)
+    told = _contact_warnings(run_, {0: SimpleNamespace(contacts=one, cell_size=0.005)})
+    assert len(told) == 1 + contacts
+    assert ("contacts alone" in told[-1]) == bool(contacts)
+    assert ("too weak" in told[-1]) == (not contacts)
+
+
+def compliance(arm, solid, split):
+    """Return f'u of unit loads at the outboard end, cells at contacts with nodes of their own."""
+    operators, T = arm.substructure.operators, arm.substructure.T
+    cells, points = operators.cells.copy(), list(operators.points)
+    rigid = T.inboard | T.outboard
+    for node in np.flatnonzero(~rigid) if split else ():
+        at = np.flatnonzero(solid & (cells == node).any(axis=1))
+        if len(at) == 2 and len(np.intersect1d(*cells[at])) == 1:
+            cells[at[1]] = np.where(cells[at[1]] == node, len(points), cells[at[1]])
+            points.append(points[node])
+    young = arm.state(solid * 1.0).elastic.young
+    blocks = np.broadcast_to(operators.stiffness, (len(cells), 8, 8)) * young[:, None, None]
+    K = np.zeros((2 * len(points), 2 * len(points)))
+    for cell, block in zip(cells, blocks, strict=True):
+        dofs = (2 * cell[:, None] + [0, 1]).ravel()
+        K[np.ix_(dofs, dofs)] += block
+    x, y = np.array(points).T[:2]
+    inner = np.flatnonzero((x > 1e-9) & (x < x.max() - 1e-9))
+    basis = np.zeros((len(K), 2 * len(inner) + 3))
+    basis[(2 * inner[:, None] + [0, 1]).ravel(), np.arange(2 * len(inner))] = 1.0
+    end = np.flatnonzero(x > x.max() - 1e-9)
+    basis[2 * end, -3], basis[2 * end + 1, -2], basis[2 * end, -1] = 1.0, 1.0, -y[end]
+    inverse = np.linalg.inv(basis.T @ K @ basis)
+    return inverse[-2, -2] + inverse[-1, -1]  # a force across, a moment
+
+
+@pytest.mark.serial
+def test_what_is_opened_is_as_soft_as_split_nodes():
+    """Against matrices put together here; the contact alone makes the truss stiff."""
+    scene = do.load_scene(TWO_ARM, (*QUICK, "arms.cells=[24,8]", "arms.height=0.2"))
+    arm = Arm(scene, 0, MPI.COMM_SELF, do.Profile())
+    i, j = (arm.mesh.centroid * [24.0, 40.0] + [0.0, 4.0]).astype(int).T
+    bars, posts = (j == 0) | (j == 7), (i == 0) | (i == 23)
+    steps = [(j == k) & (i >= 3 * k - 1 + (k == 4)) & (i <= 3 * k + 2) for k in range(1, 7)]
+    solid = np.any([bars, posts, *steps], axis=0)  # a brace of two cells, once joined by a corner
+    found = arm.contacts(solid)
+    assert found.joins and found.corners == 1 and found.remaining == 0
+    joined, split = (compliance(arm, solid, one) for one in (False, True))
+    assert split > 4.0 * joined
+    assert compliance(arm, found.kept, False) == pytest.approx(split, rel=2e-3)
+
+
+LINK = {
+    "name": "link",
+    "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
+    "arms": [{"name": "link", "length": 0.3, "height": 0.06, "thickness": 0.04,
+              "cells": [30, 6, 4], "passive": 0.01}],
+    "joints": [{"name": "swing", "type": "revolute", "parent": "ground", "child": "link",
+                "axis": [0, 0, 1]}],
+    "motion": {"path": "joints", "file": "swing.csv", "horizon": 0.3},
+    "payload": {"mass": 1.0},
+    "reduction": {"coordinates": 8},
+    "objective": {"kind": "mass", "loads": [[0, 100.0, 0, 0, 0, 0], [0, 0, 60.0, 0, 0, 0],
+                                            [0, 0, 0, 5.0, 0, 0]]},
+    "constraints": {"tip_deflection": 6e-5},
+    "design": {"initial": 0.5, "filter_radius": 0.015, "projection": "heaviside",
+               "continuation": 8, "sharpness": 64.0},
+    "optimizer": {"max_iterations": 200},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+def test_the_lightest_link(tmp_path):
+    """With a filter of 1.5 cells it hangs by edges; the robust one is a single piece."""
+    (tmp_path / "swing.csv").write_text("t,swing\n0,0\n0.2,1\n")
+    robust = ("design.projection=robust", "design.erosion=0.25", "design.filter_radius=0.02")
+    for changes in ((), robust):
+        scene = do.scene_from_dict(LINK, str(tmp_path / "link.toml"), changes)
+        result = do.optimize(scene)
+        one = result.arms[0].contacts(result.x_phys[0] > 0.5)
+        assert one.corners == 0 and not result.violated
+        if changes:
+            assert (one.pieces, one.edges, one.left_out) == (1, 0, 0.0) and one.joins
+            assert result.crisp.objective == pytest.approx(result.evaluation.objective, rel=0.03)
+        else:
+            assert one.pieces > 5 and one.edges > 20 and one.left_out > 0.1
