@@ -30,6 +30,7 @@ from dolfinopt.cli.shared import (
     tell,
 )
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.optimization.measured import PASSING_RATE
 from dolfinopt.units import with_unit
 
 if TYPE_CHECKING:
@@ -248,7 +249,7 @@ def _check_gradient(
     profile: Any,
 ) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
-    from dolfinopt.optimization.gradient_check import PASSES, STEPS, taylor_test
+    from dolfinopt.optimization.gradient_check import STEPS, taylor_test
 
     test = taylor_test(scene, partition, arms, x, profile)
     if world.rank == 0:
@@ -265,8 +266,9 @@ def _check_gradient(
             )
     if not test.passed:
         raise ConvergenceError(
-            f"the Taylor remainders fall at a rate below {PASSES}: the gradient is not exact here; "
-            "repeat with a smaller simulation.tolerance to see whether the simulation is the cause"
+            f"the Taylor remainders fall at a rate below {PASSING_RATE}: the gradient is not exact "
+            "here; repeat with a smaller simulation.tolerance to see whether the simulation is "
+            "the cause"
         )
 
 

@@ -21,40 +21,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dolfinopt.optimization.measured import (
+    ACCEPTED_FALL_SHARE,
+    CONVEXITY_GROWTH_FACTOR,
+    CONVEXITY_KEPT_SHARE,
+    CONVEXITY_MARGIN_FACTOR,
+    CONVEXITY_NOISE,
+    FREE_STEPS,
+    LEAP_FACTOR,
+    LONGER_FALL_SHARE,
+    LONGER_MOVE_FACTOR,
+    MERIT_ROUNDING,
+    SHORTER_FALL_SHARE,
+    SHORTER_MOVE_FACTOR,
+    SHORTEST_MOVE_FACTOR,
+)
 from dolfinopt.optimization.mma import CURVATURE, MMAState
 from dolfinopt.optimization.problem import Problem, Stage
 from dolfinopt.optimization.stopping import Sum
 from dolfinopt.responses.constraints import EXCESS
-
-# Share of the promised fall of the merit that a step must bring, and from which on it may be
-# longer the next time; with frozen loads, whose gradient is no derivative, any fall is enough.
-ENOUGH, GOOD, POOR = 0.05, 0.6, 0.25
-SHORTER, SHORTER_YET, LONGER = 0.5, 0.25, 2.0
-ATTEMPTS = 8  # of a step: the last ones are 1 % as long as the first
-ROUNDING = 1e-10  # of the merit
-# Free steps without a lower merit until the search goes back, at first; strict ones after that. Of
-# thirteen problems the longest way over a hill that ended lower took ten.
-FREEDOM, STRICT = 8, 3
-# A free step is repeated, so many times at most, that takes a limit's value, or the objective of a
-# design that keeps all limits, to so many times what it was.
-FREE_ATTEMPTS, LEAP = 4, 2.0
-# Newton iterations for each time step of the last design's motion before a step is given up: most
-# designs take 3 to 10, machines 16 to 44, what is falling apart thousands.
-PATIENCE = 100.0
-# Where strict steps end, free ones are tried again if the merit has fallen to this share since.
-WORTH = 0.98
-# Where no step lowers the merit of a design beyond a limit, or none has lessened the violation in
-# so many iterations, the price of limits is raised by this factor, up to so much: what is left then
-# is the least violation. Source: Byrd, Nocedal & Waltz (2008), doi:10.1080/10556780701394169.
-UNTIL_DEARER, DEARER, DEAREST = 20, 30.0, 900.0
-# Change of a held smooth limit, relative and for a change of x by 1, from which a new stage begins;
-# and of the objective.
-DRIFT, GREW = 0.05, 2.0
-NEAR = -0.2  # relative value from which on a limit counts for that
-# Svanberg's 1.1: a little more convexity than what was seen asks for, at most so many times more.
-MARGIN, MOST = 1.1, 10.0
-KEPT = 0.5  # of the convexity after a step that did not need it
-SEEN = 1e-6  # relative difference from the promise below which nothing is learnt: noise
 
 
 @dataclass(frozen=True)
@@ -70,12 +55,12 @@ class Search:
         merit: lowest one so far, of limits' true values over `size`, the objective's.
         size: of the objective where the projection became as steep as it is.
         released: merit when free steps were allowed again.
-        weight: factor on the price of limits, see `DEARER`.
+        weight: factor on the price of limits, see `DEARER_PRICE_FACTOR`.
     """
 
     radius: float = 1.0
     reach: float = 0.0
-    freedom: int = FREEDOM
+    freedom: int = FREE_STEPS
     strict: int = 0
     lag: int = 0
     merit: float = np.inf
@@ -156,14 +141,14 @@ class Verdict:
 
 
 def leaps(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether a free step makes things so much worse that it leads nowhere, see `LEAP`.
+    """Return whether a free step makes things so much worse that it leads nowhere.
 
     Args:
         before, after: (1 + m,) values.
     """
     kept = bool((before[1:] <= EXCESS).all())
-    up = kept and after[0] > before[0] + (LEAP - 1.0) * abs(before[0])
-    far = 1.0 + after[1:] > LEAP * (1.0 + np.maximum(before[1:], 0.0))
+    up = kept and after[0] > before[0] + (LEAP_FACTOR - 1.0) * abs(before[0])
+    far = 1.0 + after[1:] > LEAP_FACTOR * (1.0 + np.maximum(before[1:], 0.0))
     return bool(up or far.any() or not np.isfinite(after).all())
 
 
@@ -179,16 +164,16 @@ def judge_step(
         exact: whether the gradients are derivatives.
     """
     if not np.isfinite(after).all():
-        return Verdict(False, SHORTER_YET)
+        return Verdict(False, SHORTEST_MOVE_FACTOR)
     merit = stage.merit(before)
     fall, hoped = merit - stage.merit(after), merit - stage.merit(promised.values)
-    noise = ROUNDING * abs(merit)
-    accepted = fall >= (ENOUGH * hoped if exact else 0.0) - noise
+    noise = MERIT_ROUNDING * abs(merit)
+    accepted = fall >= (ACCEPTED_FALL_SHARE * hoped if exact else 0.0) - noise
     if not accepted:
-        return Verdict(False, SHORTER_YET if fall < -2.0 * hoped else SHORTER)
-    if fall >= GOOD * hoped:
-        return Verdict(True, LONGER)
-    return Verdict(True, 1.0 if fall >= POOR * hoped else SHORTER)
+        return Verdict(False, SHORTEST_MOVE_FACTOR if fall < -2.0 * hoped else SHORTER_MOVE_FACTOR)
+    if fall >= LONGER_FALL_SHARE * hoped:
+        return Verdict(True, LONGER_MOVE_FACTOR)
+    return Verdict(True, 1.0 if fall >= SHORTER_FALL_SHARE * hoped else SHORTER_MOVE_FACTOR)
 
 
 def learnt(
@@ -204,7 +189,9 @@ def learnt(
     miss = after - promised.values
     needed = convexity + miss / promised.spread
     if accepted:
-        return np.minimum(convexity, np.maximum(needed, KEPT * convexity))
-    worse = miss > SEEN * np.abs(after)
-    most = MOST * np.where(convexity > 0.0, convexity, np.inf)
-    return np.where(worse, np.minimum(MARGIN * np.maximum(needed, convexity), most), convexity)
+        return np.minimum(convexity, np.maximum(needed, CONVEXITY_KEPT_SHARE * convexity))
+    worse = miss > CONVEXITY_NOISE * np.abs(after)
+    most = CONVEXITY_GROWTH_FACTOR * np.where(convexity > 0.0, convexity, np.inf)
+    return np.where(
+        worse, np.minimum(CONVEXITY_MARGIN_FACTOR * np.maximum(needed, convexity), most), convexity
+    )

@@ -17,6 +17,11 @@ from dolfinopt.dynamics.collocation import counted
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.iterate import Iterate
+from dolfinopt.optimization.measured import (
+    AT_BOUND_SHARE,
+    COORDINATE_RESERVE_FACTOR,
+    CRISP_NEWTON_ITERATIONS,
+)
 from dolfinopt.optimization.problem import EvaluatedDesign, Evaluator, Problem, problem_of
 from dolfinopt.optimization.state import FurtherMemory, FurtherRow, fields_of
 from dolfinopt.optimization.stopping import Sum, kkt_residual
@@ -171,9 +176,6 @@ class FurtherRun:
 # rest need not be an optimum. Source: Stolpe, Verbart & Rojas-Labanda (2018),
 # doi:10.1007/s00158-017-1884-0.
 
-# Variables nearer to a bound than this part of their range count as held by it.
-AT_BOUND = 1e-3
-
 
 @dataclass(frozen=True)
 class Certificate:
@@ -266,7 +268,7 @@ def _compared(
     """Return angle, degrees, and ratio of lengths over the free variables; nan if there is none."""
     width = xmax - xmin
     room = np.minimum(x - xmin, xmax - x)
-    free = (width > 0.0) & (room > AT_BOUND * width)
+    free = (width > 0.0) & (room > AT_BOUND_SHARE * width)
     g, h = np.where(free, exact * width, 0.0), np.where(free, frozen * width, 0.0)
     gg, hh = total({k: np.array([g[p] @ g[p], h[p] @ h[p]]) for k, p in parts.items()})
     if not (gg > 0.0 and hh > 0.0):
@@ -353,13 +355,6 @@ def _known(value: float) -> float | None:
 
 # -- what is still to be known of an optimised design when the iterations have ended -------------
 
-# "auto" chooses coordinates for the initial design, so many times better than asked for: those of
-# an optimised one err 1.7 to 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
-RESERVE = 3.0
-# Newton iterations for each step of the final design's motion before the cut design's is given up:
-# machines take 16 to 44, a chain far fewer.
-PATIENCE = 400.0
-
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
@@ -384,7 +379,7 @@ def initial_selection(
     evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]
 ) -> OrderSelection | None:
     """Choose the coordinates by the initial design, where the scene says "auto" (collective)."""
-    return _choose(evaluator, x_phys, RESERVE)
+    return _choose(evaluator, x_phys, COORDINATE_RESERVE_FACTOR)
 
 
 def assess(
@@ -437,7 +432,7 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
         return None
     cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
     steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
-    with suppress(ConvergenceError), counted(PATIENCE * steps):
+    with suppress(ConvergenceError), counted(CRISP_NEWTON_ITERATIONS * steps):
         return evaluator.evaluate_densities(cut, simulated=True)
     return None
 

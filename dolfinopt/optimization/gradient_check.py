@@ -12,6 +12,13 @@ from dolfinopt.arms.arm import Patterns
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
+from dolfinopt.optimization.measured import (
+    FORCE_ROUNDING,
+    INSIDE_MARGIN,
+    OBJECTIVE_ROUNDING,
+    PASSING_RATE,
+    STEP_RATIO,
+)
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
@@ -24,13 +31,7 @@ from dolfinopt.scene.tables.objective import EXACT_ONLY
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-FALL = 4.0  # ratio of one step to the next: remainders of second order fall by 16
-STEPS = tuple(0.01 / FALL**k for k in range(5))  # of the design variable, down to 4e-5
-MARGIN = 0.05  # design variables are moved this far inside [0, 1]: the steps must not leave it
-ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
-# The same of drive forces: they are made of accelerations, which are less accurate.
-ROUNDING_OF_FORCES = 1e-9
-PASSES = 1.9  # least rate; 2 is exact, a wrong gradient has 1
+STEPS = tuple(0.01 / STEP_RATIO**k for k in range(5))  # of the design variable, down to 4e-5
 
 Cells = Mapping[int, np.ndarray]
 
@@ -69,7 +70,7 @@ class TaylorTest:
     @property
     def passed(self) -> bool:
         """True when every direction's rate says that the gradient is one."""
-        return all(row.rate >= PASSES for row in self.rows)
+        return all(row.rate >= PASSING_RATE for row in self.rows)
 
 
 def taylor_test(
@@ -78,7 +79,7 @@ def taylor_test(
     """Test the gradient by the design variables x: filter, reduction, simulation, objective.
 
     The instants of the objective and the time steps are those of x throughout; with them the
-    objective is smooth. Variables are moved `MARGIN` inside their bounds first.
+    objective is smooth. Variables are moved `INSIDE_MARGIN` inside their bounds first.
 
     Args:
         scene, partition, arms, profile: as for `evaluate`.
@@ -92,7 +93,7 @@ def taylor_test(
     exact = _with(scene, gradient="exact")
     designed = {k: arm for k, arm in arms.items() if k in scene.designed}
     patterns = Patterns(scene, partition, arms)
-    x = {k: MARGIN + (1.0 - 2.0 * MARGIN) * x[k] for k in designed}
+    x = {k: INSIDE_MARGIN + (1.0 - 2.0 * INSIDE_MARGIN) * x[k] for k in designed}
     x_phys = _physical(partition, arms, patterns, x)
     evaluation, base = evaluate(exact, partition, arms, x_phys, profile, simulated=False)
     cells = patterns.collect(gradient(exact, partition, arms, base, profile))
@@ -105,7 +106,7 @@ def taylor_test(
             frozen = _by_x(partition, designed, cells, x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    share = ROUNDING_OF_FORCES if scene.objective.kind in EXACT_ONLY else ROUNDING
+    share = FORCE_ROUNDING if scene.objective.kind in EXACT_ONLY else OBJECTIVE_ROUNDING
     value = _fixed_objective(exact, partition, arms, patterns, profile, base)
     here = value(x)
     rounding = share * abs(here)
@@ -240,4 +241,4 @@ def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np
 def _rate(remainders: tuple[float, ...], rounding: float) -> float:
     """Return the order of the finest remainders in h; those at rounding level say nothing."""
     known = [r for r in remainders if r > rounding]
-    return float(np.log(known[-2] / known[-1]) / np.log(FALL)) if len(known) > 1 else np.inf
+    return float(np.log(known[-2] / known[-1]) / np.log(STEP_RATIO)) if len(known) > 1 else np.inf

@@ -11,36 +11,28 @@ from mpi4py import MPI
 
 from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.optimization.acceptance import (
-    ATTEMPTS,
-    DEARER,
-    DEAREST,
-    DRIFT,
+from dolfinopt.optimization.acceptance import Search, judge_step, leaps, learnt, promise
+from dolfinopt.optimization.measured import (
+    CURVED_ASYMPTOTE_DISTANCE,
+    DEARER_ITERATIONS,
+    DEARER_PRICE_FACTOR,
+    DEAREST_PRICE_FACTOR,
     FREE_ATTEMPTS,
-    FREEDOM,
-    GREW,
-    NEAR,
-    PATIENCE,
-    SHORTER,
-    SHORTER_YET,
-    STRICT,
-    UNTIL_DEARER,
-    WORTH,
-    Search,
-    judge_step,
-    leaps,
-    learnt,
-    promise,
+    FREE_STEPS,
+    LARGEST_ASYMPTOTE_DISTANCE,
+    LIMIT_PRICE,
+    RELEASE_MERIT_SHARE,
+    SHORTER_MOVE_FACTOR,
+    SHORTEST_MOVE_FACTOR,
+    STAGE_LIMIT_DRIFT,
+    STAGE_LIMIT_LEVEL,
+    STAGE_PRICE_FACTOR,
+    STEP_NEWTON_ITERATIONS,
+    STRICT_ATTEMPTS,
+    STRICT_STEPS,
 )
-from dolfinopt.optimization.mma import (
-    CURVED_DISTANCE,
-    LARGEST_DISTANCE,
-    MMAState,
-    initial_state,
-    mma_step,
-)
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import (
-    PRICE,
     EvaluatedDesign,
     Evaluator,
     Problem,
@@ -114,7 +106,7 @@ class Iterate:
         """Hold the smooth limits of these designs, and a price by the objective's size."""
         held = limits_at(self.scene, self.designs)
         self.problem = problem_of(self.scene, self.designs, held)
-        self.stage = Stage(held, self.search.weight * PRICE * (abs(self.problem.f0) or 1.0))
+        self.stage = Stage(held, self.search.weight * LIMIT_PRICE * (abs(self.problem.f0) or 1.0))
         if len(self.convexity) != len(self.problem.values):
             self.convexity = np.zeros(len(self.problem.values))
 
@@ -156,7 +148,7 @@ class Iterate:
         Free steps first, as long as they lead to something better within `freedom` of them; else
         back to the best design, and strict steps from there.
         """
-        late = self.continuation.complete and self.idle >= UNTIL_DEARER
+        late = self.continuation.complete and self.idle >= DEARER_ITERATIONS
         if late and self.best.excess > 0.0 and not self._raise_price():
             self.stuck = "none lessens the violation, however dear it is"
             return
@@ -170,8 +162,8 @@ class Iterate:
             if self._strict_step():
                 self._seek(strict=max(0, self.search.strict - 1))
                 return
-            if not free and self.search.merit < WORTH * self.search.released:
-                self._seek(released=self.search.merit, freedom=FREEDOM // 2, strict=0)
+            if not free and self.search.merit < RELEASE_MERIT_SHARE * self.search.released:
+                self._seek(released=self.search.merit, freedom=FREE_STEPS // 2, strict=0)
                 if self._free_step():
                     return
             if not self._raise_price() and (self.continuation.complete or not self._sharpen()):
@@ -185,7 +177,7 @@ class Iterate:
         before = projection.beta, dict(projection.thresholds), projection.age
         rises = projection.is_due(self.problem.excess, strict=False)
         for attempt in range(FREE_ATTEMPTS):
-            move = SHORTER_YET**attempt * projection.move
+            move = SHORTEST_MOVE_FACTOR**attempt * projection.move
             new, after = self._proposed(move, None)
             if rises:
                 projection.advance(self.variables.split(new), strict=False)
@@ -203,12 +195,12 @@ class Iterate:
         """Take a step that lowers the merit; return whether there is one."""
         exact = self.scene.objective.gradient == "exact"
         before = self.problem.values
-        for _ in range(ATTEMPTS):
+        for _ in range(STRICT_ATTEMPTS):
             move = self.search.radius * self.continuation.move
             new, after = self._proposed(move, self.stage.price)
             designs = self._tried(new, move)
             if designs is None:
-                self._seek(radius=SHORTER_YET * self.search.radius)
+                self._seek(radius=SHORTEST_MOVE_FACTOR * self.search.radius)
                 continue
             tried = problem_of(self.scene, designs, self.stage.limits).values
             promised = promise(
@@ -237,7 +229,7 @@ class Iterate:
         self._seek(reach=move)
         steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
         try:
-            with counted(PATIENCE * steps if steps else np.inf):
+            with counted(STEP_NEWTON_ITERATIONS * steps if steps else np.inf):
                 return self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.failed = str(error)
@@ -282,7 +274,7 @@ class Iterate:
             self.designs = self.evaluator.evaluate(self.x)
             self.begin_stage()
         freedom = self.search.freedom // 2
-        self._seek(freedom=freedom, strict=STRICT, radius=SHORTER, lag=0)
+        self._seek(freedom=freedom, strict=STRICT_STEPS, radius=SHORTER_MOVE_FACTOR, lag=0)
 
     def _seek(self, **changes: Any) -> None:
         self.search = replace(self.search, **changes)
@@ -332,7 +324,7 @@ class Iterate:
                 self.variables.xmax,
                 self.state,
                 move=move,
-                widest=CURVED_DISTANCE if self.curved else LARGEST_DISTANCE,
+                widest=CURVED_ASYMPTOTE_DISTANCE if self.curved else LARGEST_ASYMPTOTE_DISTANCE,
                 convexity=self.convexity if strict else None,
                 prices=np.full(len(problem.f), price) if strict else None,
                 comm=self.world,
@@ -347,17 +339,20 @@ class Iterate:
             self._sharpen()
             return
         now = problem_of(self.scene, self.designs)
-        near = now.f > NEAR
+        near = now.f > STAGE_LIMIT_LEVEL
         drift = np.abs(now.f - problem.f)[near].max(initial=0.0)
-        grown = self.search.weight * PRICE * abs(problem.f0) / price
-        if drift > DRIFT * self.change or not 1.0 / GREW <= grown <= GREW:
+        grown = self.search.weight * LIMIT_PRICE * abs(problem.f0) / price
+        if (
+            drift > STAGE_LIMIT_DRIFT * self.change
+            or not 1.0 / STAGE_PRICE_FACTOR <= grown <= STAGE_PRICE_FACTOR
+        ):
             self.begin_stage()
 
     def _raise_price(self) -> bool:
         """Make limits dearer where x does not meet them; return whether they are (collective)."""
-        if self.problem.excess == 0.0 or self.search.weight >= DEAREST:
+        if self.problem.excess == 0.0 or self.search.weight >= DEAREST_PRICE_FACTOR:
             return False
-        self._seek(weight=DEARER * self.search.weight, radius=1.0)
+        self._seek(weight=DEARER_PRICE_FACTOR * self.search.weight, radius=1.0)
         self._seek(merit=self.problem.merit(self.search.size, self.search.weight))
         self.best = replace(self.best, improved=self.iteration)
         self.begin_stage()
@@ -366,7 +361,11 @@ class Iterate:
     @property
     def least_violated(self) -> bool:
         """Whether x violates limits, and no step lessens that however dear they are."""
-        return bool(self.stuck) and self.problem.excess > 0.0 and self.search.weight >= DEAREST
+        return (
+            bool(self.stuck)
+            and self.problem.excess > 0.0
+            and self.search.weight >= DEAREST_PRICE_FACTOR
+        )
 
     def _sharpen(self) -> bool:
         """Raise beta for the same x; return whether the design has a motion then (collective)."""

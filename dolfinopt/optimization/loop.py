@@ -20,16 +20,15 @@ from dolfinopt.optimization.certificate import (
     initial_selection,
 )
 from dolfinopt.optimization.iterate import Iterate
+from dolfinopt.optimization.measured import (
+    CHECKPOINT_SECONDS,
+    LANDING_EXCESS,
+    LANDING_MOVE_FACTOR,
+    LANDING_STEPS,
+)
 from dolfinopt.optimization.problem import Evaluator, Problem, densities
 from dolfinopt.optimization.state import FurtherMemory, HistoryRow, Memory, fields_of
-from dolfinopt.optimization.stopping import (
-    LANDING,
-    LAST,
-    NEARLY,
-    Ending,
-    conflict_sentences,
-    stop_reason,
-)
+from dolfinopt.optimization.stopping import Ending, conflict_sentences, stop_reason
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit, violated
@@ -101,9 +100,6 @@ class Result:
 
 # -- the optimisation loop: evaluate, differentiate, update by MMA, until the design converges ---
 
-# A checkpoint is written when this much time has passed: a kill costs no more than that, and
-# writing stays below a percent of the run.
-CHECKPOINT_INTERVAL = 2.0  # s
 
 Report = Callable[[HistoryRow], None]
 
@@ -246,10 +242,10 @@ class _Run:
         one = self.iterate
         if self.finished != "limit" or not one.curved:
             return
-        one.search = replace(one.search, freedom=0, radius=LANDING)
+        one.search = replace(one.search, freedom=0, radius=LANDING_MOVE_FACTOR)
         one.continuation.held = True
-        for _ in range(LAST):
-            if one.best.excess == 0.0 or one.problem.excess > NEARLY or one.stuck:
+        for _ in range(LANDING_STEPS):
+            if one.best.excess == 0.0 or one.problem.excess > LANDING_EXCESS or one.stuck:
                 return
             one.step()
             if not one.stuck:
@@ -363,7 +359,7 @@ class _Run:
 
     def _checkpoint(self, force: bool = False) -> None:
         """Save when due (collective: the root looks at the clock)."""
-        due = force or time.perf_counter() - self.saved >= CHECKPOINT_INTERVAL
+        due = force or time.perf_counter() - self.saved >= CHECKPOINT_SECONDS
         if self.recorder is None or not self.partition.world.bcast(due, root=0):
             return
         with self.profile.phase("checkpoint"):

@@ -23,47 +23,36 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.measured import (
+    ACTIVE_MULTIPLIER,
+    BLOCK_ENTRIES,
+    COMPLEMENTARITY_REST,
+    DUAL_EVALUATIONS,
+    DUAL_REGULARISATION,
+    DUAL_ROUNDING,
+    FIRST_ASYMPTOTE_DISTANCE,
+    FIRST_DUAL_RADIUS,
+    FLAT_GRADIENT_SHARE,
+    LARGEST_ASYMPTOTE_DISTANCE,
+    LARGEST_DUAL_RADIUS,
+    LEAST_ASYMPTOTE_DISTANCE,
+    LEAST_DUAL_STEP,
+    MULTIPLIER_FLOOR,
+    PENALTY_LIMIT,
+    REST_MOVE_SHARE,
+)
 
 Array = npt.NDArray[np.float64]
 
-# Asymptote distances, in units of a variable's range xmax - xmin (Svanberg 2007).
-_INITIAL_DISTANCE = 0.5
-_SMALLEST_DISTANCE = 0.01
-LARGEST_DISTANCE = 10.0
-CURVED_DISTANCE = (
-    1.0  # for curved constraints: with 10 limits of the motion are left every 25 steps
-)
 _WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: asyincr)
 _NARROW = 0.7  # where it turned back (asydecr)
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
-# A move below this part of the range is rounding and its sign chance: without the limit the
-# asymptotes of variables at rest would depend on the order of summation over the ranks.
-_AT_REST = 1e-9
 
 CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
 _RAA0 = 1e-5  # his raa0: convex even where all gradients are zero
 _PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y + y^2 / 2
-_MOST = 1e9  # of it
 
-# The dual is stepped in units of (multiplier + _FLOOR), because multipliers span many decades.
-# Multipliers below raa0 hardly change the design beside the curvature that raa0 adds.
-_FLOOR = 1e-5
-_FIRST_RADIUS = 10.0  # of the trust region in these units: about a decade of every multiplier
-_LARGEST_RADIUS = 1000.0  # three decades
-_SMALLEST_STEP = 1e-14  # in these units: the rounding of the multipliers
-_MAX_EVALUATIONS = 300  # of the dual; 4 to 5 are the rule
-_ROUNDING = 1e-14  # of the dual's value relative to its terms: some ten units of the last place
-_ACTIVE_MULTIPLIER = 1e-7 * _FLOOR  # smaller ones move no variable
-# Allowed rest of an active constraint relative to its terms. Near rounding is the rule; only
-# constraints that nearly repeat each other end in between.
-_COMPLEMENTARY = 1e-6
-_REGULARISATION = 1e-12  # of the dual's curvature, for constraints that say the same
-_FLAT = 1e-6  # part of the gradient added to it, for a flat dual; vanishes at the maximum
 _TINY = float(np.finfo(np.float64).tiny)
-
-# Variables are treated in blocks whose temporaries stay in the cache (96 kB of doubles), which
-# makes an evaluation of the dual nearly three times as fast at 19 200 variables.
-_BLOCK_ENTRIES = 12288
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +93,7 @@ def mma_step(
     state: MMAState,
     *,
     move: float = 0.2,
-    widest: float = LARGEST_DISTANCE,
+    widest: float = LARGEST_ASYMPTOTE_DISTANCE,
     convexity: npt.ArrayLike | None = None,
     prices: npt.ArrayLike | None = None,
     comm: MPI.Comm | None = None,
@@ -198,12 +187,12 @@ class _Given:
         return both
 
     def blocks(self) -> list[tuple[int, slice]]:
-        """Cut the pieces into blocks of about _BLOCK_ENTRIES entries of `gradients`.
+        """Cut the pieces into blocks of about BLOCK_ENTRIES entries of `gradients`.
 
         Returns:
             The number of its piece and the variables of every block.
         """
-        columns = max(_BLOCK_ENTRIES // (1 + self.f.size), 256)
+        columns = max(BLOCK_ENTRIES // (1 + self.f.size), 256)
         blocks, first = [], 0
         for number, length in self.pieces.items():
             last = first + length
@@ -232,8 +221,8 @@ def _fault(given: _Given) -> str:
             return f"state.{name} does not hold {n} finite numbers"
     if sum(given.pieces.values()) != n:
         return f"pieces hold {sum(given.pieces.values())} variables, x {n}"
-    if given.widest < _INITIAL_DISTANCE:
-        return f"widest is {given.widest}, expected at least {_INITIAL_DISTANCE}"
+    if given.widest < FIRST_ASYMPTOTE_DISTANCE:
+        return f"widest is {given.widest}, expected at least {FIRST_ASYMPTOTE_DISTANCE}"
     if not 0.0 < given.move <= 1.0:
         return f"move is {given.move}, expected 0 < move <= 1"
     outside = (given.x < given.xmin) | (given.x > given.xmax)
@@ -274,13 +263,13 @@ def _asymptote_distance(given: _Given, columns: slice, width: Array) -> Array:
     """Return the distance of the asymptotes from x in units of the range `width`."""
     state = given.state
     if state.iteration < 2:
-        return np.full(width.shape, _INITIAL_DISTANCE)
+        return np.full(width.shape, FIRST_ASYMPTOTE_DISTANCE)
     last = (given.x[columns] - state.x_old1[columns]) / width
     before = (state.x_old1[columns] - state.x_old2[columns]) / width
-    moving = np.minimum(np.abs(last), np.abs(before)) > _AT_REST
+    moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE
     factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
     distance = factor * (state.upp[columns] - state.low[columns]) / (2.0 * width)
-    return np.minimum(np.maximum(distance, _SMALLEST_DISTANCE), given.widest)
+    return np.minimum(np.maximum(distance, LEAST_ASYMPTOTE_DISTANCE), given.widest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +331,9 @@ class _Dual:
             self.f = np.clip(f[active[1:]] / scale[1:], -1e30, 1e30)
         self.penalty = np.full(self.f.size, _PENALTY)
         if given.prices is not None:
-            self.penalty = np.clip(given.prices[active[1:]] * scale[1:] / scale[0], _FLOOR, _MOST)
+            self.penalty = np.clip(
+                given.prices[active[1:]] * scale[1:] / scale[0], MULTIPLIER_FLOOR, PENALTY_LIMIT
+            )
         self.comm = comm
         self.numbers = list(given.pieces)
         self.blocks = [(k, _block(given, columns, active, scale)) for k, columns in given.blocks()]
@@ -410,20 +401,20 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     lower. The derivatives are known down to rounding, the values are not.
 
     Raises:
-        ConvergenceError: the constraints are not met to `_COMPLEMENTARY`.
+        ConvergenceError: the constraints are not met to `COMPLEMENTARITY_REST`.
     """
     point = dual.at(multipliers)
-    radius = np.full(multipliers.size, _FIRST_RADIUS)
+    radius = np.full(multipliers.size, FIRST_DUAL_RADIUS)
     evaluations, kinked = 1, False
-    while multipliers.size and evaluations < _MAX_EVALUATIONS:
+    while multipliers.size and evaluations < DUAL_EVALUATIONS:
         z = _newton_step(point, radius, dual.penalty)
-        if np.abs(z).max() <= _SMALLEST_STEP:
+        if np.abs(z).max() <= LEAST_DUAL_STEP:
             break
         trial = dual.at(_stepped(point.multipliers, z, dual.penalty))
         evaluations += 1
         change = trial.multipliers - point.multipliers
         rise, rise_there = point.gradient * change, trial.gradient * change
-        rounding = _ROUNDING * (dual.size[0] + trial.multipliers @ dual.size[1:])
+        rounding = DUAL_ROUNDING * (dual.size[0] + trial.multipliers @ dual.size[1:])
         not_lower = trial.value >= point.value - rounding
         turned = -rise_there.sum()
         mean_curvature = 0.5 * (point.curvature + trial.curvature)
@@ -432,7 +423,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
                 trial = replace(trial, curvature=mean_curvature)
             point = trial
             radius = np.where(rise_there >= 0.0, np.maximum(radius, 4.0 * np.abs(z)), radius)
-            radius = np.minimum(radius, _LARGEST_RADIUS)
+            radius = np.minimum(radius, LARGEST_DUAL_RADIUS)
         else:
             # The multipliers that turned the derivative go less far. What was met on the way enters
             # the curvature: on a ridge between two kinks either side alone points off the ridge.
@@ -447,9 +438,9 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
 
 def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
     """Raise ConvergenceError unless multipliers and constraints are complementary."""
-    active = point.multipliers > _ACTIVE_MULTIPLIER
+    active = point.multipliers > ACTIVE_MULTIPLIER
     left = np.where(active, np.abs(point.gradient), np.maximum(point.gradient, 0.0))
-    allowed = _COMPLEMENTARY * (dual.size[1:] + _TINY)
+    allowed = COMPLEMENTARITY_REST * (dual.size[1:] + _TINY)
     if (left > allowed).any():
         i = int(np.argmax(left / allowed))
         raise ConvergenceError(
@@ -462,14 +453,14 @@ def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
 
 
 def _newton_step(point: _DualPoint, radius: Array, penalty: Array) -> Array:
-    """Return the Newton step z in units of (multiplier + _FLOOR), limited by the trust region.
+    """Return the Newton step z in units of (multiplier + MULTIPLIER_FLOOR), limited by the radius.
 
     A radius r lets a multiplier grow or shrink by the factor 1 + r. The price of violation has a
     kink where the multiplier reaches the penalty: the step ends there at the latest, and the next
     one starts with the curvature of the side it goes to.
     """
     old = point.multipliers
-    unit = old + _FLOOR
+    unit = old + MULTIPLIER_FLOOR
     violated = (old > penalty) | ((old == penalty) & (point.gradient > 0.0))
     to_kink = (penalty - old) / unit
     lower = np.maximum(np.where(violated, to_kink, -old / unit), -radius / (1.0 + radius))
@@ -480,7 +471,7 @@ def _newton_step(point: _DualPoint, radius: Array, penalty: Array) -> Array:
 
 def _stepped(old: Array, z: Array, penalty: Array) -> Array:
     """Return the multipliers after the step z, exactly 0 or the penalty if it leads there."""
-    unit = old + _FLOOR
+    unit = old + MULTIPLIER_FLOOR
     new = old + unit * z
     new[z <= -old / unit] = 0.0
     kinked = np.abs(new - penalty) <= 1e-15 * penalty
@@ -498,7 +489,9 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     m = gradient.size
     # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
     # is flat; the relative part is for equivalent constraints.
-    diagonal = _REGULARISATION * np.diag(curvature) + _FLAT * np.abs(gradient) + _TINY
+    diagonal = (
+        DUAL_REGULARISATION * np.diag(curvature) + FLAT_GRADIENT_SHARE * np.abs(gradient) + _TINY
+    )
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)
     fixed = ((lower == 0.0) & (gradient <= 0.0)) | ((upper == 0.0) & (gradient >= 0.0))

@@ -12,6 +12,12 @@ import numpy as np
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.optimization.measured import (
+    GENTLE_SHARPNESS,
+    LIMIT_PRICE,
+    STRICT_SHARPENINGS,
+    WAITING_EXCESS,
+)
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
@@ -79,12 +85,6 @@ class Variables:
 
 # -- the projection's steepness and thresholds, as they change over the iterations ---------------
 
-# Steepness from which on the move limit falls with its square root: up to it the projection's
-# slope, about beta / 2, moves x_phys by no more than twice what x moves.
-GENTLE = 4.0
-WAITS = 0.02  # excess of a limit from which on beta waits for the design to come back
-AT_ONCE = 4  # strict steps have one function in so many parts of design.continuation
-
 
 class Continuation:
     """Owns the projection's beta and thresholds; without a projection both stay as they are.
@@ -116,7 +116,7 @@ class Continuation:
     @property
     def move(self) -> float:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
-        return self.scene.optimizer.move * min(1.0, (GENTLE / self.beta) ** 0.5)
+        return self.scene.optimizer.move * min(1.0, (GENTLE_SHARPNESS / self.beta) ** 0.5)
 
     def as_it_is(self) -> Continuation:
         """Return one that stays as this one is now."""
@@ -159,10 +159,10 @@ class Continuation:
             excess: largest relative violation of a limit.
             strict: whether the update is to be compared with the design before.
         """
-        return not self.complete and excess <= WAITS and self.age >= self._updates(strict)
+        return not self.complete and excess <= WAITING_EXCESS and self.age >= self._updates(strict)
 
     def _updates(self, strict: bool) -> int:
-        return max(1, self.scene.design.continuation // AT_ONCE) if strict else 1
+        return max(1, self.scene.design.continuation // STRICT_SHARPENINGS) if strict else 1
 
     def advance(self, x: Mapping[int, np.ndarray], strict: bool) -> None:
         """Raise beta, and move the thresholds so that the volume of x stays (collective).
@@ -180,10 +180,6 @@ class Continuation:
 
 
 # -- the problem at one point x, as MMA takes it, from what the designs that x stands for do -----
-
-# Price of a limit's excess in units of the objective: an excess by 1 % costs as much as a tenth of
-# the objective. Mass and compliance change by one to three percent with a percent of a limit.
-PRICE = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +260,7 @@ class Problem:
     def merit(self, size: float, weight: float) -> float:
         """Return the merit by the limits' true values, over the `size` of the objective."""
         over = sum(one.excess for one in self.limits if not one.met)
-        return float(self.values[0] / size + weight * PRICE * over)
+        return float(self.values[0] / size + weight * LIMIT_PRICE * over)
 
 
 def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndarray, ...]:

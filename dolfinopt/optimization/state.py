@@ -12,6 +12,7 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.optimization.acceptance import Search
+from dolfinopt.optimization.measured import IMPROVED_SHARE
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.responses.order_selection import OrderSelection
 
@@ -79,9 +80,6 @@ class FurtherRow(HistoryRow):
 # -- what an optimisation must remember to go on as if it had never been interrupted -------------
 
 
-WORTH = 1e-3  # relative: what a design must be better to count as improved
-
-
 @dataclass(frozen=True, eq=False)
 class Best:
     """The best design so far: of the sharpest projection among those that keep all limits.
@@ -93,8 +91,8 @@ class Best:
         thresholds: per arm its eta.
         objective: what is minimised.
         excess: largest relative violation of a limit.
-        improved: iteration of the last design that was better than the one before by `WORTH`, and
-            `reference` its objective, of an infeasible one its excess.
+        improved: iteration of the last design that was better than the one before by a tenth of a
+            percent, and `reference` its objective, of an infeasible one its excess.
     """
 
     x: np.ndarray
@@ -122,7 +120,7 @@ class Best:
         """Return it with what it has improved since `before`, which it follows."""
         value = self.excess or self.objective
         same = (self.excess > 0.0) == (before.excess > 0.0) and self.beta <= before.beta
-        if same and value > before.reference - WORTH * abs(before.reference):
+        if same and value > before.reference - IMPROVED_SHARE * abs(before.reference):
             return replace(self, improved=before.improved, reference=before.reference)
         return replace(self, improved=self.iteration, reference=value)
 

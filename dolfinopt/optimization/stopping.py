@@ -9,22 +9,26 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import nnls
 
+from dolfinopt.optimization.measured import (
+    CUT_OFF_MOVE_SHARE,
+    DEPENDENT_EIGENVALUE_SHARE,
+    FREE_SET_ROUNDS,
+    GREY_SHARE,
+    IMPROVING_ITERATIONS,
+    LARGEST_EXPONENT,
+    LARGEST_RESIDUAL_FACTOR,
+    OPPOSING_SHARE,
+    REACHED_LIMIT_SHARE,
+    ROOM_SHARE,
+    SETTLED_ITERATIONS,
+    TRIAL_STEP_SHARE,
+)
 from dolfinopt.optimization.problem import Problem
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.scene.load import Scene
 from dolfinopt.units import NOT_MET
 
 Sum = Callable[[Mapping[int, np.ndarray]], np.ndarray]
-
-ROUNDS = 10  # of choosing the free variables; two or three are the rule
-# Eigenvalues of the scaled Gram matrix below this share of the largest are rounding: constraints
-# whose gradients say the same.
-DEPENDENT = 1e-12
-# Variables can move that are farther than this share of their range from either bound.
-ROOM = 1e-3
-TRIAL = 0.1  # step of the variable that moves most, in ranges: what bounds nearer than that hold
-PEAK = 10.0  # times the tolerance of the root mean square, that of the largest
-EXPONENT = 64  # of the norm that stands for the largest: above it by 20 % at most, of 1e5 cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +51,8 @@ class Residual:
         return cls(np.nan, np.nan, np.empty(0))
 
     def is_within(self, tolerance: float) -> bool:
-        """Return whether the design counts as stationary; see `PEAK` for the largest."""
-        return self.rms <= tolerance and self.largest <= PEAK * tolerance
+        """Return whether the design counts as stationary."""
+        return self.rms <= tolerance and self.largest <= LARGEST_RESIDUAL_FACTOR * tolerance
 
 
 def kkt_residual(
@@ -92,7 +96,7 @@ def kkt_residual(
     free = width > 0.0  # passive variables have no gradient and no room
     unit = np.where(free, width, 1.0)
     down, up = (x - xmin) / unit, (xmax - x) / unit
-    roomy = free & (np.minimum(down, up) > ROOM)
+    roomy = free & (np.minimum(down, up) > ROOM_SHARE)
     g0, g = df0dx * width, dfdx * width
 
     def added(*terms: np.ndarray) -> np.ndarray:
@@ -100,8 +104,8 @@ def kkt_residual(
         return total({k: np.array([one[part].sum() for one in terms]) for k, part in parts.items()})
 
     def largest(term: np.ndarray) -> float:
-        """Return the largest |term|, see `EXPONENT`."""
-        return float(added(np.abs(term) ** EXPONENT)[0] ** (1.0 / EXPONENT))
+        """Return the largest |term|, see `LARGEST_EXPONENT`."""
+        return float(added(np.abs(term) ** LARGEST_EXPONENT)[0] ** (1.0 / LARGEST_EXPONENT))
 
     square, count = added(g0**2, free)
     if square == 0.0:
@@ -112,12 +116,12 @@ def kkt_residual(
     g0 = g0 / scale
     slack = np.maximum(-f, 0.0)
     best, inside = Residual(np.inf, np.inf, np.zeros(f.size)), roomy
-    for _ in range(ROUNDS):
+    for _ in range(FREE_SET_ROUNDS):
         movable = inside | roomy
         n = max(1.0, float(added(movable)[0]))
         found = _multipliers(g0, g, inside, slack / np.sqrt(n), parts, total)
         L = g0 + found @ g
-        t = TRIAL / (largest(L) or 1.0)
+        t = TRIAL_STEP_SHARE / (largest(L) or 1.0)
         moving = free & (t * L <= down) & (t * L >= -up)
         step = np.where(moving, L, np.clip(t * L, -up, down) / t)
         movable = roomy | (step != 0.0)
@@ -158,7 +162,7 @@ def _multipliers(
     scale[scale == 0.0] = 1.0
     # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > DEPENDENT * values[-1]
+    kept = values > DEPENDENT_EIGENVALUE_SHARE * values[-1]
     if not kept.any():
         return np.zeros(m)
     root = np.sqrt(values[kept])
@@ -168,23 +172,13 @@ def _multipliers(
 
 # -- when the iterations end, and how that is said -----------------------------------------------
 
-# A change above this part of the move limit was cut off by it and tells nothing about convergence.
-MOVING = 0.5
-# Grayness above which a projection has not done its work: as if 2 % of the cells stood at 1/2.
-GREY = 0.02
-# A run whose iterations are spent while it exceeds limits by no more than this share goes on with
-# steps so much shorter, for so many at most: limits that follow the design settle as steps do.
-NEARLY, LANDING, LAST = 0.05, 0.1, 8
 
 Ending = Literal["", "converged", "settled", "stuck", "limit"]
-# Iterations without a better design, the projection complete, after which a run has settled; and in
-# which one counts as still improving that has spent its iterations.
-SETTLED, IMPROVING = 60, 20
 
 
 def small_change(scene: Scene) -> float:
     """Return the change of the design variables up to which a design counts as converged."""
-    return min(scene.optimizer.tolerance, MOVING * scene.optimizer.move)
+    return min(scene.optimizer.tolerance, CUT_OFF_MOVE_SHARE * scene.optimizer.move)
 
 
 def ending(
@@ -211,13 +205,13 @@ def ending(
         stuck: why no step betters the design, "" where one does.
         idle: iterations since the best design improved by a tenth of a percent.
     """
-    small = change <= min(scene.optimizer.tolerance, MOVING * reach)
+    small = change <= min(scene.optimizer.tolerance, CUT_OFF_MOVE_SHARE * reach)
     rests = iteration > 0 and small and complete
     if rests and not violated and residual.is_within(scene.optimizer.kkt_tolerance):
         return "converged"
     if stuck:
         return "stuck"
-    if complete and idle >= SETTLED:
+    if complete and idle >= SETTLED_ITERATIONS:
         return "settled"
     return "limit" if iteration >= scene.optimizer.max_iterations else ""
 
@@ -247,12 +241,16 @@ def stop_reason(
     reason = {
         "converged": f"converged: largest change {change:.3g} <= {small_change(scene):g}, "
         f"residual {kkt:.2g} <= {options.kkt_tolerance:g}",
-        "settled": f"settled: no better design by 0.1 % in {SETTLED} iterations",
+        "settled": f"settled: no better design by 0.1 % in {SETTLED_ITERATIONS} iterations",
         "stuck": f"stopped: no step improves the design ({stuck})",
     }.get(end, f"optimizer.max_iterations = {options.max_iterations}")
     if end == "limit" and not not_met:
         reason += ", feasible, "
-        reason += "still improving" if idle <= IMPROVING else f"not improved in {idle} iterations"
+        reason += (
+            "still improving"
+            if idle <= IMPROVING_ITERATIONS
+            else f"not improved in {idle} iterations"
+        )
     if not_met:
         reason += ", infeasible: least violation"
         reason += "" if best is None else f", at iteration {best}"
@@ -260,16 +258,12 @@ def stop_reason(
         reason += f"; the best design is that of iteration {best}"
     if not_met:
         reason += f"{NOT_MET}{not_met}"
-    if scene.design.projection and grayness > GREY:
+    if scene.design.projection and grayness > GREY_SHARE:
         reason += f"; the projected design is still grey ({grayness:.2g})"
     return reason
 
 
 # -- which limits stand against those that a design does not meet --------------------------------
-
-# Share of the violated constraint's gradient that another one must balance to stand against it.
-OPPOSES = 0.05
-NEAR = 0.02  # a limit counts as reached within this share of it: the iterations may end any time
 
 
 def conflict_sentences(
@@ -300,11 +294,11 @@ def conflict_sentences(
             continue
         own = problem.rows == index
         row = int(np.flatnonzero(own)[np.argmax(problem.f[own])])
-        others = np.flatnonzero(~own & (problem.f >= -NEAR) & eased[problem.rows])
+        others = np.flatnonzero(~own & (problem.f >= -REACHED_LIMIT_SHARE) & eased[problem.rows])
         g, rows = problem.dfdx[row], problem.dfdx[others]
         left = kkt_residual(x, xmin, xmax, g, np.zeros(len(others)), rows, parts, total)
         sizes = _sizes(np.vstack([g, rows]) * (xmax - xmin), parts, total)
-        strong = left.multipliers * sizes[1:] > OPPOSES
+        strong = left.multipliers * sizes[1:] > OPPOSING_SHARE
         opposed = {problem.limits[k] for k in problem.rows[others[strong]]}
         names = [one for one in problem.limits if one in opposed]
         found[_sentence(limit, names)] = None

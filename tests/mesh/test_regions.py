@@ -9,7 +9,8 @@ from mpi4py import MPI
 from runs import ROOT, STATED, TWO_ARM, overrides, refusal, run
 
 import dolfinopt as do
-from dolfinopt.optimization.gradient_check import FALL, taylor_test
+from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.optimization.measured import STEP_RATIO
 from dolfinopt.optimization.problem import Evaluator
 from dolfinopt.output.views import gather_views
 from dolfinopt.plots.design import REGION, design_figure
@@ -95,7 +96,7 @@ def test_gradients_with_regions(kind, law):
     x = {k: 0.5 + 0.4 * np.sin(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
     for row in taylor_test(scene, partition, arms, x, do.Profile()).rows:
         # Not the finest one: "simp" has a void of 1e-12, and rounding to suit.
-        rate = np.log(row.remainders[1] / row.remainders[2]) / np.log(FALL)
+        rate = np.log(row.remainders[1] / row.remainders[2]) / np.log(STEP_RATIO)
         assert row.slope != 0.0 and rate > 1.9
 
 
