@@ -415,7 +415,7 @@ def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept
         best = whole.certificate.further.objective
         assert min(row.objective for row in shown) == best < whole.evaluation.objective
     assert len(WORLD.bcast(whole.history, root=0)) == 3  # the finished design's own
-    monkeypatch.setattr(loop, "CHECKPOINT_INTERVAL", 0.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 0.0)
     made, update = [], iterate.Iterate.step
 
     def counted(one, *arguments):

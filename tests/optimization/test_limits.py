@@ -142,14 +142,14 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
         assert limits["deviation"].value == deviations[0]
         assert own == pytest.approx([one / 0.012 - 1.0 for one in deviations], rel=1e-9)
         return
-    # The eroded one's row has the nominal one's value, and what changes it is its own gradient.
+    # Both rows have the nominal one's value; each changes by its own gradient.
     assert limits["deviation"].value == deviations[2]
-    assert own == pytest.approx([deviations[2] / 0.012 - 1.0], rel=1e-9)
+    assert own == pytest.approx([deviations[2] / 0.012 - 1.0] * 2, rel=1e-9)
     row = designs[0].of_nominal.tolist().index(False)
     scale = deviations[2] / deviations[0]
-    assert problem.dfdx[rows.index("deviation")] == pytest.approx(
-        scale * designs[0].constraints[row], rel=1e-9
-    )
+    eroded, nominal = problem.dfdx[np.array(rows) == "deviation"]
+    assert eroded == pytest.approx(scale * designs[0].constraints[row], rel=1e-9)
+    assert nominal == pytest.approx(designs[2].constraints[row], rel=1e-9)
     # What a stage holds, later designs are measured by.
     held = [2.0 * one for one in limits_at(built, designs)]
     assert problem_of(built, designs, held).f == pytest.approx(0.5 * (1.0 + problem.f) - 1.0)
@@ -200,7 +200,7 @@ def test_a_run_that_ends_just_beyond_a_limit_lands(monkeypatch):
     ended = do.optimize(scene(*changes, iterations=5))
     assert not ended.violated and 5 < ended.iterations <= 13
     assert ended.best_iteration == ended.iterations
-    monkeypatch.setattr("dolfinopt.optimization.loop.LAST", 0)
+    monkeypatch.setattr("dolfinopt.optimization.loop.LANDING_STEPS", 0)
     before = do.optimize(scene(*changes, iterations=5))
     assert before.violated and before.iterations == 5
     if WORLD.rank == 0:

@@ -668,7 +668,7 @@ def test_warm_start_saves_evaluations(monkeypatch):
 
 
 def test_unsolved_subproblem_is_an_error(monkeypatch):
-    monkeypatch.setattr(mma, "_MAX_EVALUATIONS", 1)
+    monkeypatch.setattr(mma, "DUAL_EVALUATIONS", 1)
     problem, x = waves(1)
     df0dx, f, dfdx = problem(x)
     f[0] = np.abs(dfdx[0]).sum()

@@ -169,7 +169,7 @@ def test_bounds_out_of_reach_are_told():
 
 def test_resume_gives_the_same_bits(shared_tmp_path, monkeypatch):
     """Interrupted after any iteration, whatever was saved last: the same designs and history."""
-    monkeypatch.setattr("dolfinopt.optimization.loop.CHECKPOINT_INTERVAL", 0.0)
+    monkeypatch.setattr("dolfinopt.optimization.loop.CHECKPOINT_SECONDS", 0.0)
     folders = {name: shared_tmp_path / str(name) for name in ("whole", 0, 1, 4, 6)}
     if WORLD.rank == 0:
         for folder in folders.values():

@@ -351,7 +351,7 @@ def test_interrupted_optimisation_goes_on(plan, done, tmp_path, monkeypatch, whe
     """What is computed again begins at the last checkpoint and ends in the same bits."""
     _, outcomes = done
     made = plan[0].design
-    monkeypatch.setattr(optimization, "CHECKPOINT_INTERVAL", 0.0)
+    monkeypatch.setattr(optimization, "CHECKPOINT_SECONDS", 0.0)
     reached = 3
     with monkeypatch.context() as patch:
         if where == "at the end":
