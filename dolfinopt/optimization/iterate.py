@@ -296,11 +296,21 @@ class Iterate:
         self.begin_stage()
         return True
 
-    def begin_anew(self) -> None:
-        """Go on from the best design; what was seen before does not count any more (collective)."""
+    def begin_anew(self) -> bool:
+        """Go on from the best design; what was seen before does not count any more (collective).
+
+        Return whether it has a motion; if not, it counts as before.
+        """
         self._restore_best()
-        self.state, self.best, self.stuck = initial_state(self.x), Best.none(self.x), ""
-        self.evaluate()
+        best, self.best = self.best, Best.none(self.x)
+        try:
+            self.evaluate()
+        except ConvergenceError:  # on all ranks
+            self.best = best
+            self.evaluator.undo()
+            return False
+        self.state, self.stuck = initial_state(self.x), ""
+        return True
 
     def _restore_best(self) -> None:
         if self.best.iteration >= 0:

@@ -220,7 +220,8 @@ class _Run:
         """Look again whether geometric stiffening counts, and say whether to go on (collective).
 
         "auto" decided for the initial design. Where the final one calls for it, it is evaluated
-        anew, and the iterations that are left go on with it.
+        anew, and the iterations that are left go on with it; if its motion can then not be
+        simulated, what was found without stays, and the summary says what it misses.
         """
         if not needs(self.scene, "motion"):
             return False
@@ -230,7 +231,12 @@ class _Run:
         group = [self.scene, *pose_scenarios(self.scene)]
         if not reconsider_stiffening(group, self.partition, self.arms):
             return False
-        self.iterate.begin_anew()
+        if not self.iterate.begin_anew():
+            known = self.partition.world.bcast(stiffening_of(self.arms), root=0)
+            for arm in self.arms.values():
+                arm.set_stiffening(replace(known, on=False))
+            self.iterate.evaluate_again()
+            return False
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
     def _land(self) -> None:

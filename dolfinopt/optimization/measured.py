@@ -53,6 +53,9 @@ STRICT_SHARPENINGS = 4  # parts of design.continuation in which strict steps hav
 # with a percent of a limit.
 LIMIT_PRICE = 10.0
 
+# Of the nominal design's limits: what the eroded one keeps at most.
+ERODED_LIMIT_FACTOR = 2.0
+
 # -- Residual and endings (stopping, loop) --
 
 FREE_SET_ROUNDS = 10  # of choosing the variables with room; two or three are the rule

@@ -13,6 +13,7 @@ from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.measured import (
+    ERODED_LIMIT_FACTOR,
     GENTLE_SHARPNESS,
     LIMIT_PRICE,
     STRICT_SHARPENINGS,
@@ -268,13 +269,15 @@ def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndar
 
     Smooth limit = limit times smooth over true value. Where the limits bind the nominal one of
     robust designs alone, those of the eroded one are scaled so that it meets them as the nominal
-    one does: its gradients keep members from getting thin, and no more is asked of it.
+    one does, up to `ERODED_LIMIT_FACTOR`: its gradients keep members from getting thin, and it does
+    not fall apart.
     """
     found = [np.array(one.evaluation.smooth_limits) for one in designs]
     if len(designs) > 1 and scene.design.limits_on == "nominal":
         eroded, nominal = (1.0 + np.array(designs[i].evaluation.constraints) for i in (0, -1))
         known = (eroded > 0.0) & (nominal > 0.0)  # what nothing loads has no share
-        found[0] = found[0] * np.divide(eroded, nominal, out=np.ones_like(eroded), where=known)
+        ratio = np.divide(eroded, nominal, out=np.ones_like(eroded), where=known)
+        found[0] = found[0] * np.minimum(ratio, ERODED_LIMIT_FACTOR)
     return tuple(found)
 
 

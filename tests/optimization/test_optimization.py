@@ -4,6 +4,7 @@ import signal
 import subprocess
 import time
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from mpi4py import MPI
 from runs import TWO_ARM, command, environment, overrides, run, scene, shell
 
 import dolfinopt as do
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.acceptance import Search
+from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.output import checkpoint
 from dolfinopt.parallel import on_root
 
@@ -97,6 +101,41 @@ def test_stiffening_is_looked_at_again_for_the_final_design():
     evaluation, _ = do.evaluate(*place, arms, after.x_phys, do.Profile(), simulated=True)
     # Both are simulated to 1e-2 of the tolerance, from other starts.
     assert after.evaluation.max_deviation == pytest.approx(evaluation.max_deviation, rel=3e-3)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("lost", ["stiffened", "sharper"])
+def test_a_design_that_cannot_be_simulated_any_more_loses_nothing(monkeypatch, lost):
+    """With stiffening, or with a sharper projection, at the end: the design before is returned."""
+    settings = ["objective.kind=mass", "objective.gradient=exact", "constraints.deviation=0.04"]
+    if lost == "stiffened":
+        settings += ["simulation.stiffening=auto", "design.initial=1.0"]
+        settings += ["design.volume_fraction=1.0"]
+        method, count = "begin_anew", 3
+    else:
+        settings += ["design.projection=heaviside", "design.continuation=1"]
+        monkeypatch.setattr(Search, "__init__", partialmethod(Search.__init__, freedom=0))
+        method, count = "_sharpen", 6
+    whole, fails = getattr(Iterate, method), []
+
+    def failing(self):
+        evaluate = self.evaluate
+        self.evaluate = lambda: fails.append(self.iteration) or give_up()
+        try:
+            return whole(self)
+        finally:
+            self.evaluate = evaluate
+
+    def give_up():
+        raise ConvergenceError("the motion cannot be simulated")
+
+    monkeypatch.setattr(Iterate, method, failing)
+    result = do.optimize(small(*SMALLEST, *settings, iterations=count))
+    assert fails and result.iterations == count
+    assert np.isfinite(result.evaluation.max_deviation)
+    if lost == "stiffened":
+        asked = next(iter(result.arms.values())).stiffening
+        assert not asked.on and asked.neglected > 4e-3  # told, and left out
 
 
 # -- constraints and projections -------------------------------------------------------------
