@@ -34,7 +34,7 @@ from dolfinopt.profiling import Profile
 pytestmark = pytest.mark.serial  # arrays of one process
 
 TOLERANCE = 1e-4
-LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
+LEFT = 2.0 * batch.BATCH_NEWTON_SHARE * TOLERANCE  # by Newton's method, of either of two
 DAMPING = 1e-3  # s
 
 
@@ -303,7 +303,7 @@ def test_fallback_of_one_that_does_not_converge(monkeypatch, alone):
 def test_adjoint_of_a_solution_from_the_batch():
     """Slopes through a solution of the batch are those through the same one found alone."""
     problems = [two_arms(), two_arms(payload=1.5)]
-    found = batch.integrate(problems, TOLERANCE, 3, Profile(), [None] * 2, radau.GOAL)
+    found = batch.integrate(problems, TOLERANCE, 3, Profile(), [None] * 2, radau.ONE_RUN.goal)
     problem, one = problems[1], found[1]
     same = radau.on_grid(problem, one.time_grid, TOLERANCE, 3)
     t = np.linspace(0.1, 1.0, 7)

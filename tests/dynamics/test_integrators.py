@@ -558,7 +558,7 @@ def test_error_that_no_steps_lower(monkeypatch, on_grids, error, words, most) ->
         solve("radau", problem, 1e-4)
     assert "\n" not in str(raised.value)
     assert len(grids) <= most
-    assert max(grids) <= radau.MAX_STEPS
+    assert max(grids) <= radau.RADAU_STEPS_LIMIT
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
@@ -567,7 +567,7 @@ def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, on_grids, share
     problem, _ = two_arms()
     found = radau.on_grid(problem, even_steps(problem, 40), 1e-4, 3)
     on_grids(lambda *_: replace(found, error=share * 1e-4))
-    monkeypatch.setattr(radau, "MAX_STEPS", 40)
+    monkeypatch.setattr(radau, "RADAU_STEPS_LIMIT", 40)
     if share < 1.0:
         assert solve("radau", problem, 1e-4).error == share * 1e-4
     else:
@@ -631,7 +631,8 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     with pytest.raises(ConvergenceError, match=r"material\.young_modulus.*motion\.duration"):
         arms_of_a_scene(*changes, f"simulation.stages={stages}", cells=(40, 4))
     assert len(grids) <= 2
-    assert sum(work) <= march.SWEEPS * sum(grids) + march.LONGEST * march.MAX_ITERATIONS
+    most = march.LONGEST_WINDOW_STEPS * march.MARCH_ITERATIONS_LIMIT
+    assert sum(work) <= march.WINDOWS_ITERATIONS_LIMIT * sum(grids) + most
     assert len(told) >= 2
 
 
@@ -654,7 +655,7 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
     remedy = r"deflects by [0-9.]+ % .*50 %.*young_modulus"
     with pytest.raises(ConvergenceError, match="t = .* an arm " + remedy):
         arms_of_a_scene("motion.duration=0.45")
-    monkeypatch.setattr("dolfinopt.dynamics.simulation.VALID", 0.01)
+    monkeypatch.setattr("dolfinopt.dynamics.simulation.DEFLECTION_LIMIT", 0.01)
     with pytest.raises(ConvergenceError, match="arm1.*" + remedy):
         arms_of_a_scene("motion.duration=1.0", "payload.mass=1")
 
@@ -717,7 +718,7 @@ def some_factors(stages: Stages, slow: np.ndarray) -> NewtonMatrix:
 
 def slow_up_to(monkeypatch: pytest.MonkeyPatch, limits: tuple[float, ...]) -> None:
     """Treat coordinates densely up to these angles, tried in turn."""
-    monkeypatch.setattr(factors, "LIMITS", limits)
+    monkeypatch.setattr(factors, "SLOW_ANGLES", limits)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, limits=limits))
 
 
@@ -906,7 +907,7 @@ def test_dense_matrices_are_kept_small(
     dense(monkeypatch)
     whole = radau.on_grid(problem, edges, 1e-8, 3)
     slopes = Adjoint(problem, whole).gradient(t, whole.sample(t))
-    monkeypatch.setattr(factors, "MEMORY_BYTES", 1e6)
+    monkeypatch.setattr(factors, "FACTORS_BYTES", 1e6)
     matrices.clear()
     parts = radau.on_grid(problem, edges, 1e-8, 3)
     again = Adjoint(problem, whole).gradient(t, whole.sample(t))
@@ -929,7 +930,7 @@ def test_adjoint_is_exact_with_fast_coordinates(
     solution = radau.on_grid(problem, even_steps(problem, 60), 1e-8, 3)
     t = np.linspace(0.0, 1.0, 31)
     by_q = solution.sample(t) @ problem.mechanism.stiffness()
-    monkeypatch.setattr(factors, "LIMITS", limits)
+    monkeypatch.setattr(factors, "SLOW_ANGLES", limits)
     matrices.clear()
     found = Adjoint(problem, solution).gradient(t, by_q)
     assert min(size for _, size in matrices) < 16

@@ -418,7 +418,7 @@ def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> N
         moved(*overrides)
     said = str(refusal.value)
     deflection = re.search(r"deflects by ([0-9.]+) % of its length: beyond 50 %", said)
-    assert deflection is not None and float(deflection[1]) > 100.0 * march.VALID
+    assert deflection is not None and float(deflection[1]) > 100.0 * march.DEFLECTION_LIMIT
     assert "material.young_modulus" in said and "motion.duration" in said and "\n" not in said
 
 
