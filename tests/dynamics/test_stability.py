@@ -27,7 +27,8 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.fem.interface import MOST_ROUNDING, floats, rounding_error
+from dolfinopt.fem.interface import floats, rounding_error
+from dolfinopt.fem.measured import STIFFNESS_ROUNDING_LIMIT
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
@@ -196,10 +197,10 @@ def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
     for floor in 10.0 ** (-0.5 * np.arange(6.0, 17.0)):  # SIMP: its square to solid
         arm = one_arm("interpolation.law=simp", f"interpolation.floor={floor}", cells=cells)
         arm.set_design(DESIGNS[name](0, *arm.mesh.centroid.T))
-        if estimates and 10.0 * estimates[-1] > 0.9 * MOST_ROUNDING:
+        if estimates and 10.0 * estimates[-1] > 0.9 * STIFFNESS_ROUNDING_LIMIT:
             with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):
                 arm.elastic.constraint_modes()
-        if not estimates or 10.0 * estimates[-1] < 1.1 * MOST_ROUNDING:
+        if not estimates or 10.0 * estimates[-1] < 1.1 * STIFFNESS_ROUNDING_LIMIT:
             estimates.append(rounding_error(arm.elastic, arm.elastic.constraint_modes()))
     assert 3 <= len(estimates) <= 6
     np.testing.assert_allclose(np.diff(np.log10(estimates)), 1.0, atol=0.02)
