@@ -39,7 +39,7 @@ from dolfinopt.dynamics.measured import (
     PILOT_NEWTON_SHARE,
     PILOTS_LIMIT,
     RADAU_ESTIMATE_SHARE,
-    STEPS_BY_SPEED_EXPONENT,
+    SPEED_EXPONENT,
 )
 from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
@@ -236,7 +236,7 @@ def _pilot(
         (solution,) = _on_grid(chosen, grid, stages, rest[own], [None], tolerance, tuning)
         if solution is not None:
             profile.counts.newton_iterations += solution.iterations
-            return solution, max(1.0, float(speeds.max() / speeds[k]) ** STEPS_BY_SPEED_EXPONENT)
+            return solution, max(1.0, float(speeds.max() / speeds[k]) ** SPEED_EXPONENT)
     return None, 1.0
 
 

@@ -34,7 +34,8 @@ VIBRATION_ROUNDING_ERROR = 1e-14  # of the stability function R, growing with th
 
 EQUILIBRIUM_ROUNDING_ERROR = 1e-14  # relative step at t = 0 below which nothing changes
 MACHINE_EQUILIBRIUM_ROUNDING_ERROR = 1e-13  # the same of machines, beside the coordinates
-# Relative step, if not half of the one before, that is rounding of an ill-conditioned stiffness.
+# A relative step below it that is not half of the one before is rounding of an ill-conditioned
+# stiffness.
 EQUILIBRIUM_STALLED_ERROR = 1e-8
 IDENTITY_ROUNDING_ERROR = 1e-9  # of T'KT that is still taken for the identity
 PROPORTION_ROUNDING_ERROR = 1e-12  # relative, of integrals that are a factor times others
@@ -58,7 +59,7 @@ INVERTED_MATRICES_CHUNK = 512  # matrices at a time: they stay in the processor'
 # -- radau: grids ----------------------------------------------------------------------------
 
 RADAU_GRIDS_LIMIT = 12  # each at least 1.1 times finer
-RADAU_STEPS_LIMIT = 30_000  # of a grid; fewer where they take more than
+RADAU_STEPS_LIMIT = 30_000  # of a grid; fewer where they take more than so many bytes
 RADAU_BYTES_LIMIT = 3e9
 # An error above this is no estimate: of a grid that Newton's method has solved in windows, or so
 # many times that of a coarser one, it tells that the steps find another motion than finer ones
@@ -131,7 +132,7 @@ BATCH_NEWTON_SHARE = 1e-3
 PILOT_NEWTON_SHARE = 0.1
 # Steps grow with the speed of the slowest vibration to this power: lighter payloads vibrate faster,
 # and less. Paper's example, 4 kg against 6 kg: 0.4 initial, 0.6 optimised.
-STEPS_BY_SPEED_EXPONENT = 0.5
+SPEED_EXPONENT = 0.5
 BATCH_SIZE_LIMIT = 40_000  # steps times coordinates: with more, arrays leave the processor's cache
 
 # -- generalized_alpha -----------------------------------------------------------------------

@@ -395,8 +395,8 @@ def simulate_batch(
             1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
-        In the scenes' order; of one that fails, or bends by more than `march.VALID` of an arm's
-        length, its error, see `simulate`.
+        In the scenes' order; of one that fails, or bends by more than `DEFLECTION_LIMIT` of an
+        arm's length, its error, see `simulate`.
     """
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
     problems = _problems(scenes, bodies)

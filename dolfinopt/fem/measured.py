@@ -29,7 +29,7 @@ STIFFNESS_ROUNDING_LIMIT = 1e-3
 # translations, the assembled matrix does: where they are lost in it, refinement fails.
 ROUNDING_TRANSLATION_SHARE = 0.03
 ROUNDING_ITERATIONS = 6  # of that estimate; four give two digits
-DEFLECTION_ROUNDING_ERROR = 1e-8  # of a deflection that may come of factors of long arms
+DEFLECTION_ROUNDING_ERROR = 1e-8  # of a deflection, by factors of long arms
 # Ratio of Young's moduli up to which floating solids do no harm: the stiffness of an arm is then
 # off by at most a few 1e-7, from rounding.
 HARMLESS_CONTRAST = 1e6

@@ -34,11 +34,11 @@ FLAT_VOLUME_SHARE = 1e-6  # of the cube of a cell's longest edge, below which it
 #   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
 # Fill-in of a nested dissection makes both grow faster than n.
 RANK_BYTES = 0.2e9  # of a rank without cells
-BUDGET_CELLS = 38_400  # with so many
-CELL_BYTES = 6.9e3  # a cell takes so much,
-FILL_BYTES = 0.2e3  # more for every doubling,
-CELL_SECONDS = 32e-6  # and so long,
-CELL_SECONDS_EXPONENT = 0.33  # growing as this power of n
+BUDGET_CELLS = 38_400  # n for which the next ones hold
+CELL_BYTES = 6.9e3  # of a cell
+FILL_BYTES = 0.2e3  # more, of a cell, for every doubling of n
+CELL_SECONDS = 32e-6  # s, of a cell
+CELL_SECONDS_EXPONENT = 0.33  # power of n with which that grows
 SMALL_MESH_CELLS = 100_000  # of all arms, 1 GB: not worth a look
 # Bytes a node of a quadratic element over those of others: 400 x 24 of them, with the nodes of
 # 800 x 48 others, take the latters' time.

@@ -40,7 +40,8 @@ FOLLOWED_RESIDUAL_SHARE = 1e-9  # of the reach, above which a pose is not reache
 # Singular values of the Jacobian, rotations times the reach, over the largest: below it the joints'
 # rates lose their digits.
 SINGULAR_VALUE_RATIO = 1e-6
-FOLLOWING_STEPS = 50  # of the dense table, cut where Newton's method needs it, or for each row
+# Least steps of the dense table, and a row of the path's; cut where Newton's method needs it.
+FOLLOWING_STEPS = 50
 FOLLOWING_STEPS_A_ROW = 2
 LEAST_FOLLOWING_SHARE = 1e-7  # of the duration: a shorter step has no continuation
 JOINT_STEP_LIMIT = 0.3  # rad, or of the reach: a longer Newton step may lead to another solution

@@ -45,7 +45,7 @@ SHIFT_TOLERANCE = 1e-12
 RESPONSE_TOLERANCE = 1e-10
 # Directions whose response is below this part of the largest are lost in that.
 RESPONSE_RANK_SHARE = 1e-10
-# Part of the length of a vector of the responses' Krylov space whose remainder is rounding.
+# Part of the length of a vector of their Krylov space, below which its remainder is rounding.
 RESPONSE_DEFLATION_SHARE = 1e-12
 
 # -- subspace --------------------------------------------------------------------------------

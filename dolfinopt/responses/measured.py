@@ -17,7 +17,7 @@ STIFFENING_UNKNOWN_CHANGE = 2e-3  # that from which it is taken where the compar
 
 # -- order_selection -------------------------------------------------------------------------
 
-# The motion is compared with one of so many coordinates, or so many times those tried.
+# The motion is compared with one of at least so many coordinates, and so many times those tried.
 RICHER_COORDINATES = 24
 RICHER_RATIO = 2
 TRIED_COORDINATES_LIMIT = 48  # of an arm
