@@ -94,7 +94,7 @@ def test_mumps_solves_several_loads_at_once(pivot):
 @pytest.mark.serial
 def test_large_plane_arms_take_mumps(monkeypatch):
     """By their rows, on one rank; the objective stays the same to rounding of the factors."""
-    monkeypatch.setattr(interior, "MOST_WORK", 0.0)  # no band
+    monkeypatch.setattr(interior, "BAND_WORK_LIMIT", 0.0)  # no band
     found = {}
     for name, rows in (("petsc", np.inf), ("mumps", 100)):
         monkeypatch.setattr(interior, "MUMPS_ROWS", rows)

@@ -34,17 +34,17 @@ from dolfinopt.scene import load as scenes
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import STATICS, needs_alone
 
-THRESHOLDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
+THRESHOLD_BOUNDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 
 # Share of the least change that an optimisation looks at, or of the simulation's tolerance, that
 # iterative solutions may leave; and what they leave, in their tolerance, with any contrast and
 # islands (docs/pages/theory/elements.md): up to five times it in a cell's derivative, of the
 # largest, once in mass and inertia. In geometric stiffness, itself a correction, it is forty times.
-SHARE, LEFT = 1e-3, 5.0
+FIELD_ERROR_SHARE, FIELD_ERROR_RATIO = 1e-3, 5.0
 FIELD_TOLERANCES = 1e-10, 1e-6  # bounds
 
 # How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
-CLIPPED = 1e-10
+CLIPPED_DENSITY_LIMIT = 1e-10
 
 
 def field_tolerance(scene: scenes.Scene) -> float:
@@ -54,8 +54,9 @@ def field_tolerance(scene: scenes.Scene) -> float:
     optimisation ends, the bodies to a part of the simulation's tolerance.
     """
     optimizer = scene.optimizer
-    least = min(optimizer.tolerance, optimizer.kkt_tolerance, scene.simulation.tolerance * LEFT)
-    return float(np.clip(SHARE * least / LEFT, *FIELD_TOLERANCES))
+    simulated = scene.simulation.tolerance * FIELD_ERROR_RATIO
+    least = min(optimizer.tolerance, optimizer.kkt_tolerance, simulated)
+    return float(np.clip(FIELD_ERROR_SHARE * least / FIELD_ERROR_RATIO, *FIELD_TOLERANCES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +161,8 @@ class Arm:
         x_filtered = self.smoothed(x)
         clipped = None
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
-            clipped = (x_filtered < -CLIPPED) | (x_filtered > 1.0 + CLIPPED)
+            beyond = CLIPPED_DENSITY_LIMIT
+            clipped = (x_filtered < -beyond) | (x_filtered > 1.0 + beyond)
         x_phys = self.mesh.keep(np.clip(x_filtered, 0.0, 1.0))
         return PhysicalDesign(x_phys, None, clipped)
 
@@ -196,12 +198,12 @@ class Arm:
     def preserving_threshold(self, x: np.ndarray, beta: float) -> float:
         """Return the projection's threshold that keeps the volume of x (collective on the arm).
 
-        Within `THRESHOLDS`: where all that is left between void and solid is nearly void, the
+        Within `THRESHOLD_BOUNDS`: where all that is left between void and solid is nearly void, the
         volume alone would choose a threshold among the void cells.
         """
         area = self._active(self.mesh.area)
         eta = preserving_threshold(self.physical(x), area, beta, self.mesh.comm)
-        return float(np.clip(eta, *THRESHOLDS))
+        return float(np.clip(eta, *THRESHOLD_BOUNDS))
 
     def backward(self, gradient: np.ndarray, design: PhysicalDesign | None = None) -> np.ndarray:
         """Return the derivative with respect to x from that with respect to x_phys.

@@ -139,8 +139,8 @@ def _of_shifted(by_shifted: RigidIntegrals, lever: complex) -> RigidIntegrals:
 # -- the arm by itself -----------------------------------------------------------------------
 
 RITZ_VECTORS = 4  # in space bending in two planes comes in pairs
-SETTLED = 1e-5  # relative change of the first eigenvalue after which no more iterations are made
-MAX_ITERATIONS = 50  # two to four are enough unless the arm has many modes of one frequency
+EIGENVALUE_CHANGE = 1e-5  # relative, of the first one, after which no more iterations are made
+SUBSPACE_ITERATIONS = 50  # two to four are enough unless the arm has many modes of one frequency
 
 
 def full_first_frequency(arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: np.ndarray) -> float:
@@ -159,7 +159,7 @@ def full_first_frequency(arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: n
     count = min(len(K_r), RITZ_VECTORS)
     values, vectors = _agreed(arm, *eigh(K_r, M_r, subset_by_index=[0, count - 1]))
     free, loads = FreeArm(arm), arm.mass_times(V @ vectors)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(SUBSPACE_ITERATIONS):
         Z = free.solve(arm.restrict(loads))
         MZ = arm.mass_times(Z)
         flat = Z.reshape(-1, count).T
@@ -167,7 +167,7 @@ def full_first_frequency(arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: n
         K, M = arm.comm.allreduce(products) if arm.comm.size > 1 else products
         before = values[0]
         values, vectors = _agreed(arm, *eigh(0.5 * (K + K.T), 0.5 * (M + M.T)))
-        if before - values[0] <= SETTLED * values[0]:
+        if before - values[0] <= EIGENVALUE_CHANGE * values[0]:
             break
         loads = MZ @ vectors
     return float(np.sqrt(max(values[0], 0.0)) / (2.0 * np.pi))

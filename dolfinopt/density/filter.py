@@ -9,19 +9,17 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
+from dolfinopt.density.measured import (
+    COLUMN_PLACES,
+    FACET_SKEW_LIMIT,
+    LEAST_SIDE_DISTANCE,
+    MIRROR_DISTANCE_LIMIT,
+)
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
 from dolfinopt.mesh.checks import facet_areas, facet_corners
 from dolfinopt.solver import conjugate_gradients, direct_solver
-
-# Distance of a facet's midpoint from the foot of the perpendicular through the cell's centroid, in
-# lengths of the facet, up to which a cell counts as a rectangle or an equilateral triangle. Gmsh
-# places points to 1e-9 of a slender cell.
-SKEW = 1e-6
-# Least distance of a centroid from a side, in areas over side lengths, in the stabilisation: 1/2 in
-# a parallelogram, 2/3 in a triangle; it may vanish in a quadrilateral that is hardly convex.
-NEAREST = 0.05
 
 
 class HelmholtzFilter:
@@ -66,7 +64,7 @@ class HelmholtzFilter:
         r = radius / (2.0 * np.sqrt(3.0))
         sides = _sides(mesh, open_edges)
         skew = mesh.comm.allgather(float(sides.skew.max(initial=0.0)))
-        self.keeps_bounds = max(skew) <= SKEW
+        self.keeps_bounds = max(skew) <= FACET_SKEW_LIMIT
         self._scheme = (_TwoPoint if self.keeps_bounds else _Hybrid)(mesh, sides, r)
 
     def forward(self, x: np.ndarray) -> np.ndarray:
@@ -102,7 +100,7 @@ class _Sides:
     def distance(self) -> np.ndarray:
         """Distance (n, k) of the centroid from the side, m."""
         distance = np.einsum("nki,nki->nk", self.normal, self.arm)
-        return np.maximum(distance, NEAREST * self.area[:, None] / self.length)
+        return np.maximum(distance, LEAST_SIDE_DISTANCE * self.area[:, None] / self.length)
 
     @property
     def skew(self) -> np.ndarray:
@@ -322,12 +320,6 @@ def _positive_definite(mat: PETSc.Mat) -> PETSc.Mat:
 
 # -- designs that are symmetric about an arm's axis or planes, or the same over its thickness ----
 
-# Largest distance of a cell from the mirror image of its partner, in square roots of its area, in
-# space cubic roots of its volume. Meshes of symmetric geometries that were made without a thought
-# of symmetry: 0.7 to 1.0.
-TOLERANCE = 1.25
-SAME_PLACE = 1e7  # places across a mesh that are told apart
-
 
 class AxisSymmetry:
     """Make a cell field symmetric about y = 0, or z = 0: y = (x + x[mirror]) / 2.
@@ -358,13 +350,13 @@ class AxisSymmetry:
         distance, mirror = cKDTree(everywhere).query(everywhere * sign)
         off = distance / (np.sqrt(area) if mesh.dim == 2 else np.cbrt(area))
         worst = int(np.argmax(off))
-        if off[worst] > TOLERANCE:
+        if off[worst] > MIRROR_DISTANCE_LIMIT:
             place = ", ".join(f"{x:.4g}" for x in everywhere[worst])
             key, name = ("symmetric", "y") if axis == 1 else ("symmetric_z", "z")
             raise InputError(
                 f"arm {mesh.name!r}: {key} = true, but the mesh is not symmetric about {name} = 0: "
-                f"the cell at ({place}) m has no mirror image within {TOLERANCE:g} cell "
-                "sizes; correct the geometry, or mesh one half and mirror it"
+                f"the cell at ({place}) m has no mirror image within {MIRROR_DISTANCE_LIMIT:g} "
+                "cell sizes; correct the geometry, or mesh one half and mirror it"
             )
         self.mirror = mirror
 
@@ -397,7 +389,7 @@ class Extrusion:
         first = sum(counts[: self.comm.rank])
         places = np.concatenate(self.comm.allgather(mesh.centroid[:, :2]))
         size = np.abs(places).max()
-        _, column = np.unique(np.rint(places / size * SAME_PLACE), axis=0, return_inverse=True)
+        _, column = np.unique(np.rint(places / size * COLUMN_PLACES), axis=0, return_inverse=True)
         self._column = column.ravel()[first : first + mesh.num_cells]
         self._count = np.bincount(column.ravel())
 

@@ -8,14 +8,9 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage
 
+from dolfinopt.density.measured import CELL_SAMPLES, CORNER_LENGTH_RATIO, SAMPLES_LIMIT
 from dolfinopt.mesh.checks import cell_volumes
 
-# Samples along a cell of the mean area, and in all: a width is known to a sample.
-SAMPLES = 4
-MOST = 1_000_000
-# A piece that hangs on the rest by one end is a corner up to this length, in widths, and a member
-# beyond. Two straight edges that meet at less than 23 degrees make the longest corners.
-CORNER = 2.0
 EIGHT = np.ones((3, 3), dtype=bool)
 
 
@@ -86,7 +81,7 @@ def _sampled(corners: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, float]
     extent = corners.max(axis=(0, 1)) - low
     x, y = np.moveaxis(corners, 2, 0)
     area = 0.5 * np.abs((x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1))
-    size = max(np.sqrt(np.median(area)) / SAMPLES, np.sqrt(extent.prod() / MOST))
+    size = max(np.sqrt(np.median(area)) / CELL_SAMPLES, np.sqrt(extent.prod() / SAMPLES_LIMIT))
     counts = np.maximum(np.rint(extent / size).astype(int), 1)
     size = float(extent[0] / counts[0])
     raster = np.full(counts, -1, dtype=np.int8)
@@ -157,7 +152,7 @@ def _thinner(inside: np.ndarray, depth: np.ndarray, diameter: int) -> Place | No
         return _place(int(np.argmax(np.where(pieces == number, depth, 0.0))), depth)
 
     longest = np.asarray(ndimage.maximum(away, pieces, numbers))
-    if (longest > CORNER * diameter).any():
+    if (longest > CORNER_LENGTH_RATIO * diameter).any():
         return middle(1 + int(np.argmax(longest)))
     for number, box in zip(numbers, ndimage.find_objects(pieces), strict=True):
         around = tuple(slice(max(s.start - 1, 0), s.stop + 1) for s in box)

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.optimize import brentq
 
-MIDDLE = 0.5  # threshold where none is better than another
+MIDDLE_THRESHOLD = 0.5  # threshold where none is better than another
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def robust_thresholds(erosion: float, dilation: float) -> tuple[float, float, fl
 
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
     """
-    return MIDDLE + erosion, MIDDLE, MIDDLE - dilation
+    return MIDDLE_THRESHOLD + erosion, MIDDLE_THRESHOLD, MIDDLE_THRESHOLD - dilation
 
 
 def preserving_threshold(x: np.ndarray, area: np.ndarray, beta: float, comm: MPI.Comm) -> float:
@@ -81,6 +81,6 @@ def preserving_threshold(x: np.ndarray, area: np.ndarray, beta: float, comm: MPI
         return float(comm.allreduce(area @ (project(x, beta, eta).value - x)))
 
     if beta == 0.0 or not gain(0.0) > 0.0 > gain(1.0):
-        return MIDDLE
+        return MIDDLE_THRESHOLD
     # As exact as eta can be: the volume is then right to about beta times its rounding.
     return float(brentq(gain, 0.0, 1.0, xtol=1e-16, rtol=4.0 * np.finfo(float).eps))

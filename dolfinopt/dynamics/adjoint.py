@@ -27,6 +27,11 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.measured import (
+    ADJOINT_CONTRACTION_LIMIT,
+    ADJOINT_CORRECTION_SHARE,
+    KEPT_MATRICES_BYTES,
+)
 from dolfinopt.dynamics.newton import (
     NewtonMatrix,
     factorise,
@@ -36,11 +41,6 @@ from dolfinopt.dynamics.newton import (
 )
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-
-# Share of the multipliers that a correction may have left: their error is a tenth of it or less.
-ENOUGH = 1e-8
-POOR = 0.3  # contraction above which more coordinates are treated densely
-KEPT_BYTES = 64e6  # of factors that are kept for further functions
 
 _Factors = tuple[NewtonMatrix, Linearisation]
 
@@ -110,7 +110,7 @@ class Adjoint:
         q, qd, a = (x[part] for x in self._at)
         matrix = factorise(window, q, qd, a, slow)
         exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
-        if len(window.h) == len(self._stages.h) and matrix.inverse.nbytes <= KEPT_BYTES:
+        if len(window.h) == len(self._stages.h) and matrix.inverse.nbytes <= KEPT_MATRICES_BYTES:
             self._kept = {key: (matrix, exact)}
         return matrix, exact
 
@@ -152,10 +152,10 @@ def _answered(
     after: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return a window's multipliers and dJ by the state (2, N) at its beginning, or None."""
-    # None where corrections do not shrink by `POOR`.
+    # None where corrections do not shrink by `ADJOINT_CONTRACTION_LIMIT`.
     multipliers = matrix.solve_transposed(by_a, by_y, after)
     size = np.abs(multipliers).max()
-    enough = ENOUGH * size
+    enough = ADJOINT_CORRECTION_SHARE * size
     while True:
         gradient = exact.transposed(multipliers.reshape(-1, by_a.shape[2]))
         more_a, more_y = vector_jacobian_product(
@@ -166,7 +166,7 @@ def _answered(
             return multipliers, _before(matrix.stages, left_y, after)
         step = matrix.solve_transposed(left_a, left_y, after)
         before, size = size, np.abs(step).max()
-        if not size <= POOR * before:
+        if not size <= ADJOINT_CONTRACTION_LIMIT * before:
             return None
         multipliers += step
 

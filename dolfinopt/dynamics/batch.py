@@ -24,13 +24,22 @@ from dolfinopt.dynamics.collocation import (
     steps_between_breakpoints,
 )
 from dolfinopt.dynamics.elastic_system import (
-    REFERENCES,
     ElasticInstants,
     ElasticSystem,
     Modes,
     modes_of,
     proportion,
     static_equilibrium,
+)
+from dolfinopt.dynamics.measured import (
+    BATCH_GRIDS_LIMIT,
+    BATCH_NEWTON_SHARE,
+    BATCH_SIZE_LIMIT,
+    MEAN_MASS_INSTANTS,
+    PILOT_NEWTON_SHARE,
+    PILOTS_LIMIT,
+    RADAU_ESTIMATE_SHARE,
+    SPEED_EXPONENT,
 )
 from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
@@ -53,15 +62,6 @@ RUNS = Tuning(
     keep_near=0.6,
     matrices=6,
 )
-MAX_GRIDS = 4  # refinements until a system is left to `radau.integrate`
-MAX_PILOTS = 3  # systems that are tried for a first, rough solution
-# What Newton may leave, about, over the tolerance: of values, and of a first, rough solution.
-GOAL, PILOT_GOAL = 1e-3, 0.1
-# Steps grow with the speed of the slowest vibration to this power: lighter payloads vibrate
-# faster, and less. Paper's example, 4 kg against 6 kg: 0.4 initial, 0.6 optimised.
-GROWTH = 0.5
-# Steps times coordinates of a batch: with more, arrays leave the processor's cache.
-MAX_SIZE = 40_000
 
 
 def integrate(
@@ -70,7 +70,7 @@ def integrate(
     stages: int,
     profile: Profile,
     guesses: Sequence[Solution | None],
-    goal: float = GOAL,
+    goal: float = BATCH_NEWTON_SHARE,
 ) -> list[Solution | ConvergenceError]:
     """Solve every system as `radau.integrate` does, related ones at once.
 
@@ -153,10 +153,10 @@ def _together(
             left = np.array([i for i in left if guesses[i] is not None], dtype=int)
     own = [one is not None for one in known]  # whether a guess is of the system itself
     tuning = replace(RUNS, goal=goal)
-    for _ in range(MAX_GRIDS):
+    for _ in range(BATCH_GRIDS_LIMIT):
         missing = []
         for steps, group in _groups(batch, left, guesses, own, more, tolerance, stages).items():
-            most = max(1, MAX_SIZE // (rest.shape[1] * sum(steps)))
+            most = max(1, BATCH_SIZE_LIMIT // (rest.shape[1] * sum(steps)))
             for first in range(0, len(group), most):
                 members = np.array(group[first : first + most])
                 time_grids = _common_time_grids([batch.members[i] for i in members], steps)
@@ -174,7 +174,7 @@ def _together(
                         continue
                     profile.counts.newton_iterations += solution.iterations
                     guesses[i], own[i] = solution, True
-                    if solution.error <= radau.ACCEPT * tolerance:
+                    if solution.error <= RADAU_ESTIMATE_SHARE * tolerance:
                         found[i] = solution
                     else:
                         missing.append(i)
@@ -225,10 +225,10 @@ def _pilot(
 ) -> tuple[Solution | None, float]:
     """Solve the middle one of the systems, or one beside it, on a first grid; None if it fails."""
     # The second value is how many times more steps the fastest one may need.
-    batch, tuning = modes.system, replace(RUNS, goal=PILOT_GOAL)
+    batch, tuning = modes.system, replace(RUNS, goal=PILOT_NEWTON_SHARE)
     horizons = np.array([batch.members[i].breakpoints[-1] for i in members])
     speeds = horizons * modes.frequencies[members].min(axis=1)
-    for k in range(len(members) // 2, len(members))[:MAX_PILOTS]:
+    for k in range(len(members) // 2, len(members))[:PILOTS_LIMIT]:
         own = members[k : k + 1]
         system = batch.members[own[0]]
         grid = even_steps(system, first_num_steps(system))[None]
@@ -236,7 +236,7 @@ def _pilot(
         (solution,) = _on_grid(chosen, grid, stages, rest[own], [None], tolerance, tuning)
         if solution is not None:
             profile.counts.newton_iterations += solution.iterations
-            return solution, max(1.0, float(speeds.max() / speeds[k]) ** GROWTH)
+            return solution, max(1.0, float(speeds.max() / speeds[k]) ** SPEED_EXPONENT)
     return None, 1.0
 
 
@@ -363,7 +363,7 @@ class BatchSystem:
     def preconditioner(self) -> BatchModes:
         """Return its own coordinates: they are vibrations."""
         size = self.num_coordinates
-        shares = np.linspace(0.0, 1.0, REFERENCES)
+        shares = np.linspace(0.0, 1.0, MEAN_MASS_INSTANTS)
         t = np.array([member.breakpoints[-1] * shares for member in self.members])
         rest = np.zeros((t.size, size))
         derivative = self.at(t.ravel()).linearise(rest, rest, rest).dense()

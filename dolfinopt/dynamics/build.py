@@ -12,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.measured import SAME_INSTANT_SHARE, TABLE_BREAKPOINTS_LIMIT
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.mechanism import (
@@ -34,9 +35,6 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, Curve, read_table
 from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.load import Arm, Scene
-
-MAX_ROWS = 50  # of a table of forces whose rows begin steps; more are fine as a curve
-SAME_TIME = 1e-6  # share of the horizon within which two instants are one
 
 
 def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
@@ -241,8 +239,8 @@ def _with_rows(instants: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
     if scene.control is None or scene.control.forces is None:
         return instants
     times = _forces(scene.control.forces, scene.driven)[0]
-    times = times if len(times) <= MAX_ROWS else times[-1:]
-    apart = SAME_TIME * scene.motion.horizon
+    times = times if len(times) <= TABLE_BREAKPOINTS_LIMIT else times[-1:]
+    apart = SAME_INSTANT_SHARE * scene.motion.horizon
     found = list(instants)
     for t in map(float, times[(times > 0.0) & (times < scene.motion.horizon)]):
         if min(abs(t - other) for other in found) > apart:

@@ -11,6 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
+from dolfinopt.dynamics.measured import (
+    COMPARED_STEP_COUNTS,
+    EVEN_STEPS_ROUNDING,
+    EXTREME_EXCESS_SHARE,
+    FIRST_GRID_STEPS_LIMIT,
+    LONG_MOTION_INSTANTS,
+    RESPONSE_INSTANTS_LIMIT,
+    RESPONSE_INTERVAL,
+    STEPS_PER_PERIOD,
+    VIBRATION_ROUNDING_ERROR,
+)
 from dolfinopt.dynamics.system import (
     Instants,
     Linearisation,
@@ -292,16 +303,6 @@ def lagrange_derivatives(nodes: np.ndarray, tau: np.ndarray) -> np.ndarray:
 # -- time grids: steps of an integrator, and the instants at which responses look at its
 # solution
 
-STEPS_PER_PERIOD = 8.0  # of the slowest vibration
-MOST_STEPS = 20_000  # of a first grid: more are asked for by estimated errors alone
-LONGEST = 1e-3  # s from one instant to the next
-MOST_INSTANTS = 1_000_000  # `LONGEST` apart; they take 1 GB and 3 s
-OF_LONG_MOTIONS = 100_000  # instants of a longer motion, unless it bends faster
-# Share of the largest elastic deflection by which an extreme may exceed its neighbouring instants:
-# the default simulation.tolerance.
-EXCEEDED = 1e-4
-EVEN = 1e-9  # difference of steps, over the time between breakpoints, that is rounding
-
 
 def even_steps(system: System, count: int) -> np.ndarray:
     """Return the ends (n + 1,) of about `count` even steps between the breakpoints, s."""
@@ -321,7 +322,7 @@ def first_num_steps(system: System) -> int:
     pieces = len(system.breakpoints) - 1
     smooth = 20 * min(pieces, 4) + 5 * max(pieces - 4, 0)  # many pieces are short ones
     wanted = STEPS_PER_PERIOD * horizon * slowest / (2.0 * np.pi)
-    return int(np.clip(wanted, smooth, MOST_STEPS))
+    return int(np.clip(wanted, smooth, FIRST_GRID_STEPS_LIMIT))
 
 
 def divided(system: System, time_grid: np.ndarray, count: int) -> np.ndarray:
@@ -343,7 +344,8 @@ def is_graded(system: System, time_grid: np.ndarray) -> bool:
         return False  # those of a system with another horizon
     ends = np.searchsorted(time_grid, system.breakpoints)
     return any(
-        np.ptp(np.diff(time_grid[first : last + 1])) > EVEN * (time_grid[last] - time_grid[first])
+        np.ptp(np.diff(time_grid[first : last + 1]))
+        > EVEN_STEPS_ROUNDING * (time_grid[last] - time_grid[first])
         for first, last in pairwise(ends)
     )
 
@@ -364,9 +366,9 @@ def response_instants(
 
     They lie evenly from 0 to the horizon, both included, at most 1 ms apart (of a horizon above
     1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
-    that it could exceed two neighbouring instants by more than `EXCEEDED` of its largest value:
-    between instants d apart by max |qdd| d^2 / 8 at most. More than two for each stage of a step
-    say nothing new of a polynomial.
+    that it could exceed two neighbouring instants by more than
+    `EXTREME_EXCESS_SHARE` of its largest value: between instants d apart by max |qdd| d^2 / 8 at
+    most. More than two for each stage of a step say nothing new of a polynomial.
 
     Args:
         solution: the integrator's.
@@ -375,15 +377,17 @@ def response_instants(
         horizon: s.
         least: number of intervals that are wanted at least.
     """
-    count = max(1, int(np.ceil(horizon / LONGEST * (1.0 - 1e-9))))
-    if count > MOST_INSTANTS:
-        count = OF_LONG_MOTIONS
+    count = max(1, int(np.ceil(horizon / RESPONSE_INTERVAL * (1.0 - 1e-9))))
+    if count > RESPONSE_INSTANTS_LIMIT:
+        count = LONG_MOTION_INSTANTS
     largest = _largest(solution.q[:, elastic], stiffness)
     wanted = float(least)
     if largest > 0.0:
         bend = _largest(solution.a[..., elastic], stiffness)
         known = 2.0 * solution.a.shape[0] * solution.a.shape[1]
-        wanted = max(wanted, min(horizon * np.sqrt(bend / (8.0 * EXCEEDED * largest)), known))
+        wanted = max(
+            wanted, min(horizon * np.sqrt(bend / (8.0 * EXTREME_EXCESS_SHARE * largest)), known)
+        )
     return np.linspace(0.0, horizon, count * max(1, int(np.ceil(wanted / count))) + 1)
 
 
@@ -454,11 +458,6 @@ def spend(amount: float) -> None:
 # Without damping it is there to the end, though. So estimated by the amplitude at each breakpoint,
 # asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
 
-# Numbers of steps, about sixteen of them, after which a free vibration is compared.
-LOOKS = 16
-FASTEST = 1e30  # rad/s: beyond, squares overflow
-ROUNDING = 1e-14  # of R, which grows with the steps
-
 
 @np.errstate(over="ignore")  # of what has no mass
 def unresolved(
@@ -483,9 +482,10 @@ def unresolved(
     k, d, m = (x[:, None] for x in single)
     jumps = _jumps(stages, single, states, breakpoint_steps)
     jumps[0, :, 0] -= k[:, 0] * rest
-    square = np.minimum(k / m, FASTEST**2)
+    fastest = 1e30  # rad/s: beyond, squares overflow
+    square = np.minimum(k / m, fastest**2)
     amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
-    decay = np.minimum(0.5 * (d / m), FASTEST)
+    decay = np.minimum(0.5 * (d / m), fastest)
     rate = -decay + np.sqrt((decay * decay - square).astype(complex))
     h = stages.h.reshape(stages.runs, -1, 1)[:, breakpoint_steps]
     lost = _lost(radau_iia(len(stages.method.c) + 1), rate * h, stages.length - breakpoint_steps)
@@ -523,7 +523,7 @@ def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
     values, X = np.linalg.eig(method.A)
     weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
     R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)
-    j = np.unique(np.geomspace(1.0, steps.max(), LOOKS).round())
+    j = np.unique(np.geomspace(1.0, steps.max(), COMPARED_STEP_COUNTS).round())
     apart = np.abs(np.exp(z[..., None] * j) - R[..., None] ** j)
-    seen = (j <= steps[:, None, None]) & (apart > ROUNDING * j)
+    seen = (j <= steps[:, None, None]) & (apart > VIBRATION_ROUNDING_ERROR * j)
     return np.where(seen, apart, 0.0).max(axis=-1)

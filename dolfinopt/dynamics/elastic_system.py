@@ -10,17 +10,20 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 
+from dolfinopt.dynamics.measured import (
+    EQUILIBRIUM_ITERATIONS,
+    EQUILIBRIUM_ROUNDING_ERROR,
+    EQUILIBRIUM_STALLED_ERROR,
+    IDENTITY_ROUNDING_ERROR,
+    MEAN_MASS_INSTANTS,
+    PROPORTION_ROUNDING_ERROR,
+)
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
-
-MAX_NEWTON = 50  # iterations for the equilibrium: it converges in 3 to 6, or folds
-ROUNDING = 1e-14  # a step below it changes nothing
-# A step below this that is not half of the one before is rounding of an ill-conditioned stiffness.
-STALLED = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +171,7 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
     q = rest = np.zeros((system.runs, size))
     before = np.full(system.runs, np.inf)
     found = np.zeros(system.runs, dtype=bool)
-    for _ in range(MAX_NEWTON):
+    for _ in range(EQUILIBRIUM_ITERATIONS):
         residual = instants.residual(q, rest, rest)
         found |= ~residual.any(axis=1)  # mostly at once: nothing loads the arms before they move
         if found.all():
@@ -180,8 +183,8 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
             break
         q = np.where(found[:, None], q, q + step)
         size_of_step = relative_errors(system, step[:, None], q[:, None])
-        stalled = (size_of_step <= STALLED) & (size_of_step >= 0.5 * before)
-        found |= (size_of_step <= ROUNDING) | stalled
+        stalled = (size_of_step <= EQUILIBRIUM_STALLED_ERROR) & (size_of_step >= 0.5 * before)
+        found |= (size_of_step <= EQUILIBRIUM_ROUNDING_ERROR) | stalled
         before = size_of_step
     return q, found
 
@@ -192,12 +195,6 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
 # for definite.
 
 Own = TypeVar("Own", bound="ElasticSystem")
-
-# What T'KT may be away from the identity, and is still taken for it.
-MODE_ROUNDING = 1e-9
-# Relative difference of the integrals that rounding makes of a factor.
-SAME = 1e-12
-REFERENCES = 3  # instants of the horizon whose mass is averaged: 1 to 9 cost the same iterations
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,8 +257,8 @@ def modes_of(system: Own) -> Modes[Own]:
     the rest. The change of coordinates is exact; only how well they uncouple rests on the mean.
     """
     mechanism, size = system.mechanism, system.num_coordinates
-    instants = system.at(np.linspace(0.0, system.breakpoints[-1], REFERENCES))
-    rest = np.zeros((REFERENCES, size))
+    instants = system.at(np.linspace(0.0, system.breakpoints[-1], MEAN_MASS_INSTANTS))
+    rest = np.zeros((MEAN_MASS_INSTANTS, size))
     mass = instants.linearise(rest, rest, rest).dense()[:, :, 2 * size :].mean(axis=0)
     bodies, transforms, inverses, frequencies = [], [], [], []
     for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
@@ -297,7 +294,7 @@ def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     # uses them sees that the coordinates are uncoupled by them.
     changed = body.in_basis(T)
     one = np.eye(len(changed.K))
-    if np.abs(changed.K - one).max(initial=0.0) > MODE_ROUNDING:
+    if np.abs(changed.K - one).max(initial=0.0) > IDENTITY_ROUNDING_ERROR:
         return changed
     share = proportion([body.K], [body.D])
     return replace(changed, K=one, D=changed.D if share is None else share * one)
@@ -312,6 +309,6 @@ def proportion(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> float
     place = np.unravel_index(np.abs(here[k]).argmax(), here[k].shape)
     factor = float(there[k][place] / here[k][place])
     for a, b, size in zip(here, there, largest, strict=True):
-        if np.abs(b - factor * a).max(initial=0.0) > SAME * abs(factor) * size:
+        if np.abs(b - factor * a).max(initial=0.0) > PROPORTION_ROUNDING_ERROR * abs(factor) * size:
             return None
     return factor

@@ -19,20 +19,19 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from dolfinopt.dynamics.collocation import GivenUp, Solution, even_steps, first_num_steps, spend
+from dolfinopt.dynamics.measured import (
+    ALPHA_AIM_SHARE,
+    ALPHA_CONTRACTION_LIMIT,
+    ALPHA_ESTIMATE_SHARE,
+    ALPHA_FAILURES_LIMIT,
+    ALPHA_NEWTON_ITERATIONS,
+    ALPHA_RESIDUAL_SHARE,
+    ALPHA_ROUNDING_ERROR,
+    ALPHA_STEPS_LIMIT,
+)
 from dolfinopt.dynamics.system import Instants, System, relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.profiling import Profile
-
-MAX_STEPS = 400_000
-MAX_NEWTON = 12  # iterations of a step, mostly one
-MAX_FAILURES = 3  # of Newton's method, on grids each four times finer than the one before
-SLOW = 0.03  # contraction of an iteration above which the tangent is renewed
-# Residual left in a step, as static deflection, in units of tolerance times the largest one.
-# A thousandth leaves room for resonance.
-REST = 1e-3
-ROUNDING = 1e-12  # no residual is asked to be smaller: cancellation between stiff coordinates
-ACCEPT = 0.8  # share of the tolerance that the estimate may take: it is good to some percent
-AIM = 0.6  # of a new grid, as a share of the tolerance
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,8 @@ def integrate(system: System, tolerance: float, rho_inf: float, profile: Profile
         profile: counts Newton iterations.
 
     Raises:
-        ConvergenceError: more than `MAX_STEPS` steps are needed, or Newton's method fails in a
-            step whatever its length.
+        ConvergenceError: more than `ALPHA_STEPS_LIMIT` steps are needed, or Newton's method fails
+            in a step whatever its length.
     """
     time_grid = even_steps(system, first_num_steps(system))
     coarse: Solution | None = None
@@ -86,7 +85,7 @@ def integrate(system: System, tolerance: float, rho_inf: float, profile: Profile
             raise
         except ConvergenceError:
             failures += 1
-            if failures == MAX_FAILURES:
+            if failures == ALPHA_FAILURES_LIMIT:
                 raise
             coarse, scaled, time_grid = None, np.nan, _divided(time_grid, 4)
             continue
@@ -94,16 +93,16 @@ def integrate(system: System, tolerance: float, rho_inf: float, profile: Profile
         if coarse is not None:
             difference = _difference(system, coarse, fine)
             error = _error(difference, scaled * (1.0 - 1.0 / ratio**2), ratio)
-            if error <= ACCEPT * tolerance:
+            if error <= ALPHA_ESTIMATE_SHARE * tolerance:
                 profile.counts.newton_iterations += iterations
                 return replace(fine, error=error, iterations=iterations)
             scaled = difference / (ratio**2 - 1.0)
-            growth = float(np.sqrt(error / (AIM * tolerance)))
-            if not growth * len(fine.a) <= MAX_STEPS:  # not a number included
+            growth = float(np.sqrt(error / (ALPHA_AIM_SHARE * tolerance)))
+            if not growth * len(fine.a) <= ALPHA_STEPS_LIMIT:  # not a number included
                 raise ConvergenceError(
                     f"generalised-alpha needs about {growth * len(fine.a):.2g} steps for the "
-                    f"simulation.tolerance of {tolerance:g}, more than {MAX_STEPS}; raise it or "
-                    'choose simulation.integrator = "radau"'
+                    f"simulation.tolerance of {tolerance:g}, more than {ALPHA_STEPS_LIMIT}; raise "
+                    'it or choose simulation.integrator = "radau"'
                 )
             # Above 4 a grid far from the tolerance would vouch for one that should meet it.
             ratio = int(np.clip(np.ceil(growth), 2, 4))
@@ -132,7 +131,9 @@ def on_grid(system: System, time_grid: np.ndarray, tolerance: float, rho_inf: fl
     q_0, qd = system.initial_state()
     free = not system.preconditioner().definite
     flexibility = _flexibility(system, free)
-    enough = max(REST * tolerance, ROUNDING) * _static_size(instants[:: _every(h)], flexibility)
+    enough = max(ALPHA_RESIDUAL_SHARE * tolerance, ALPHA_ROUNDING_ERROR) * _static_size(
+        instants[:: _every(h)], flexibility
+    )
     newton = _Newton(flexibility, weights, enough)
     q = np.empty((len(time_grid), system.num_coordinates))
     q[0], qd_0 = q_0[0], qd[0]
@@ -192,10 +193,10 @@ def _newmark(
 class _Newton:
     """Modified Newton's method: owns the inverse tangent, kept from step to step.
 
-    The tangent is renewed where an iteration leaves more than `SLOW` of the residual. A step
-    ends on the residual that its last correction is expected to leave, by the contraction
-    observed so far and trusted less with every step: rate^0.8, Hairer & Wanner (1996), IV.8,
-    doi:10.1007/978-3-642-05221-7. Most steps cost one evaluation of it.
+    The tangent is renewed where an iteration leaves more than `ALPHA_CONTRACTION_LIMIT` of the
+    residual. A step ends on the residual that its last correction is expected to leave, by the
+    contraction observed so far and trusted less with every step: rate^0.8, Hairer & Wanner (1996),
+    IV.8, doi:10.1007/978-3-642-05221-7. Most steps cost one evaluation of it.
 
     Attributes:
         iterations: corrections made.
@@ -222,7 +223,7 @@ class _Newton:
         if abs(h - self._h) > 1e-6 * h:
             self._renew(at, h, state, guess)
         a, rate, before = guess, self._rate**0.8, None
-        for _ in range(MAX_NEWTON):
+        for _ in range(ALPHA_NEWTON_ITERATIONS):
             residual = at.residual(*self._midpoint(h, state, a))
             norm = self._norm(residual)
             if before is None:
@@ -236,7 +237,7 @@ class _Newton:
                     self._renew(at, h, state, guess)
                     a, rate, before = guess, 1.0, None
                     continue
-                if rate > SLOW:
+                if rate > ALPHA_CONTRACTION_LIMIT:
                     self._renew(at, h, state, a)
                     rate = 1.0
             a = a - residual @ self._inverse_t

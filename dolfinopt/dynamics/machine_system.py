@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
+from dolfinopt.dynamics.measured import EQUILIBRIUM_ITERATIONS, MACHINE_EQUILIBRIUM_ROUNDING_ERROR
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
@@ -27,9 +28,6 @@ from dolfinopt.multibody.mechanism import Closure, Drives, ElasticBodies, repeat
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
-
-MAX_NEWTON = 50  # iterations for the state at the start: it converges in 3 to 8
-ROUNDING = 1e-13  # of a step of that iteration, beside the coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +346,7 @@ class MachineSystem:
         instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
         rest, ydd, step = (np.zeros_like(y) for _ in range(3))
         step, some = step[0], self._at_start
-        for _ in range(MAX_NEWTON):
+        for _ in range(EQUILIBRIUM_ITERATIONS):
             residual = instants.residual(y, rest, ydd)[0, some]
             if not residual.any():
                 return y, ydd[0, ground]
@@ -360,7 +358,7 @@ class MachineSystem:
             ydd[0, ground] += step[ground]
             step[ground] = 0.0
             y = y + step
-            if np.abs(step).max() <= ROUNDING * max(1.0, np.abs(y).max()):
+            if np.abs(step).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(1.0, np.abs(y).max()):
                 return y, ydd[0, ground]
         limited = bool(self.drives.limited.any())
         raise ConvergenceError(

@@ -27,6 +27,16 @@ from dolfinopt.dynamics.collocation import (
     tangent_at,
     vector_jacobian_product,
 )
+from dolfinopt.dynamics.measured import (
+    BLOCKS_BYTES,
+    DENSE_COORDINATES_LIMIT,
+    EXACT_COORDINATES_LIMIT,
+    FACTORS_BYTES,
+    INVERTED_MATRICES_CHUNK,
+    NEWTON_ROUNDING_ERROR,
+    NEWTON_SETTLED_STEP,
+    SLOW_ANGLES,
+)
 from dolfinopt.dynamics.system import Linearisation, State
 
 # -- Newton's matrix over a run of steps: dense in the slow coordinates, diagonal in the fast ----
@@ -41,19 +51,14 @@ from dolfinopt.dynamics.system import Linearisation, State
 # matrix decides about the number of iterations alone; with every coordinate slow it is exact.
 # Without J_fs, which costs a tenth of an iteration, it takes two to three times as many.
 
-BATCH_BYTES = 64e6  # blocks solved together: bounds the memory with many coordinates
-# Angles w h up to which coordinates are slow, tried in turn: 6 Newton iterations with 30 and 40, 10
-# with 20, in an optimisation of the paper's example.
-LIMITS = (40.0, 120.0, np.inf)
-# As long as not all must be, the slowest so many are: on short steps nearly all would.
-MOST = 24
-SMALL = 12  # coordinates up to which the exact matrix costs less than more iterations
-MEMORY_BYTES = 256e6  # of the factors of steps that are solved together
-
 
 def limits_for(stages: Stages) -> tuple[float, ...]:
     """Return the limits to try where an exact matrix saves repetitions: of few coordinates, it."""
-    return LIMITS if stages.preconditioner.system.num_coordinates > SMALL else LIMITS[-1:]
+    return (
+        SLOW_ANGLES
+        if stages.preconditioner.system.num_coordinates > EXACT_COORDINATES_LIMIT
+        else SLOW_ANGLES[-1:]
+    )
 
 
 def next_slow_coordinates(
@@ -69,8 +74,8 @@ def next_slow_coordinates(
         return np.arange(len(angles)), ()
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))
-    if limit < np.inf and len(slow) > MOST:
-        slow = np.sort(np.argsort(angles, kind="stable")[:MOST])
+    if limit < np.inf and len(slow) > DENSE_COORDINATES_LIMIT:
+        slow = np.sort(np.argsort(angles, kind="stable")[:DENSE_COORDINATES_LIMIT])
     if len(slow) <= more_than and beyond:
         return next_slow_coordinates(stages, tuple(beyond), more_than)
     return slow, tuple(beyond) if len(slow) < len(angles) else ()
@@ -83,9 +88,9 @@ def _bytes(stages: Stages) -> int:
 
 
 def windows(stages: Stages, slow: np.ndarray) -> list[slice]:
-    """Return runs of steps whose factors fit in `MEMORY_BYTES`: mostly one."""
+    """Return runs of steps whose factors fit in `FACTORS_BYTES`: mostly one."""
     size, count = len(slow), len(stages.h)
-    length = max(1, int(MEMORY_BYTES * count / (_bytes(stages) * size * size + 1)))
+    length = max(1, int(FACTORS_BYTES * count / (_bytes(stages) * size * size + 1)))
     return [slice(i, min(i + length, count)) for i in range(0, count, length)]
 
 
@@ -268,7 +273,7 @@ def factorise(
     slow_size = len(slow)
     inverse = np.empty((count, s * slow_size, s * slow_size))
     answer = np.empty((count, s, slow_size, 2 * slow_size))
-    chunk = max(1, int(BATCH_BYTES / (8 * max(1, s * slow_size) ** 2)))
+    chunk = max(1, int(BLOCKS_BYTES / (8 * max(1, s * slow_size) ** 2)))
     for first in range(0, count, chunk):
         part = slice(first, min(first + chunk, count))
         inside = tangent.window(part.start * s, part.stop * s).dense()
@@ -361,11 +366,6 @@ class WindowedNewtonMatrix:
 
 # -- Newton's method for all stages of all steps at once, of one run of steps or of many ---------
 
-# Relative steps and errors below this that do not fall any more are rounding.
-ROUNDING = 1e-9
-# The step below which a poor contraction is blamed on the matrix, no more on the nonlinearity.
-SETTLED = 0.01
-
 
 @dataclass(frozen=True)
 class Tuning:
@@ -383,7 +383,7 @@ class Tuning:
     """
 
     goal: float = 1e-7  # Taylor tests look at 1e-10
-    limits: tuple[float, ...] = LIMITS
+    limits: tuple[float, ...] = SLOW_ANGLES
     least_rate: float = 0.01
     keep: tuple[float, float] = (0.15, 0.3)  # half of it, or twice, take as long
     near: float = 0.0
@@ -530,9 +530,9 @@ class _Run:
     def _after_failure(self, size: float, age: int, exact: bool) -> bool:
         """Choose the next matrix; return whether there is one."""
         if exact and age == 0:  # rounding, where the step is small: nothing is left to gain
-            self.converged = bool(size <= max(self.tolerance, ROUNDING))
+            self.converged = bool(size <= max(self.tolerance, NEWTON_ROUNDING_ERROR))
             return False
-        if age == 0 or (age == 1 and self.before <= SETTLED):
+        if age == 0 or (age == 1 and self.before <= NEWTON_SETTLED_STEP):
             if self.simplified:
                 self.simplified = False
             elif self.limits:
@@ -670,8 +670,6 @@ def _left(rate: np.ndarray, tuning: Tuning) -> np.ndarray:
 # sweep over all steps. The tangent moves by some percent within a step: so do the iterations
 # contract. Source: Hairer & Wanner (1996), IV.8, doi:10.1007/978-3-642-05221-7.
 
-CHUNK = 512  # matrices that are inverted together: they stay in the processor's cache
-
 
 @dataclass(frozen=True, eq=False)
 class SimplifiedNewtonMatrix(NewtonMatrix):
@@ -763,8 +761,8 @@ def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: b
     count, size = jacobian.shape[:2]
     parts = np.empty((len(values), count, size, size), dtype=complex)
     K, D, M = np.split(jacobian.transpose(1, 2, 0), 3, axis=1)
-    for first in range(0, count, CHUNK):
-        part = slice(first, first + CHUNK)
+    for first in range(0, count, INVERTED_MATRICES_CHUNK):
+        part = slice(first, first + INVERTED_MATRICES_CHUNK)
         hl = values[:, None] * h[part]
         each_sum = M[:, :, None, part] + hl * (D[:, :, None, part] + hl * K[:, :, None, part])
         if definite:

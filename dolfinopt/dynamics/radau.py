@@ -38,10 +38,46 @@ from dolfinopt.dynamics.collocation import (
     step_ends,
     unresolved,
 )
+from dolfinopt.dynamics.measured import (
+    DEFLECTION_LIMIT,
+    DENSE_COORDINATES_LIMIT,
+    ESTIMATE_CONTRACTION_LIMIT,
+    ESTIMATE_CORRECTION_SHARE,
+    ESTIMATE_CORRECTIONS_LIMIT,
+    FAILED_STEP_RATIO,
+    FINER_GRID_ITERATIONS,
+    FIRST_GRID_ERROR,
+    FIRST_GRID_GROWTH_LIMIT,
+    FIRST_GRID_ITERATIONS_LIMIT,
+    FIRST_REFINEMENT_RATIO,
+    LATER_REFINEMENT_RATIO,
+    LEAST_STEP_SHARE,
+    LONGEST_WINDOW_STEPS,
+    LOST_MOTION_ERROR,
+    LOST_MOTION_ERROR_RATIO,
+    MARCH_ANGLE_BOUNDS,
+    MARCH_ANGLE_EXCESS,
+    MARCH_ITERATIONS_LIMIT,
+    MARCH_STEPS_LIMIT,
+    NEWTON_ROUNDING_ERROR,
+    RADAU_AIM_SHARE,
+    RADAU_BYTES_LIMIT,
+    RADAU_ESTIMATE_SHARE,
+    RADAU_GRIDS_LIMIT,
+    RADAU_STEPS_LIMIT,
+    RADAU_WORK_LIMIT,
+    RESTING_GROUP_SHARE,
+    SHORTEST_WINDOW_STEPS,
+    STALLED_ERROR_RATIO,
+    STALLED_GRIDS_LIMIT,
+    STEP_GROWTH_LIMIT,
+    STEPS_PER_PERIOD,
+    UNKNOWN_MOTION_STEPS,
+    WINDOW_MATRICES_LIMIT,
+    WINDOWS_ITERATIONS_LIMIT,
+)
 from dolfinopt.dynamics.newton import (
-    MOST,
     ONE_RUN,
-    ROUNDING,
     Iterate,
     NewtonMatrix,
     Tuning,
@@ -53,40 +89,12 @@ from dolfinopt.dynamics.newton import (
     simplified_newton_matrix,
     windows,
 )
-from dolfinopt.dynamics.system import LEAST_SHARE, Preconditioner, State, System
+from dolfinopt.dynamics.system import Preconditioner, State, System
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import SlowWork
 
-GOAL = ONE_RUN.goal  # what Newton may leave, as a share of the tolerance
-MAX_GRIDS = 12  # each at least 1.1 times finer
-# Steps of a grid; fewer where they take more than so many bytes.
-MAX_STEPS, MAX_BYTES = 30_000, 3e9
-# An error above `LOST` is no estimate: of a grid that Newton's method has solved in windows, or
-# `GREW` times that of a coarser one, it tells that the steps find another motion than finer ones
-# would. Then, and where Newton's method fails, the steps follow from a march along the motion; of a
-# motion that comes of that, it is given up. Of steps merely too long errors are below 1.
-LOST, GREW = 0.5, 1e3
-# Errors in turn that are not below this share of the one before until a motion is given up: as long
-# as a vibration is not resolved its error does not fall.
-STALLED, FELL = 4, 0.9
-# Least growth of the steps at the first refinement, and at most at later ones, where the order that
-# is seen decides: as long as vibrations are not resolved the error falls more slowly.
-REFINED, DOUBLED = 1.1, 2.0
-# Newton iterations times time steps, of all grids: 50 to 190 microseconds each with 8 to 20
-# coordinates; and of long motions so many iterations of their first grid.
-MAX_WORK, MAX_SWEEPS = 100_000, 100
-USUAL = 8  # iterations of a finer grid
-# Share of the tolerance that the estimate may take: it is 0.55 to 1 times the error.
-ACCEPT = 0.6
-# Aim of a new grid, as a share of the tolerance: the estimate varies by some ten percent between
-# neighbouring designs, and a grid that is refined twice costs more than one too fine.
-AIM = 0.4
-# Error with eight steps a period of the slowest vibration, by stages: paper's example, initial
-# design. The first grid is chosen by it where so many more steps are needed; else coarse.
-FIRST_ANGLE = 2.0 * np.pi / 8.0
-FIRST_ERROR = {1: np.inf, 2: 0.083, 3: 4.6e-3, 4: 1.1e-4, 5: 7e-6}
-FIRST_GROWTH = 1.6
+AIM = RADAU_AIM_SHARE  # as gradient checks know it
 
 
 def integrate(
@@ -113,10 +121,10 @@ def integrate(
     time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages)
     progress = SlowWork("simulation")
     most = _most_steps(preconditioner, stages)
-    work = max(MAX_WORK, MAX_SWEEPS * (len(time_grid) - 1))
+    work = max(RADAU_WORK_LIMIT, FIRST_GRID_ITERATIONS_LIMIT * (len(time_grid) - 1))
     iterations = stalled = coarse = 0
     before, marched = np.inf, False
-    for _ in range(MAX_GRIDS):
+    for _ in range(RADAU_GRIDS_LIMIT):
         progress.tell(f"{len(time_grid) - 1} time steps")
         try:
             found = _on_grid(preconditioner, time_grid, tolerance, stages, guess, progress)
@@ -126,16 +134,17 @@ def integrate(
             if marched:
                 raise
             found = None
+        # The steps then follow from a march along the motion; what is lost after that is given up.
         if found is None or (_is_lost(found, before) and not marched):
             found = _marched(preconditioner, len(time_grid) - 1, tolerance, stages, progress)
             before, marched = np.inf, True
         guess, iterations = found, iterations + found.iterations
-        if guess.error <= ACCEPT * tolerance:
+        if guess.error <= RADAU_ESTIMATE_SHARE * tolerance:
             profile.counts.newton_iterations += iterations
             return replace(guess, iterations=iterations)
         if _is_lost(guess, before):
             raise ConvergenceError(_lost_motion(system, guess))
-        stalled = stalled + 1 if guess.error > FELL * before else 0
+        stalled = stalled + 1 if guess.error > STALLED_ERROR_RATIO * before else 0
         work -= guess.iterations * len(guess.a)
         least = _least_growth(guess, before, coarse, tolerance)
         before, coarse = guess.error, len(guess.a)
@@ -145,8 +154,12 @@ def integrate(
             if guess.error > tolerance:
                 raise
             break
-        expected = USUAL * (len(time_grid) - 1)
-        if stalled == STALLED or (stalled and guess.error < ROUNDING) or expected > work:
+        expected = FINER_GRID_ITERATIONS * (len(time_grid) - 1)
+        if (
+            stalled == STALLED_GRIDS_LIMIT
+            or (stalled and guess.error < NEWTON_ROUNDING_ERROR)
+            or expected > work
+        ):
             break
     assert guess is not None
     if guess.error <= tolerance:  # finer steps have no room, and the estimate itself is met
@@ -161,29 +174,33 @@ def integrate(
 def _least_growth(found: Solution, before: float, coarse: int, tolerance: float) -> float:
     """Return the least growth of the steps by the order that the last refinement has shown."""
     if not before < np.inf:
-        return REFINED
+        return FIRST_REFINEMENT_RATIO
     growth = np.log(len(found.a) / coarse)
     order = np.log(before / found.error) / growth if growth > 0.0 else 0.0
     if order <= 0.0:
-        return DOUBLED
-    wanted = np.log(found.error / (AIM * tolerance)) / order
-    return float(np.exp(np.clip(wanted, np.log(REFINED), np.log(DOUBLED))))
+        return LATER_REFINEMENT_RATIO
+    wanted = np.log(found.error / (RADAU_AIM_SHARE * tolerance)) / order
+    return float(
+        np.exp(np.clip(wanted, np.log(FIRST_REFINEMENT_RATIO), np.log(LATER_REFINEMENT_RATIO)))
+    )
 
 
 def _most_steps(preconditioner: Preconditioner, stages: int) -> int:
     """Return how many steps have room: of machines every coordinate has dense blocks."""
     # Measured: 19 to 75 kB a step with 8 coordinates, 104 with 64, of a four-bar with 18 200.
     definite, size = preconditioner.definite, preconditioner.system.num_coordinates
-    dense, copies = (min(size, MOST), 1) if definite else (size, 4)
+    dense, copies = (min(size, DENSE_COORDINATES_LIMIT), 1) if definite else (size, 4)
     values = copies * (stages * stages + 2 * stages + 8) * dense * dense + 2500
-    return min(MAX_STEPS, int(MAX_BYTES / (8 * values)))
+    return min(RADAU_STEPS_LIMIT, int(RADAU_BYTES_LIMIT / (8 * values)))
 
 
 def _is_lost(found: Solution, before: float) -> bool:
-    """Return whether finer steps would find another motion, see `LOST`."""
+    """Return whether finer steps would find another motion, see `LOST_MOTION_ERROR`."""
     if not np.isfinite(found.error):
         return True
-    return found.error > LOST and (found.windows > 1 or found.error > GREW * before)
+    return found.error > LOST_MOTION_ERROR and (
+        found.windows > 1 or found.error > LOST_MOTION_ERROR_RATIO * before
+    )
 
 
 def _lost_motion(system: System, found: Solution) -> str:
@@ -210,10 +227,11 @@ def _marched(
     stages: int,
     progress: SlowWork,
 ) -> Solution:
-    """Return the solution on steps that follow the motion, see `march.graded`."""
+    """Return the solution on steps that follow the motion, see `graded`."""
     system = preconditioner.system
-    known = FIRST_ERROR[min(stages, 5)]
-    angle = 0.8 * FIRST_ANGLE * (AIM * tolerance / known) ** (1.0 / (2 * stages - 1))
+    known = FIRST_GRID_ERROR[min(stages, 5)]
+    angle = 2.0 * np.pi / STEPS_PER_PERIOD
+    angle = 0.8 * angle * (RADAU_AIM_SHARE * tolerance / known) ** (1.0 / (2 * stages - 1))
     step = system.breakpoints[-1] / count
     found = graded(preconditioner, step, angle, tolerance, stages, progress)
 
@@ -335,8 +353,8 @@ def next_time_grid(
     guess: Solution | None,
     tolerance: float,
     stages: int,
-    least: float = REFINED,
-    most: int = MAX_STEPS,
+    least: float = FIRST_REFINEMENT_RATIO,
+    most: int = RADAU_STEPS_LIMIT,
 ) -> np.ndarray:
     """Return steps that should meet the tolerance, from the estimated error of `guess`.
 
@@ -350,8 +368,8 @@ def next_time_grid(
         return _first_time_grid(system, tolerance, stages)
     count = len(guess.a)
     order = 2 * stages - 1  # at the steps' ends
-    growth = (guess.error / (AIM * tolerance)) ** (1.0 / order)
-    if guess.error > ACCEPT * tolerance:
+    growth = (guess.error / (RADAU_AIM_SHARE * tolerance)) ** (1.0 / order)
+    if guess.error > RADAU_ESTIMATE_SHARE * tolerance:
         wanted = int(np.ceil(count * min(max(growth, least), 8.0)))
         if wanted > most:
             raise GivenUp(
@@ -368,9 +386,9 @@ def next_time_grid(
 
 def _first_time_grid(system: System, tolerance: float, stages: int) -> np.ndarray:
     """Return steps from cold that are likely to meet the tolerance, or coarse ones."""
-    known = FIRST_ERROR[min(stages, 5)]
-    growth = (known / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
-    growth = max(growth, 0.6) if growth < FIRST_GROWTH else 1.0
+    known = FIRST_GRID_ERROR[min(stages, 5)]
+    growth = (known / (RADAU_AIM_SHARE * tolerance)) ** (1.0 / (2 * stages - 1))
+    growth = max(growth, 0.6) if growth < FIRST_GRID_GROWTH_LIMIT else 1.0
     return even_steps(system, int(np.ceil(first_num_steps(system) * growth)))
 
 
@@ -379,12 +397,7 @@ def _first_time_grid(system: System, tolerance: float, stages: int) -> np.ndarra
 # The polynomial is put into the richer collocation of the same steps, of order 2 s + 1; the Newton
 # step from there is the global error to its leading order, propagation included.
 
-ROUGHLY = 0.2  # correction of an estimate that still lets it be believed: the next is a fifth
-CORRECTIONS = 4  # of an estimate: mostly one
 AnyMatrix = NewtonMatrix | WindowedNewtonMatrix
-# Contraction of Newton's iteration up to which one answer, with what it may leave, estimates the
-# error; beyond it is corrected, which takes an eighth of the time of all.
-TRUSTED = 0.2
 
 
 def estimated_errors(
@@ -417,7 +430,7 @@ def estimated_errors(
     error, sure = np.full(richer.runs, np.inf), np.zeros(richer.runs, dtype=bool)
     if richer.preconditioner.guided:
         matrix = _simplified(richer, begin, a, slow)
-        if rate is not None and rate.max(initial=0.0) <= TRUSTED:
+        if rate is not None and rate.max(initial=0.0) <= ESTIMATE_CONTRACTION_LIMIT:
             _, shift = matrix.solve(residual, np.zeros((2, a.shape[2])))
             return richer.relative(shift, q) / (1.0 - rate) + unseen
         error, sure = _corrected(richer, matrix, begin, a, residual, q)
@@ -502,13 +515,13 @@ def _corrected(
     before = stages.relative(shift, q)
     found = np.full(stages.runs, np.inf)
     pending = np.ones(stages.runs, dtype=bool)
-    for _ in range(CORRECTIONS):
+    for _ in range(ESTIMATE_CORRECTIONS_LIMIT):
         with np.errstate(all="ignore"):  # of what diverges
             there = at_stages(stages, state, a + step)
             more, shift_more = matrix.solve(residual_at(stages, *there, a + step), rest)
             step, shift = step + more, shift + shift_more
         error, correction = stages.relative(shift, q), stages.relative(shift_more, q)
-        believed = pending & (correction <= ROUGHLY * error) & np.isfinite(error)
+        believed = pending & (correction <= ESTIMATE_CORRECTION_SHARE * error) & np.isfinite(error)
         found[believed] = error[believed]
         pending &= ~believed & (correction <= 0.7 * before)
         if not pending.any():
@@ -527,19 +540,10 @@ REMEDY = (
     "stiffen them (material.young_modulus, interpolation.floor, design.minimum) or slow the motion "
     "(motion.duration)"
 )
-# Deflection of a body over its length beyond which its motion is refused. A cantilever that linear
-# elasticity bends by 0.5 of its length bends by 0.41, and comes 0.11 closer, which a floating frame
-# with linear elasticity leaves out (elastica under a load across its end; 0.1: 1 % and 0.006,
-# 0.3: 9 % and 0.05, 1: 66 % and 0.25).
-VALID = 0.5
 BEYOND = (
-    f"beyond {100 * VALID:.0f} % no floating frame with linear elasticity holds, which leaves out "
-    "how much an arm gets shorter as it bends"
+    f"beyond {100 * DEFLECTION_LIMIT:.0f} % no floating frame with linear elasticity holds, "
+    "which leaves out how much an arm gets shorter as it bends"
 )
-# Solved together where nothing is known of free coordinates: two turns of a slider-crank take 16
-# iterations, with 16 steps 44, all at once 117.
-FEW_STEPS = 2
-SWEEPS = 60  # Newton iterations of a grid, on average over its steps: windows take 10 to 50
 
 
 class March:
@@ -561,7 +565,8 @@ class March:
         """Return where Newton's method ends for one run; its iterations are those of all windows.
 
         Raises:
-            ConvergenceError: Newton fails in a single step, or spends more than `MAX_SWEEPS`.
+            ConvergenceError: Newton fails in a single step, or spends more than
+                `WINDOWS_ITERATIONS_LIMIT`.
         """
         if stages.preconditioner.guided or guess.any():
             a, spent = self._run(stages, state, guess, tuning, True)
@@ -576,8 +581,8 @@ class March:
         size, s = stages.preconditioner.system.num_coordinates, len(stages.method.c)
         pieces: list[np.ndarray] = []
         spent, guess = 0, np.zeros((1, 1, size))
-        for first in range(0, count, FEW_STEPS):
-            window = stages.window(first, min(first + FEW_STEPS, count))
+        for first in range(0, count, UNKNOWN_MOTION_STEPS):
+            window = stages.window(first, min(first + UNKNOWN_MOTION_STEPS, count))
             held = np.broadcast_to(guess, (len(window.h), s, size))
             a, iterations = self._run(window, state, held, tuning, False)
             q, qd = step_ends(window, state, a)
@@ -602,10 +607,10 @@ class March:
                 f"Newton's method fails in a single time step of {stages.h[0]:.3g} s: the arms "
                 f"deform beyond small-deflection theory; {REMEDY}"
             )
-        if self._work > SWEEPS * self._count:
+        if self._work > WINDOWS_ITERATIONS_LIMIT * self._count:
             raise ConvergenceError(
-                f"Newton's method takes more than {SWEEPS} iterations for each time step: the "
-                f"arms deform beyond small-deflection theory; {REMEDY}"
+                f"Newton's method takes more than {WINDOWS_ITERATIONS_LIMIT} iterations for each "
+                f"time step: the arms deform beyond small-deflection theory; {REMEDY}"
             )
         self._progress.tell(
             f"Newton's method window by window, {self._done} of {self._count} steps done"
@@ -621,19 +626,6 @@ class March:
 
 
 # -- steps that follow the motion --------------------------------------------------------------
-
-# Steps of a window: fewer where Newton's method fails or steps get shorter, more where all is well.
-SHORTEST, LONGEST = 4, 32
-MATRICES = 6  # of Newton's method in a window: shorter steps take less than more of them
-SHORTER = 0.5  # steps after a failure: each attempt costs a window, too short ones the whole rest
-LONGER = 2.0  # largest growth of the steps from one window to the next
-LEAST_STEP = 1e-7  # of the horizon: where shorter ones fail the motion has no continuation
-MARCH_STEPS = 20_000
-MAX_ITERATIONS = 2_500  # of Newton's method, of all windows: 2 to 6 ms each
-# A step's angle is w h, if w is the frequency of a vibration as large as the whole motion that has
-# the accelerations' highest derivative. Errors of even steps of 2 pi / 8 stand in `radau`.
-ANGLES = (0.05, 1.0)  # bounds of it
-EXCESS = 1.5  # of the angle, that is still accepted
 
 
 @dataclass(frozen=True, eq=False)
@@ -666,7 +658,7 @@ def graded(
     Args:
         preconditioner: of a single run.
         step: the first one, s.
-        angle: aim of every step, see `ANGLES`.
+        angle: aim of every step, see `MARCH_ANGLE_BOUNDS`.
         tolerance: relative error of the coordinates, of which Newton's method leaves a share.
         stages: number of them.
         progress: whom to tell how far it is.
@@ -692,9 +684,9 @@ class _Graded:
     ) -> None:
         self.preconditioner, self.system = preconditioner, preconditioner.system
         self.method, self.tolerance, self.progress = radau_iia(stages), tolerance, progress
-        self.angle = float(np.clip(angle, *ANGLES))
+        self.angle = float(np.clip(angle, *MARCH_ANGLE_BOUNDS))
         self.state: State = self.system.initial_state()
-        self.h, self.count, self.first = step, LONGEST, step
+        self.h, self.count, self.first = step, LONGEST_WINDOW_STEPS, step
         self.ends = [0.0]
         self.pieces: list[np.ndarray] = [np.zeros((0, stages, self.system.num_coordinates))]
         self.held: np.ndarray = np.zeros(
@@ -714,9 +706,9 @@ class _Graded:
         horizon = self.system.breakpoints[-1]
         for _, end in pairwise(self.system.breakpoints):
             while self.t < end:
-                if self.h < LEAST_STEP * horizon:
+                if self.h < LEAST_STEP_SHARE * horizon:
                     raise ConvergenceError(self._stuck(f"a time step of {self.h:.2g} s"))
-                if self.iterations > MAX_ITERATIONS or len(self.ends) > MARCH_STEPS:
+                if self.iterations > MARCH_ITERATIONS_LIMIT or len(self.ends) > MARCH_STEPS_LIMIT:
                     spent = f"{len(self.ends) - 1} time steps and {self.iterations} iterations"
                     raise GivenUp(self._stuck(spent))
                 self.progress.tell(f"steps that follow the motion, {100 * self.t / horizon:.0f} %")
@@ -736,32 +728,38 @@ class _Graded:
             grid[-1] = end
         stages = stages_of(self.preconditioner, self.method, grid)
         first = np.broadcast_to(self.held, (self.count, len(self.method.c), self.held.shape[2]))
-        tuning = replace(ONE_RUN, limits=limits_for(stages), matrices=MATRICES)
+        tuning = replace(ONE_RUN, limits=limits_for(stages), matrices=WINDOW_MATRICES_LIMIT)
         found = newton(stages, self.state, first, self.tolerance, tuning, simplified=False)
         spent = int(found.iterations[0])
         self.iterations, self.work = self.iterations + spent, self.work + spent * self.count
         if not found.converged[0]:
-            if self.count > SHORTEST and self.t > 0.0:
-                self.count = max(SHORTEST, self.count // 4)
+            if self.count > SHORTEST_WINDOW_STEPS and self.t > 0.0:
+                self.count = max(SHORTEST_WINDOW_STEPS, self.count // 4)
             else:
-                self.h *= SHORTER
+                self.h *= FAILED_STEP_RATIO
             return
         q, qd = step_ends(stages, self.state, found.a)
         angles, size = self._angles(stages, (q[:-1], qd[:-1]), found.a)
         # A motion sets in from rest like a power of time, whose first steps are poor whatever their
         # length: so short ones are accepted.
-        young = self.t == 0.0 and self.h <= self.first / LONGEST
-        poor = np.flatnonzero((angles > EXCESS * self.angle) & (not young))
+        young = self.t == 0.0 and self.h <= self.first / LONGEST_WINDOW_STEPS
+        poor = np.flatnonzero((angles > MARCH_ANGLE_EXCESS * self.angle) & (not young))
         kept = int(poor[0]) if len(poor) else self.count
         if kept == 0:
-            self.h *= max(SHORTER, self.angle / angles[0])
-            self.count = SHORTEST if self.t > 0.0 else LONGEST
+            self.h *= max(FAILED_STEP_RATIO, self.angle / angles[0])
+            self.count = SHORTEST_WINDOW_STEPS if self.t > 0.0 else LONGEST_WINDOW_STEPS
             return
         self._keep(grid[1 : kept + 1], found.a[:kept], q[1 : kept + 1], qd[kept : kept + 1])
         self.size = np.maximum(self.size, size)
-        seen = angles[max(0, kept - SHORTEST) : min(kept + 1, len(angles))].max()
-        self.h *= float(np.clip(self.angle / max(seen, 1e-300), SHORTER, LONGER))
-        self.count = min(2 * self.count, LONGEST) if kept == self.count else SHORTEST
+        seen = angles[max(0, kept - SHORTEST_WINDOW_STEPS) : min(kept + 1, len(angles))].max()
+        self.h *= float(
+            np.clip(self.angle / max(seen, 1e-300), FAILED_STEP_RATIO, STEP_GROWTH_LIMIT)
+        )
+        self.count = (
+            min(2 * self.count, LONGEST_WINDOW_STEPS)
+            if kept == self.count
+            else SHORTEST_WINDOW_STEPS
+        )
 
     def _keep(self, ends: np.ndarray, a: np.ndarray, q: np.ndarray, qd: np.ndarray) -> None:
         """Go on from the end of some steps."""
@@ -769,7 +767,7 @@ class _Graded:
         self.pieces.append(a)
         self.state, self.held, self.windows = (q[-1:], qd), a[-1:, -1:], self.windows + 1
         self.deflection = max(self.deflection, self.system.deflection(q))
-        if self.deflection > VALID:
+        if self.deflection > DEFLECTION_LIMIT:
             raise GivenUp(
                 f"at t = {self.t:.4g} s an arm deflects by {100 * self.deflection:.0f} % of its "
                 f"length: {BEYOND}; {REMEDY.replace('them', 'the arms', 1)}"
@@ -782,7 +780,7 @@ class _Graded:
         highest = factorial(s - 1) * stages.h[:, None] ** 2 * (powers[-1] @ a)
         q, _ = stage_values(stages, *begin, a)
         size = np.maximum(system.norm(q.reshape(-1, q.shape[2])), self.size)
-        least = max(LEAST_SHARE * size.max(), np.finfo(float).tiny)
+        least = max(RESTING_GROUP_SHARE * size.max(), np.finfo(float).tiny)
         share = system.norm(highest[:, None]) / np.maximum(size, least)
         return share.max(axis=-1) ** (1.0 / (s + 1)), size
 

@@ -15,7 +15,15 @@ from dolfinopt.dynamics.build import build_system, desired_motion, rests_of
 from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
-from dolfinopt.dynamics.radau import BEYOND, REMEDY, VALID
+from dolfinopt.dynamics.measured import (
+    BATCH_NEWTON_SHARE,
+    DEFLECTION_LIMIT,
+    DRIVES_CHUNK,
+    JOINT_LIMIT_ROUNDING,
+    KEPT_MATRICES_BYTES,
+)
+from dolfinopt.dynamics.newton import ONE_RUN
+from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import (
@@ -46,9 +54,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     Problem: TypeAlias = ElasticSystem | MachineSystem
-
-
-LIMIT_ROUNDING = 1e-6  # of a limit, which files round
 
 
 @dataclass(frozen=True)
@@ -298,7 +303,7 @@ class Trajectory:
                 beyond = [(sign * (q - limit), limit) for limit, sign in ends]
                 over, limit = max(beyond, key=lambda one: float(one[0].max()))
                 at = int(np.argmax(over))
-                met = bool(over[at] <= LIMIT_ROUNDING * max(width, abs(limit)))
+                met = bool(over[at] <= JOINT_LIMIT_ROUNDING * max(width, abs(limit)))
                 value, instant = float(q[at]), float(self.t[at])
                 yield JointLimit(joint.name, "position", limit, value, instant, length, met)
             for quantity, limit, values, unit in (
@@ -309,7 +314,7 @@ class Trajectory:
                     continue
                 size = np.abs(values[:, k])
                 at = int(np.argmax(size))
-                value, met = float(size[at]), bool(size[at] <= (1.0 + LIMIT_ROUNDING) * limit)
+                value, met = float(size[at]), bool(size[at] <= (1.0 + JOINT_LIMIT_ROUNDING) * limit)
                 instant = float(self.t[at])
                 yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)
 
@@ -392,8 +397,8 @@ def simulate_batch(
             1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
-        In the scenes' order; of one that fails, or bends by more than `march.VALID` of an arm's
-        length, its error, see `simulate`.
+        In the scenes' order; of one that fails, or bends by more than `DEFLECTION_LIMIT` of an
+        arm's length, its error, see `simulate`.
     """
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
     problems = _problems(scenes, bodies)
@@ -407,7 +412,7 @@ def simulate_batch(
         own, begun = [problems[i] for i in group], [starts[i] for i in group]
         with profile.phase("simulation"):
             if integrator == "radau":
-                goal = radau.GOAL if differentiated else batch.GOAL
+                goal = ONE_RUN.goal if differentiated else BATCH_NEWTON_SHARE
                 solutions = _by_radau(own, tolerance, stages, profile, begun, goal)
             else:
                 solve, rest = generalized_alpha.integrate, (tolerance, rho_inf, profile)
@@ -459,7 +464,7 @@ def _refused(trajectory: Trajectory) -> ConvergenceError | None:
     """Return why a motion is none of flexible arms any more, or None."""
     arms, deflections = trajectory.scene.arms, trajectory.deflections
     worst = int(np.argmax(deflections)) if len(deflections) else 0
-    if not len(deflections) or deflections[worst] <= VALID:
+    if not len(deflections) or deflections[worst] <= DEFLECTION_LIMIT:
         return None
     name = f"arm {arms[worst].name!r}" if worst < len(arms) else "a link"
     return GivenUp(
@@ -487,9 +492,6 @@ def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajector
 # on every shape integral. A drive of a free coordinate follows its law: u = u_ff + Kp (q_d - q) +
 # Kd (qd_d - qd), of which u_ff is inverse dynamics of the rigid arms of the same bodies.
 
-CHUNK = 512  # instants whose matrices are made at once
-KEPT_BYTES = 64e6  # of matrices that are kept for further functions of the same forces
-
 
 class DriveForces:
     """The forces of all drives at some instants, to be differentiated.
@@ -515,7 +517,7 @@ class DriveForces:
             By coordinates, rates and accelerations (3, n, S); and by every body's integrals, the
             coordinates held.
         """
-        parts = [slice(i, i + CHUNK) for i in range(0, len(self.t), CHUNK)]
+        parts = [slice(i, i + DRIVES_CHUNK) for i in range(0, len(self.t), DRIVES_CHUNK)]
         by_rates, total = [], None
         for chunk, part in zip(self._chunks(parts), parts, strict=True):
             by, bodies = chunk.gradient(weights[part])
@@ -527,7 +529,7 @@ class DriveForces:
     def _chunks(self, parts: list[slice]) -> Iterable[_Prescribed | _Machine]:
         """Return the parts' own; the same ones every time unless they take too much memory."""
         bodies, columns = len(self.system.mechanism.bodies), 3 * self.rates[0].shape[1]
-        if 8 * len(self.t) * (1 + 8 * bodies) * columns > KEPT_BYTES:
+        if 8 * len(self.t) * (1 + 8 * bodies) * columns > KEPT_MATRICES_BYTES:
             return map(self._chunk, parts)
         self._kept = self._kept or [self._chunk(part) for part in parts]
         return self._kept

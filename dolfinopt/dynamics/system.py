@@ -20,11 +20,9 @@ from typing import Protocol
 
 import numpy as np
 
-State = tuple[np.ndarray, np.ndarray]  # q, qd
+from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
 
-# A group that nearly rests beside the others is measured against this share of theirs: rounding
-# and Newton's leftover of the large ones is no error of the small one.
-LEAST_SHARE = 1e-3
+State = tuple[np.ndarray, np.ndarray]  # q, qd
 
 
 class Linearisation(Protocol):
@@ -128,8 +126,8 @@ class System(Protocol):
         """Return the largest norm of q (..., n, N) over n instants, (..., groups).
 
         A group is what is measured by itself: errors are relative to its own size, or to
-        `LEAST_SHARE` of the largest group's. Groups of other units (m, rad, energy^(1/2)) are
-        weighted so that they compare; a multiplier's coordinate belongs to none.
+        `RESTING_GROUP_SHARE` of the largest group's. Groups of other units (m, rad, energy^(1/2))
+        are weighted so that they compare; a multiplier's coordinate belongs to none.
         """
 
     def slowest_frequency(self) -> float:
@@ -194,5 +192,5 @@ def relative_errors(system: Measured, error: np.ndarray, q: np.ndarray) -> np.nd
     """Return `relative_error` of several runs (...); error and q (..., n, N)."""
     size = system.norm(q)
     largest = size.max(axis=-1, keepdims=True)
-    size = np.where(largest == 0.0, 1.0, np.maximum(size, LEAST_SHARE * largest))
+    size = np.where(largest == 0.0, 1.0, np.maximum(size, RESTING_GROUP_SHARE * largest))
     return (system.norm(error) / size).max(axis=-1)

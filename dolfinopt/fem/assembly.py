@@ -13,6 +13,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.fem.elements import ElementOperators
+from dolfinopt.fem.measured import (
+    ALIKE_CELLS_ERROR,
+    BUFFER_ENTRIES,
+    STRESS_CHUNK_CELLS,
+    STRESS_CHUNK_ENTRIES,
+)
 
 
 class AffineMatrix:
@@ -286,10 +292,6 @@ def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 # that are alike; their element matrices (1 or n_cells, ...) stand first. d is the number of
 # directions.
 
-# Largest difference of the cells' matrices from their mean, in its largest entry: rounding of the
-# nodes' places, 1e-16 m in cells of 1 mm, and what Gmsh adds to it in a file's grid.
-ALIKE = 1e-11
-
 
 def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
     """Return the mean of all ranks' matrices (n_cells, ...) that are the same but for rounding.
@@ -307,7 +309,7 @@ def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
     first = next(one for one in some if one is not None)
     mean = first + comm.allreduce((matrices - first).sum(axis=0)) / count
     error = comm.allreduce(np.abs(matrices - mean).max(initial=0.0), op=MPI.MAX)
-    return mean if error <= ALIKE * np.abs(mean).max() else None
+    return mean if error <= ALIKE_CELLS_ERROR * np.abs(mean).max() else None
 
 
 def times(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -497,13 +499,6 @@ def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 # needs no quadrature points: bilinear cells have 6 products bc of differences where four points
 # have 3 stresses each, and all products with T are dense matrix products over many cells.
 
-# Entries of the products of the modes' differences at a time: they stay in the cache; and the least
-# cells at a time, for more modes.
-CHUNK, LEAST = 120_000, 256
-# NumPy copies factors that it repeats along an axis into buffers, unless rows are longer than
-# these: by default 8192, which takes longer than the products.
-BUFFER = 256
-
 
 class StressTensor:
     """The tensor T of cells; r = n - 1 differences of each component.
@@ -527,7 +522,7 @@ class StressTensor:
         self.tensor = np.empty((count, len(b), S.shape[3]))
         pairs: list[tuple[tuple[int, int], ...]] = [((k, k),) for k in range(dim)]
         pairs += [((x, y), (y, x)) for x, y in ((0, 1), (1, 2), (2, 0))[: kinds - dim]]
-        step = max(1, CHUNK // (D.shape[1] * len(b) * kinds))
+        step = max(1, STRESS_CHUNK_ENTRIES // (D.shape[1] * len(b) * kinds))
         for run in (slice(i, i + step) for i in range(0, count, step)):
             d = D[run]
             products = np.stack(
@@ -578,7 +573,7 @@ class StiffenedModes:
         cells, count = tensor.cells, len(young)
         b, c = np.triu_indices(cells.num_nodes - 1)
         self._pairs = list(zip(b, c, strict=True))
-        step = max(CHUNK // (len(b) * V.shape[2] ** 2), LEAST)
+        step = max(STRESS_CHUNK_ENTRIES // (len(b) * V.shape[2] ** 2), STRESS_CHUNK_CELLS)
         runs = [slice(i, min(i + step, count)) for i in range(0, count, step)]
         rows = cells.by_component(V, fields)
         self._runs = [self._run(run, rows, young[run]) for run in runs]
@@ -691,8 +686,8 @@ class StiffenedModes:
 
 @contextmanager
 def short_buffers() -> Iterator[None]:
-    """Let NumPy multiply rows of more than `BUFFER` entries without copies."""
-    before = np.setbufsize(BUFFER)
+    """Let NumPy multiply rows of more than `BUFFER_ENTRIES` entries without copies."""
+    before = np.setbufsize(BUFFER_ENTRIES)
     try:
         yield
     finally:

@@ -36,13 +36,8 @@ from dolfinopt.fem.interface import (
     static_fields,
     static_modes,
 )
-from dolfinopt.fem.interior import (
-    TETRAHEDRA,
-    ExtendedStiffness,
-    ExtendedSystem,
-    Guesses,
-    InteriorSystem,
-)
+from dolfinopt.fem.interior import ExtendedStiffness, ExtendedSystem, Guesses, InteriorSystem
+from dolfinopt.fem.measured import TETRAHEDRA_BANDWIDTH_RATIO
 from dolfinopt.fem.stress import element_centres, stress_operator
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -98,7 +93,8 @@ class Substructure:
                 self._stiffness = AffineMatrix(dofs, operators.stiffness, dim * size)
                 self._mass = AffineMatrix(cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        wider = TETRAHEDRA if operators.cells.shape[1] == 10 else 1.0  # quadratic ones
+        quadratic = operators.cells.shape[1] == 10  # tetrahedra
+        wider = TETRAHEDRA_BANDWIDTH_RATIO if quadratic else 1.0
         self.interior = InteriorSystem(
             self.T, self._stiffness, self._mass, profile, tolerance, wider
         )

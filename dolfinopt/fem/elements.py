@@ -15,6 +15,7 @@ import ufl
 from dolfinx import fem
 
 from dolfinopt.errors import InputError
+from dolfinopt.fem.measured import ALIKE_CELLS_ERROR, QUADRATURE_CHUNK_CELLS, TWIST_COUPLING
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
@@ -142,8 +143,6 @@ KINDS = {
     (3, 4): basix.CellType.tetrahedron,
     (3, 8): basix.CellType.hexahedron,
 }
-# Largest difference of cells' edges from their mean, in the longest, that is but rounding.
-SAME = 1e-11
 
 
 def cell_corners(mesh: ArmMesh) -> np.ndarray:
@@ -160,7 +159,7 @@ def same_corners(corners: np.ndarray) -> np.ndarray:
     if len(around) == 0:
         return around
     mean = around.mean(axis=0)
-    if np.abs(around - mean).max() > SAME * np.abs(mean).max():
+    if np.abs(around - mean).max() > ALIKE_CELLS_ERROR * np.abs(mean).max():
         return around
     return np.broadcast_to(mean, around.shape)
 
@@ -463,8 +462,6 @@ def gauss_order(degree: int, corners: int, dim: int = 2) -> int:
 
 # -- element matrices by Gauss quadrature in NumPy, in the plane and in space --------------------
 
-CELLS = 4096  # whose matrices are summed up at a time
-
 
 def quadrature_operators(
     element: Element, mesh: ArmMesh, thickness: float, poisson_ratio: float, modes: bool = False
@@ -527,8 +524,8 @@ def _full(corners: np.ndarray, degree: int, poisson_ratio: float, modes: bool) -
     # Exact on parallelepipeds and simplices, whose collapsed coordinates add d - 1 degrees.
     points, weights = gauss_points(around, degree + 1, dim)
     found = []
-    for first in range(0, max(len(corners), 1), CELLS):
-        part = corners[first : first + CELLS]
+    for first in range(0, max(len(corners), 1), QUADRATURE_CHUNK_CELLS):
+        part = corners[first : first + QUADRATURE_CHUNK_CELLS]
         volume = weights * np.abs(np.linalg.det(jacobian(part, points)))
         gradients = nodal_gradients(part, degree, points)
         if modes:
@@ -583,7 +580,6 @@ def _mass(corners: np.ndarray, degree: int) -> np.ndarray:
 #
 # with the amplitudes a = (h_z (p + r), h_y (p + t), h_x (r + t)) and the energy G V |a|^2 / 24.
 
-COUPLING = 0.8  # s; 1 has no energy left where two faces of a cell turn against each other
 CENTRE = np.full((1, 3), 0.5)
 # Axes of the shear strains 2 e_xy, 2 e_xz, 2 e_yz; the axis along which each of them grows.
 PAIRS, ALONG = ((0, 1), (0, 2), (1, 2)), (2, 1, 0)
@@ -645,7 +641,7 @@ def _amplitudes(
 
 def _coupled(a: np.ndarray) -> np.ndarray:
     """Return (S - 1) a with S S = 1 + s (ones - 1)."""
-    alone, together = np.sqrt(1.0 - COUPLING), np.sqrt(1.0 + 2.0 * COUPLING)
+    alone, together = np.sqrt(1.0 - TWIST_COUPLING), np.sqrt(1.0 + 2.0 * TWIST_COUPLING)
     return (alone - 1.0) * a + (together - alone) / 3.0 * a.sum(axis=1, keepdims=True)
 
 

@@ -17,14 +17,20 @@ from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elements import ElementOperators
+from dolfinopt.fem.measured import (
+    DEFLECTION_ROUNDING_ERROR,
+    HARMLESS_CONTRAST,
+    ROUNDING_ITERATIONS,
+    ROUNDING_TRANSLATION_SHARE,
+    SAME_PLACE_SHARE,
+    STIFFNESS_ROUNDING_LIMIT,
+)
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import on_root
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
-
-SAME_PLACE = 1e-9  # of an arm's length: places no farther apart than this are one
 
 
 class InterfaceTransformation:
@@ -216,7 +222,7 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray,
     """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
     # The narrower one; on the grid of a slender arm the first, row by row across it, which is half
     # as wide as the other one, which begins at a corner.
-    nearest = SAME_PLACE * np.ptp(points[:, 0])
+    nearest = SAME_PLACE_SHARE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
     orders = (
         np.lexsort((*across, along)),
@@ -243,16 +249,6 @@ def _places(values: np.ndarray, nearest: float) -> np.ndarray:
 
 
 # -- static fields of the outboard interface, by displacement and load; what rounding does there
-
-# Largest relative error that rounding may make in the stiffness of a design in which solids float:
-# a tenth of what an optimiser's step changes. Against long double errors are 0.03 to 0.35 of the
-# estimate.
-MOST_ROUNDING = 1e-3
-# Part of a cell's displacement as a rigid translation in that estimate. The energy does not know
-# translations, the assembled matrix does: where they are lost in it, refinement fails.
-TRANSLATION = 0.03
-POWER_STEPS = 6  # of the estimate; four give two digits
-ROUNDED = 1e-8  # part of a deflection that may come of rounding, by factors of long arms
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +335,7 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
         known = StaticFields(*(np.empty((*n, 0)) for n in ((b,), arm.points.shape, (b,), (0,))))
     extended = arm.substructure.extended
     # What a symmetric design's deflection has across the load is an error of the fields.
-    error = extended.tolerance if extended and extended.is_iterative else ROUNDED
+    error = extended.tolerance if extended and extended.is_iterative else DEFLECTION_ROUNDING_ERROR
     new = on_root(arm.comm, _new_directions, known.directions, loads, error)
     if new.shape[1] == 0:
         return known
@@ -378,7 +374,7 @@ def _new_directions(known: np.ndarray, loads: np.ndarray, tolerance: float) -> n
 def floats(arm: ElasticArm) -> bool:
     """Return whether void that is softer by orders of magnitude holds solid cells (collective)."""
     low, high = extremes(arm.comm, arm.young)
-    return low < 0.1 / HARMLESS * high and arm.connectivity.floats(arm.young)
+    return low < 0.1 / HARMLESS_CONTRAST * high and arm.connectivity.floats(arm.young)
 
 
 def _with_energies(
@@ -400,7 +396,10 @@ def _refined(arm: ElasticArm, modes: ConstraintModes) -> ConstraintModes:
     residual, _ = arm.restrict(cells.sum_at_nodes(forces))
     better = modes.interior - arm.solve(residual)
     refined = _with_energies(arm, better, modes.coupling, modes.corner)
-    if not (_is_stiffness(refined.stiffness) and rounding_error(arm, refined) <= MOST_ROUNDING):
+    if not (
+        _is_stiffness(refined.stiffness)
+        and rounding_error(arm, refined) <= STIFFNESS_ROUNDING_LIMIT
+    ):
         raise _lost_in_rounding(arm)
     return refined
 
@@ -412,7 +411,8 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
     eps u' D u, and relative to it to eps times the largest eigenvalue of D u = mu T'KT u.
     Inverse iteration finds it from random numbers: void that holds solids sets it
     orders of magnitude apart from all others. What it returns is too small only where mu
-    exceeds 1 / eps, far beyond `MOST_ROUNDING`, because the factorised matrix is off by then.
+    exceeds 1 / eps, far beyond `STIFFNESS_ROUNDING_LIMIT`, because the factorised matrix is
+    off by then.
     """
     cells = arm.substructure.cells
     diagonal = np.einsum("eii->ie", cells.stiffness) * arm.young
@@ -425,7 +425,7 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
         forces -= kept * forces.mean(axis=0)
         return arm.restrict(cells.sum_at_nodes(forces))
 
-    kept = 1.0 - TRANSLATION
+    kept = 1.0 - ROUNDING_TRANSLATION_SHARE
     places = arm.points.T / arm.mesh.outboard_point[0]
     # By place, so that numbers are random and yet the same on any number of ranks.
     line = sum(factor * x for factor, x in zip((1e4, 7e4, 3e4), places, strict=False)) + 1.0
@@ -435,7 +435,7 @@ def rounding_error(arm: ElasticArm, modes: ConstraintModes) -> float:
         arm.expand(guess[arm.interior_nodes].reshape(-1, 1), np.full((len(modes.corner), 1), 0.5))
     )
     ratio = np.inf
-    for _ in range(POWER_STEPS):
+    for _ in range(ROUNDING_ITERATIONS):
         lift = arm.comm.allreduce(modes.interior.T @ loads)
         tip = np.linalg.solve(modes.stiffness, outboard + lift)
         interior = arm.solve(loads) + modes.interior @ tip
@@ -469,10 +469,6 @@ def _is_stiffness(matrix: np.ndarray) -> bool:
 
 
 # -- solid cells that only far softer ones connect to an arm's interfaces ------------------------
-
-# Ratio of Young's moduli up to which floating solids do no harm: the stiffness of an arm is then
-# off by at most a few 1e-7, from rounding.
-HARMLESS = 1e6
 
 
 def extremes(comm: MPI.Comm, values: np.ndarray) -> tuple[float, float]:
@@ -528,11 +524,11 @@ class Connectivity:
         self._first, self._second = (np.concatenate(side) for side in zip(*pairs, strict=True))
 
     def floats(self, young: np.ndarray) -> bool:
-        """Return whether cells hang on others that are softer by more than `HARMLESS`.
+        """Return whether cells hang on others that are softer by more than `HARMLESS_CONTRAST`.
 
         True whenever, on every path from a cell to the inboard interface, there is one
-        softer by more than ten times `HARMLESS`; never where there is a path that keeps above
-        `HARMLESS`. Collective; the same on all ranks.
+        softer by more than ten times `HARMLESS_CONTRAST`; never where there is a path that keeps
+        above it. Collective; the same on all ranks.
 
         Args:
             young: (n_cells,) Young's moduli of the owned cells, Pa.
@@ -541,14 +537,16 @@ class Connectivity:
         moduli = np.concatenate([*self.comm.allgather(young), [np.inf] * self._ends])
         weakest = np.minimum(moduli[self._first], moduli[self._second])
         moduli[-self._ends :] = 0.0  # an interface does not float itself
-        level = high / HARMLESS
+        level = high / HARMLESS_CONTRAST
         while level > low:
             kept = weakest >= level
             links = (np.ones(kept.sum()), (self._first[kept], self._second[kept]))
             _, group = connected_components(
                 sp.coo_matrix(links, shape=(len(moduli), len(moduli))), directed=False
             )
-            if (moduli[group != group[self._count]] > HARMLESS * level * (1.0 - 1e-9)).any():
+            if (
+                moduli[group != group[self._count]] > HARMLESS_CONTRAST * level * (1.0 - 1e-9)
+            ).any():
                 return True
             level *= 0.1
         return False

@@ -21,6 +21,19 @@ from dolfinopt.fem.assembly import (
     interior_entries,
 )
 from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
+from dolfinopt.fem.measured import (
+    BAND_WORK_LIMIT,
+    ENERGY_TOLERANCE,
+    EXTENDED_BANDWIDTH_RATIO,
+    FACTOR_BYTES,
+    FACTOR_EXPONENT,
+    FACTOR_ROWS,
+    FREE_MEMORY_SHARE,
+    KRYLOV_TOLERANCE,
+    MUMPS_ROWS,
+    SOLID_BAND_WORK_LIMIT,
+    WIDEST,
+)
 from dolfinopt.mesh.budget import free_memory, ranks_here
 from dolfinopt.profiling import Profile
 from dolfinopt.solver import (
@@ -38,35 +51,6 @@ if TYPE_CHECKING:
 Columns = Callable[[np.ndarray], np.ndarray]
 ITERATIVE = "conjugate gradients"  # name of that solver
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
-# Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
-# has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
-MOST_WORK = 1e9
-# Rows from which MUMPS takes less time than PETSc's Cholesky, in the plane on one rank, if a design
-# takes 10 solves. Factorisation and 18 solves: 121 878 rows (1000 x 60 cells) 0.23 and 1.00 s by
-# MUMPS, 0.78 and 0.42 s by PETSc; 205 242 rows 0.55 and 1.67 s, 1.48 and 0.69 s.
-MUMPS_ROWS = 150_000
-# Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
-# takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
-MOST_SOLID_WORK = 1.5e11
-# Conjugate gradients take the same time a row whatever the shape, factors the longer the larger the
-# cross-sections. With a bandwidth of WIDEST a nearby design takes equally long: slender arms of
-# 250 000 and cubes of 22 000 rows (`dolfinopt bench solid`). Conjugate gradients are used, too,
-# where factors would take more than a part of the memory that is free: bytes of MUMPS' factor a row
-# at so many rows, growing as a power.
-WIDEST = 1200
-# Of quadratic tetrahedra, whose meshes are irregular: with 90 801 rows, a bandwidth of 1484, a body
-# takes 11 s by factors and 38 s by conjugate gradients.
-TETRAHEDRA = 2.0  # times WIDEST
-FACTOR_BYTES, FACTOR_AT, FACTOR_GROWTH = 14e3, 50_000, 0.12
-FREE_SHARE = 0.5
-# Of conjugate gradients in energy, relative, where nobody says what is needed: stiffness is then
-# right to its square, mass and inertia to it, gradients of frozen loads to five times it, geometric
-# stiffness to ten times.
-TOLERANCE = 1e-8
-TIGHT = 1e-12  # where a Krylov space is made of solutions
-# Bandwidth of K with the interfaces' rows behind, of that without, up to which it is factorised in
-# its place: nodes numbered along the arm end at the interface, others may lie anywhere.
-WIDER = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +96,12 @@ class InteriorSystem:
             stiffness: over local dofs, or in blocks over local nodes.
             mass: over local nodes.
             profile: of this rank.
-            tolerance: in place of `TOLERANCE`.
+            tolerance: in place of `ENERGY_TOLERANCE`.
             wider: factor of `WIDEST`.
         """
         self._wider = wider
         self._T, self._profile = T, profile
-        self.tolerance = tolerance or TOLERANCE
+        self.tolerance = tolerance or ENERGY_TOLERANCE
         self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
         self._factor: Factor | None = None
         self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
@@ -162,7 +146,7 @@ class InteriorSystem:
         """LAPACK's factor, where one rank owns a band that is narrow enough."""
         if self._T.comm.size > 1 or has_options(OPTIONS):
             return None
-        size, most = self._num_rows, MOST_WORK if self._T.dim == 2 else MOST_SOLID_WORK
+        size, most = self._num_rows, BAND_WORK_LIMIT if self._T.dim == 2 else SOLID_BAND_WORK_LIMIT
         if size * float(self._bandwidth) ** 2 > most:
             return None
         return BandCholesky(self._entries.rows, self._entries.columns, size)
@@ -192,10 +176,10 @@ class InteriorSystem:
         T = self._T
         here = MPI.Get_processor_name()
         share = T.comm.allgather(here).count(here) / T.comm.size
-        factor = share * FACTOR_BYTES * T.num_dofs * (T.num_dofs / FACTOR_AT) ** FACTOR_GROWTH
+        factor = share * FACTOR_BYTES * T.num_dofs * (T.num_dofs / FACTOR_ROWS) ** FACTOR_EXPONENT
         # Other arms' ranks on this machine take theirs at the same time.
         free = free_memory() * T.comm.allgather(here).count(here) / ranks_here()
-        short = T.num_dofs > FACTOR_AT and factor > FREE_SHARE * free
+        short = T.num_dofs > FACTOR_ROWS and factor > FREE_MEMORY_SHARE * free
         return bool(T.comm.allreduce(short, op=MPI.LOR))
 
     @cached_property
@@ -323,7 +307,7 @@ class InteriorSystem:
         """Return K_II^-1 times a vector (num_interior,), to nearly all digits."""
         factor = self.factorise(K)
         if self.is_iterative:
-            return self._iterative.solve(right, tolerance=TIGHT)
+            return self._iterative.solve(right, tolerance=KRYLOV_TOLERANCE)
         return factor.solve(right)
 
     def multigrid(self, K: sp.csr_matrix) -> tuple[Columns, Columns]:
@@ -423,7 +407,11 @@ class ExtendedSystem(InteriorSystem):
     def is_worth_it(self) -> bool:
         """Whether factors take no longer than those of the interior (collective)."""
         alone = self._T.comm.size == 1
-        return not alone or self.is_iterative or self._bandwidth <= WIDER * self._T.bandwidth
+        return (
+            not alone
+            or self.is_iterative
+            or self._bandwidth <= EXTENDED_BANDWIDTH_RATIO * self._T.bandwidth
+        )
 
     @property
     def _bandwidth(self) -> int:

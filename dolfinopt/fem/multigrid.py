@@ -16,13 +16,21 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dolfinopt.fem.measured import (
+    INDEPENDENT_LENGTH_SHARE,
+    KEPT_HIERARCHY_RATIO,
+    LANCZOS_ITERATIONS,
+    RIGHT_SIDES_CHUNK,
+    SMOOTHED_LOWER_SHARE,
+    SMOOTHED_UPPER_SHARE,
+    SOLUTION_ROUNDING_ERROR,
+    SOLVER_ITERATIONS,
+    STEPS_A_DIGIT_LIMIT,
+    ZERO_DIAGONAL_SHARE,
+)
 from dolfinopt.parallel import on_root
 
 PREFIX = "dolfinopt_multigrid_"  # of the PETSc options of the hierarchy
-# Smoother: Chebyshev's polynomial of degree 2 in the diagonally scaled matrix, on the upper part of
-# its spectrum, the largest eigenvalue from so many steps of Lanczos' method and a margin.
-LOWEST, HIGHEST, LANCZOS_STEPS = 0.1, 1.1, 10
-ZERO = 1e-15  # of the largest diagonal entry
 
 
 class Level:
@@ -46,7 +54,7 @@ class Level:
         diagonal = self.matrix.getDiagonal().array
         largest = self.matrix.comm.tompi4py().allreduce(diagonal.max(initial=0.0), op=MPI.MAX)
         # Aggregates of a node or two have fewer motions than six: rows of zeros.
-        zero = diagonal <= ZERO * largest
+        zero = diagonal <= ZERO_DIAGONAL_SHARE * largest
         self.inverse_diagonal = np.where(zero, 0.0, 1.0 / np.where(zero, 1.0, diagonal))[:, None]
         self.__dict__.pop("bounds", None)
 
@@ -60,7 +68,7 @@ class Level:
     def bounds(self) -> tuple[float, float]:
         """The part of the scaled matrix' spectrum that is smoothed (collective)."""
         highest = _largest_eigenvalue(self.matrix, np.sqrt(self.inverse_diagonal[:, 0]))
-        return LOWEST * highest, HIGHEST * highest
+        return SMOOTHED_LOWER_SHARE * highest, SMOOTHED_UPPER_SHARE * highest
 
     def times(self, X: np.ndarray) -> np.ndarray:
         """Return A X."""
@@ -123,7 +131,7 @@ def _largest_eigenvalue(matrix: PETSc.Mat, scale: np.ndarray) -> float:
     v /= np.sqrt(comm.allreduce(v @ v))
     before, beta = np.zeros_like(v), 0.0
     diagonal, beside = [], []
-    for _ in range(min(LANCZOS_STEPS, matrix.getSize()[0])):
+    for _ in range(min(LANCZOS_ITERATIONS, matrix.getSize()[0])):
         x.array = scale * v
         matrix.mult(x, y)
         w = scale * y.array_r - beta * before
@@ -271,16 +279,6 @@ def with_rigid_motions(matrix: PETSc.Mat, points: np.ndarray) -> None:
 
 # -- conjugate gradients for many right sides at once, preconditioned by algebraic multigrid -----
 
-COLUMNS = 12  # right sides at a time: memory of their vectors on all levels
-MAX_STEPS = 500
-# The hierarchy of another design is kept while it takes at most so many times the steps a digit.
-WORSE = 1.5
-# Steps a digit from cold beyond which a hierarchy of smaller aggregates is made: it takes half of
-# the steps, each as long again, and three times the work to make it.
-SLOW = 12.0
-LEAST = 1e-12  # tolerance that rounding allows, of the right side's own length
-INDEPENDENT = 1e-12  # least share of a direction's length that is none of the others'
-
 
 class BlockConjugateGradients:
     """K^-1 of one design after another for blocks of right sides.
@@ -325,8 +323,8 @@ class BlockConjugateGradients:
 
     def update(self) -> None:
         """Take over new values of the matrix (collective)."""
-        slow = self._first_rate > SLOW and not self.grid.gradual
-        if slow or (self._first_rate and self.rate > WORSE * self._first_rate):
+        slow = self._first_rate > STEPS_A_DIGIT_LIMIT and not self.grid.gradual
+        if slow or (self._first_rate and self.rate > KEPT_HIERARCHY_RATIO * self._first_rate):
             self._make(self.grid.gradual or slow)
         else:
             self.grid.update()
@@ -374,8 +372,8 @@ class BlockConjugateGradients:
         """Return the solution (n, k), so many columns at a time."""
         out, self.failed, most = np.empty_like(right), False, 0
         self._digits = -np.log10(tolerance)
-        for first in range(0, right.shape[1], COLUMNS):
-            part = slice(first, first + COLUMNS)
+        for first in range(0, right.shape[1], RIGHT_SIDES_CHUNK):
+            part = slice(first, first + RIGHT_SIDES_CHUNK)
             energies = None if held is None else held[part]
             out[:, part] = self._solve(right[:, part], guess, tolerance, energies)
             most = max(most, self.steps)
@@ -408,7 +406,9 @@ class BlockConjugateGradients:
             if held is None:
                 return tolerance**2 * own
             left = held - self._lengths(B, X)  # falls to that of the whole field, step by step
-            return np.clip(tolerance**2 * left, LEAST**2 * own, tolerance**2 * own)
+            return np.clip(
+                tolerance**2 * left, SOLUTION_ROUNDING_ERROR**2 * own, tolerance**2 * own
+            )
 
         if guess is not None:  # the best of their space, in energy
             P = self._orthonormal(guess)
@@ -422,7 +422,7 @@ class BlockConjugateGradients:
         P = self._orthonormal(Z)
         self.steps = 0
         while not (self._lengths(R, Z) <= goal()).all():  # not a number included
-            if self.steps == MAX_STEPS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
+            if self.steps == SOLVER_ITERATIONS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
                 self.failed = True
                 break
             Q = fine.times(P)
@@ -446,5 +446,5 @@ class BlockConjugateGradients:
             return P[:, :0]
         scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
         values, vectors = on_root(self._comm, np.linalg.eigh, gram / np.outer(scale, scale))
-        kept = values > INDEPENDENT * values[-1]
+        kept = values > INDEPENDENT_LENGTH_SHARE * values[-1]
         return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))

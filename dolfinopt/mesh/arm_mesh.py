@@ -17,13 +17,12 @@ from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import FURTHER, INBOARD, OUTBOARD, PASSIVE, gmsh_on_root, mesh_geo
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
 
 if TYPE_CHECKING:
     from dolfinopt.scene.regions import Cells
-
-SNAP = 1e-9  # distance of a node from its line of the grid, in cells, up to which it is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +180,7 @@ def structured_arm(
 def snap(values: np.ndarray, first: float, step: float) -> None:
     """Move coordinates that lie on a grid but for Gmsh's rounding, 1e-14 m, to its very lines."""
     lines = first + step * np.rint((values - first) / step)
-    near = np.abs(values - lines) < SNAP * step
+    near = np.abs(values - lines) < GRID_ROUNDING_SHARE * step
     values[near] = lines[near]
 
 
@@ -378,8 +377,6 @@ def box_arm(
 
 # -- further outboard interfaces of a box: the sides of its cells near a point of its surface ----
 
-NEAR = 1.0 + 1e-9  # of the radius: a side as far from the point as it is long belongs to it
-
 
 def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
     """Return a box with the arm's interfaces and solid cells around them (collective on it).
@@ -403,7 +400,7 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
         point = np.array(one.point)
         assert one.radius is not None
         distance = np.linalg.norm(middles - point, axis=2)
-        own = outer & (distance <= NEAR * one.radius)
+        own = outer & (distance <= INTERFACE_REACH_RATIO * one.radius)
         problem = _problem(mesh.comm, own, own & taken, distance[outer])
         with together(mesh.comm):
             if problem:

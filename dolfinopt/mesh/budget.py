@@ -10,35 +10,22 @@ from pathlib import Path
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.measured import (
+    BUDGET_CELLS,
+    CELL_BYTES,
+    CELL_SECONDS,
+    CELL_SECONDS_EXPONENT,
+    FILE_CELL_BYTES,
+    FILL_BYTES,
+    QUADRATIC_BYTES_RATIO,
+    RANK_BYTES,
+    SHARED_BYTES_RATIO,
+    SMALL_MESH_CELLS,
+    SOLID_BYTES_RATIO,
+)
 from dolfinopt.parallel import partition_arms
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT
-
-# Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
-# quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm (`_bytes`, `_seconds`):
-#   n =   9 600:  265 MB,  0.38 s;      n =  38 400:  648 MB,  2.4 s
-#   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
-# Fill-in of a nested dissection makes both grow faster than n. Quadratic elements, 400 x 24 of them
-# with the nodes of 800 x 48 others, take 1.3 times the latters' memory, and their time.
-PROCESS = 0.2e9  # bytes of a rank without cells
-CELL, FILL, AT = 6.9e3, 0.2e3, 38_400  # bytes a cell, more for every doubling, measured at
-CELL_SECONDS, GROWTH = 32e-6, 0.33  # s a cell at AT, and the power of n with which it grows
-FEW = 100_000  # cells of all arms, 1 GB: not worth a look
-QUADRATIC = 1.3  # bytes a node of a quadratic element over those of others
-# Bytes of a hexahedron over those of a quadrilateral, with conjugate gradients, which replace the
-# factor where memory is short: 378 000 dofs 3.1 GB, 996 000 8.2 GB (`dolfinopt bench solid`); and
-# of a solid arm on several ranks over one on one: 12.7 GB.
-SOLID = 3.6
-SHARED = 1.5
-# Bytes a cell of a solid from a file, whose cells are all different: without and with geometric
-# stiffness, which takes the stress of 18 loads in all cells. A bar of 16 755 tetrahedra of second
-# order takes 1.04 and 3.25 GB, of first order 0.23 and 0.46 GB, one of 4468 hexahedra 0.28 and
-# 0.42 GB. Of other elements by their nodes.
-FROM_FILE = {
-    ("tetrahedron", "quadratic"): (62e3, 194e3),
-    ("tetrahedron", "linear"): (14e3, 28e3),
-    ("hexahedron", "incompatible"): (62e3, 95e3),
-}
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -52,15 +39,16 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     cells = scene.cell_counts
     size = {k: count * _cells_for_one(scene.arms[k]) for k, count in cells.items()}
     least = {k: count * _least_bytes(scene, k) for k, count in cells.items()}
-    if sum(size.values()) <= FEW and sum(least.values()) <= FEW * CELL:
+    small = SMALL_MESH_CELLS
+    if sum(size.values()) <= small and sum(least.values()) <= small * CELL_BYTES:
         return
     partition = partition_arms(world, scene.cell_counts)
-    shared = {k: SHARED if scene.arms[k].is_solid else 1.0 for k in partition.arms}
+    shared = {k: SHARED_BYTES_RATIO if scene.arms[k].is_solid else 1.0 for k in partition.arms}
     if partition.comm.size == 1:
         shared = dict.fromkeys(shared, 1.0)
     mine = (
         sum(shared[k] * max(_bytes(size[k]), least[k]) for k in shared) / partition.comm.size
-        + PROCESS
+        + RANK_BYTES
     )
     seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
     partition.comm.Free()
@@ -86,8 +74,8 @@ def _cells_for_one(arm: Arm) -> float:
     """Return how many bilinear quadrilaterals cost as much memory as a cell of the arm."""
     nodes = arm.nodes_per_cell
     if arm.is_solid:
-        return SOLID * nodes
-    return QUADRATIC * nodes if nodes > 1.0 else 1.0
+        return SOLID_BYTES_RATIO * nodes
+    return QUADRATIC_BYTES_RATIO * nodes if nodes > 1.0 else 1.0
 
 
 def _least_bytes(scene: Scene, index: int) -> float:
@@ -97,11 +85,11 @@ def _least_bytes(scene: Scene, index: int) -> float:
         return 0.0
     stiffened = scene.simulation.stiffening is not False
     element = arm.element or DEFAULT_ELEMENT[arm.shape]
-    if known := FROM_FILE.get((arm.shape, element)):
+    if known := FILE_CELL_BYTES.get((arm.shape, element)):
         return known[stiffened]
     usual = arm.model_copy(update={"element": None})
     nodes = arm.nodes_per_cell / usual.nodes_per_cell
-    return nodes * FROM_FILE[arm.shape, DEFAULT_ELEMENT[arm.shape]][stiffened]
+    return nodes * FILE_CELL_BYTES[arm.shape, DEFAULT_ELEMENT[arm.shape]][stiffened]
 
 
 def free_memory(proc: Path = Path("/proc"), cgroup: Path = _CGROUP) -> float:
@@ -161,15 +149,16 @@ def _left(folder: Path, limit: str, usage: str, reclaimable: str) -> float:
 
 def solid_bytes(cells: int, ranks: int) -> float:
     """Return the memory that a solid arm of hexahedra takes on all of its ranks."""
-    return (SHARED if ranks > 1 else 1.0) * _bytes(SOLID * cells) + ranks * PROCESS
+    shared = SHARED_BYTES_RATIO if ranks > 1 else 1.0
+    return shared * _bytes(SOLID_BYTES_RATIO * cells) + ranks * RANK_BYTES
 
 
 def _bytes(cells: float) -> float:
-    return cells * (CELL + FILL * max(math.log2(max(cells, 1) / AT), 0.0))
+    return cells * (CELL_BYTES + FILL_BYTES * max(math.log2(max(cells, 1) / BUDGET_CELLS), 0.0))
 
 
 def _seconds(cells: float) -> float:
-    return CELL_SECONDS * cells * (cells / AT) ** GROWTH
+    return CELL_SECONDS * cells * (cells / BUDGET_CELLS) ** CELL_SECONDS_EXPONENT
 
 
 def _gigabytes(amount: float) -> str:

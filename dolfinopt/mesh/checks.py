@@ -13,15 +13,15 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.measured import (
+    FILE_ROUNDING_SHARE,
+    FLAT_CORNER_SINE,
+    FLAT_VOLUME_SHARE,
+    FRAME_TOLERANCE,
+    FULL_TURN_ANGLE,
+    TOUCHING_AREA_SHARE,
+)
 from dolfinopt.scene.load import Arm
-
-# How far an interface's middle may be off its joint axis and the mesh's height off `height`,
-# relative to `height`: far more than a polygon in place of a circle needs.
-FRAME_TOLERANCE = 0.05
-PLANE_TOLERANCE = 1e-6  # |z| relative to `height`: what a file of seven digits leaves
-FLAT_CORNER = 1e-6  # sine of a corner's angle, below which a cell has no area
-FULL_TURN = 2.0 * np.pi + 1e-6  # angles about a point: rounding of at most some dozen of them
-TOUCHING = 1e-9  # of the longest line squared: lines that meet at an end, up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def check_mesh(flat: FlatMesh, arm: Arm) -> None:
         raise InputError("its lines are curved; expected straight ones (Mesh.ElementOrder = 1)")
     used = flat.points[np.unique(flat.cells)]
     off = np.abs(used[:, 2]).max()
-    if off > PLANE_TOLERANCE * arm.height:
+    if off > FILE_ROUNDING_SHARE * arm.height:
         raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
     _check_cells(flat)
     _check_frame(flat, arm, used)
@@ -84,7 +84,9 @@ def _check_cells(flat: FlatMesh) -> None:
     back = np.roll(corner, 1, axis=1) - corner
     turn = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
     size = np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
-    bad = ~((turn > FLAT_CORNER * size).all(axis=1) | (turn < -FLAT_CORNER * size).all(axis=1))
+    bad = ~(
+        (turn > FLAT_CORNER_SINE * size).all(axis=1) | (turn < -FLAT_CORNER_SINE * size).all(axis=1)
+    )
     if bad.any():
         x, y = corner[bad][0].mean(axis=0)
         raise InputError(
@@ -131,7 +133,7 @@ def _check_overlap(flat: FlatMesh, corner: np.ndarray) -> None:
     ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     sine = np.abs(ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0])
     angle = np.bincount(flat.cells.ravel(), np.arctan2(sine, (ahead * back).sum(axis=2)).ravel())
-    bad |= (angle > FULL_TURN)[flat.cells].ravel()
+    bad |= (angle > FULL_TURN_ANGLE)[flat.cells].ravel()
     if not bad.any():
         crossed = np.zeros(len(ends), dtype=bool)
         crossed[times == 1] = _crossings(flat.points[ends[times == 1], :2])
@@ -158,7 +160,7 @@ def _crossings(lines: np.ndarray) -> np.ndarray:
     reach = np.linalg.norm(b - a, axis=1).max()
     pairs = cKDTree(0.5 * (a + b)).query_pairs(reach, output_type="ndarray")
     i, j = pairs.T
-    tiny = TOUCHING * reach * reach
+    tiny = TOUCHING_AREA_SHARE * reach * reach
     first = _twice_area(a[i], b[i], a[j]), _twice_area(a[i], b[i], b[j])
     second = _twice_area(a[j], b[j], a[i]), _twice_area(a[j], b[j], b[i])
     cross = np.minimum(*map(np.abs, first)) > tiny
@@ -211,8 +213,6 @@ def remedy(found: float, expected: float, keys: str = "length and height") -> st
 
 # -- whether cells in space can be a solid: no flat, folded or overlapping ones, one part --------
 
-FLAT = 1e-6  # volume of a cell over the cube of its longest edge, below which it has none
-
 
 def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     """Check the cells of a mesh file.
@@ -228,9 +228,9 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     corners = points[cells]
     _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
     longest = np.ptp(corners, axis=1).max(axis=1)
-    _refuse(cell_volumes(corners) < FLAT * longest**3, corners, "are flat")
+    _refuse(cell_volumes(corners) < FLAT_VOLUME_SHARE * longest**3, corners, "are flat")
     if cells.shape[1] == 8:
-        _refuse(_folded(corners, FLAT * longest**3), corners, "are folded")
+        _refuse(_folded(corners, FLAT_VOLUME_SHARE * longest**3), corners, "are folded")
     _refuse(
         _overlapping(corners, facet_keys(cells)),
         corners,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.measured import LINE_CHARACTERS_LIMIT, WORD_CHARACTERS_LIMIT
 
 # What each kind of file begins with; Gmsh takes a file that does not for a text in its language.
 FIRST = {
@@ -91,8 +92,6 @@ GENERAL = frozenset(
 # Where Gmsh goes on after it has skipped text.
 ENDS = re.compile("(?:EndIf|EndFor|Else|ElseIf|Return)(?![A-Za-z_])")
 FORMAT = re.compile(r"(?:[^%]|%%|%[-+ 0#]?\d{0,2}(?:\.\d{0,2})?[eEfFgG])*")
-LONGEST = 250  # characters of a name, number or text; Gmsh's parser has buffers of 256 and 1024
-LINE = 1000  # characters of a line that Gmsh sees; it reads blocks of 8192
 ASSIGNMENTS = frozenset({"=", "+=", "-=", "*=", "/=", "++", "--"})
 CLOSING = {"(": ")", "[": "]", "{": "}"}
 
@@ -171,7 +170,7 @@ def checked_geo(text: str) -> str:
 def _wrapped(words: list[str]) -> list[str]:
     rows, size = [""], 0
     for word in words:
-        if size + len(word) >= LINE:
+        if size + len(word) >= LINE_CHARACTERS_LIMIT:
             rows.append("")
             size = 0
         rows[-1] += word + " "
@@ -207,7 +206,7 @@ def _tokens(text: str) -> list[_Token]:
             if "\0" in piece:
                 raise _refused(line, "a character 0", "does not belong to Gmsh's language")
         else:
-            if len(piece) > LONGEST or any(c < " " for c in piece):
+            if len(piece) > WORD_CHARACTERS_LIMIT or any(c < " " for c in piece):
                 raise _refused(line, f"{piece[:20]!r}...", "is too long or goes over several lines")
             if ENDS.search(piece) and piece not in HARMLESS:
                 raise _refused(line, piece, "holds a word that ends a block")

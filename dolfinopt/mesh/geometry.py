@@ -19,15 +19,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import (
-    FRAME_TOLERANCE,
-    check_cells,
-    check_mesh,
-    facet_keys,
-    flatten,
-    keys_of,
-    remedy,
-)
+from dolfinopt.mesh.checks import check_cells, check_mesh, facet_keys, flatten, keys_of, remedy
 from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import (
     DESIGN,
@@ -45,6 +37,16 @@ from dolfinopt.mesh.gmsh_session import (
     rename_groups,
     silent_terminal,
     unknown_names,
+)
+from dolfinopt.mesh.measured import (
+    END_FACE_COSINE_GAP,
+    FACES_EDGE_ANGLE,
+    FILE_ROUNDING_SHARE,
+    FRAME_TOLERANCE,
+    INTERFACE_AREA_SHARE,
+    LOST_VOLUME_SHARE,
+    SIDE_FACE_COSINE,
+    THICKNESS_TOLERANCE,
 )
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.arms import SIZE_PARAMETER
@@ -138,10 +140,6 @@ def _read_msh(gmsh: Any, arm: Arm, _: list[str]) -> bool:
 # -- STEP files as Gmsh models: the planar face of an arm, or the end face of its solid ----------
 
 UNNAMED = "Open CASCADE STEP translator"  # and numbers: what Open CASCADE calls nameless products
-THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
-NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
-NORMAL = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
-ALONG = 1e-6  # cosine to z of a side face's normal: rounding of splines
 
 
 def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> bool:
@@ -203,7 +201,7 @@ def _prism_faces(
     model: Any, arm: Arm
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]], float]:
     """Return the end faces nearest to z = 0 of prisms, the solid of each, and their z, m."""
-    near = NEAR * arm.height
+    near = FILE_ROUNDING_SHARE * arm.height
     found: list[tuple[float, float, list[tuple[tuple[int, int], float]], tuple[int, int]]] = []
     for solid in model.getEntities(3):
         flat = []
@@ -212,9 +210,9 @@ def _prism_faces(
             grid = np.stack(np.meshgrid(*np.linspace(low, high, 5).T), axis=2).ravel()
             points = np.reshape(model.getValue(*face, grid), (-1, 3))
             upright = np.abs(np.reshape(model.getNormal(face[1], grid), (-1, 3))[:, 2])
-            if (upright > 1.0 - NORMAL).all():
+            if (upright > 1.0 - END_FACE_COSINE_GAP).all():
                 flat.append((face, float(points[:, 2].mean())))
-            elif not (upright < ALONG).all():
+            elif not (upright < SIDE_FACE_COSINE).all():
                 x, y, z = model.occ.getCenterOfMass(*face)
                 raise InputError(
                     f"it holds a solid whose face about ({x:.4g}, {y:.4g}, {z:.4g}) m is neither "
@@ -273,7 +271,7 @@ def _joint_curves(model: Any, x: float, height: float) -> list[int]:
     """Return the curves of the interface at the joint axis (x, 0)."""
     # The bore: the smallest full circle about the axis. Where there is none, the end: all straight
     # curves on the upright line through it.
-    near = NEAR * height
+    near = FILE_ROUNDING_SHARE * height
     arcs: list[tuple[float, float, int]] = []  # radius, angle, curve
     upright = []
     for _, tag in model.getEntities(1):
@@ -306,7 +304,6 @@ def _joint_curves(model: Any, x: float, height: float) -> list[int]:
 # A STEP file (ISO 10303-21) holds one instance a statement, `#21 = EDGE_CURVE('name', #22, ...);`.
 # Shapes are told by their vertices: what bears a name is found again among Gmsh's shapes by place.
 
-TOLERANCE = 1e-6  # distance of vertices relative to the extent of all: digits of a file
 
 _STATEMENT = re.compile(r"#(\d+)\s*=\s*([A-Z0-9_]+)\s*\(((?:'[^']*'|[^';])*)\)\s*;")
 _EDGES = ("EDGE_CURVE",)
@@ -341,7 +338,7 @@ class StepShapes:
         return {
             name
             for name, vertices in zip(self.names, self.vertices, strict=True)
-            if _same_places(vertices * scale, points, TOLERANCE * there)
+            if _same_places(vertices * scale, points, FILE_ROUNDING_SHARE * there)
         }
 
 
@@ -409,7 +406,6 @@ def _same_places(a: np.ndarray, b: np.ndarray, tolerance: float) -> bool:
 # the flat ends there. Volumes, or STEP products, whose names begin with passive stay solid.
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
-FACE_NEAR = 1e-6  # of the arm's height: coordinates in a file have seven digits or more
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.
 TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 Entities = dict[int, list[int]]
@@ -555,7 +551,7 @@ def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -
     # The bore: the cylinder about the axis with the smallest radius, in one or more faces; where
     # there is none, the flat end in the plane through it, of the arm's two ends.
     x, y = place
-    near = FACE_NEAR * arm.height
+    near = FILE_ROUNDING_SHARE * arm.height
     bores: list[tuple[float, int]] = []
     ends = []
     for _, tag in model.getEntities(2):
@@ -667,10 +663,6 @@ def _check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
 
 # -- A closed surface of triangles, meshed with tetrahedra; cells as a solid arm's .msh file -----
 
-EDGE = math.radians(40.0)  # between triangles, from which on there is an edge between faces
-LOST = 0.1  # largest share of the volume that flat cells may miss at curved faces
-INSIDE = 0.5  # share of a face's area that is an interface's, from which on the face is the latter
-
 
 @dataclass(frozen=True, eq=False)
 class Tetrahedra:
@@ -721,7 +713,7 @@ def tetrahedra_of(
     triangles: np.ndarray,
     size: float,
     interfaces: tuple[np.ndarray, np.ndarray],
-    edge: float = EDGE,
+    edge: float = FACES_EDGE_ANGLE,
 ) -> Tetrahedra:
     """Mesh the solid within a closed surface, on this process alone.
 
@@ -781,7 +773,7 @@ def _meshed(
     found = _cells(model, solid, chosen)
     volumes = found.volumes
     expected = np.einsum("na,na->", *_fans(points[triangles])) / 6.0
-    if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST * expected:
+    if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST_VOLUME_SHARE * expected:
         raise InputError("its cells do not fill it")
     return found
 
@@ -797,7 +789,7 @@ def _faces_of(
         inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
         a, b, c = points[nodes - 1].swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        if area[inside].sum() > INSIDE * area.sum():
+        if area[inside].sum() > INTERFACE_AREA_SHARE * area.sum():
             found.append(face)
     return found
 

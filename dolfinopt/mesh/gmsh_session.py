@@ -16,11 +16,11 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.file_check import open_file
+from dolfinopt.mesh.measured import UNREAD_STATEMENTS_LIMIT
 from dolfinopt.parallel import together
 
 # Gmsh's numbers of straight triangles and quadrilaterals.
 TRIANGLE, QUADRILATERAL = 2, 3
-MAX_STATEMENTS = 1000  # of a .geo file that Gmsh gave up: no file of an arm has more
 
 
 @contextmanager
@@ -73,7 +73,7 @@ def _finish_reading(gmsh: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder) / "empty.geo"
         empty.write_text("\n")
-        for _ in range(MAX_STATEMENTS):
+        for _ in range(UNREAD_STATEMENTS_LIMIT):
             _begin(gmsh)
             try:
                 gmsh.open(str(empty))

@@ -30,6 +30,13 @@ from typing import TypeAlias
 
 import numpy as np
 
+from dolfinopt.multibody.measured import (
+    LONG_SERIES_LIMIT,
+    LONG_SERIES_TERMS,
+    SHORT_SERIES_LIMIT,
+    SHORT_SERIES_TERMS,
+)
+
 
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return A B (i, ..., n) of matrices (i, j, n), or one (i, j), and (j, ..., n)."""
@@ -416,18 +423,13 @@ def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
     return out
 
 
-# Terms of the series: 1e-24 at x = 1, and 1e-40 up to x = FAR, where rounding has grown to 1e-15.
-TERMS, NEAR = 10, 1.0
-MANY_TERMS, FAR = 40, 10.0
-
-
 def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
     """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of many turns closed."""
-    far = np.abs(x) > FAR
+    far = np.abs(x) > LONG_SERIES_LIMIT
     if not far.any():
         return _series(x, orders)
     near = _series(np.where(far, 0.0, x), orders)
-    large = _closed(np.where(far, x, FAR), orders)
+    large = _closed(np.where(far, x, LONG_SERIES_LIMIT), orders)
     return [np.where(far, b, a) for a, b in zip(near, large, strict=True)]
 
 
@@ -441,7 +443,8 @@ def _closed(x: np.ndarray, orders: int) -> list[np.ndarray]:
 
 
 def _series(x: np.ndarray, orders: int) -> list[np.ndarray]:
-    terms = TERMS if np.abs(x).max(initial=0.0) <= NEAR else MANY_TERMS
+    short = np.abs(x).max(initial=0.0) <= SHORT_SERIES_LIMIT
+    terms = SHORT_SERIES_TERMS if short else LONG_SERIES_TERMS
     last = np.zeros((2, *x.shape), dtype=x.dtype)  # c_(orders-1) and the one before
     column = (2, *(1,) * x.ndim)
     for j in range(terms - 1, -1, -1):

@@ -9,7 +9,8 @@ import numpy as np
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.dimension import Turning, product
 from dolfinopt.multibody.kinematics import MovingJoint
-from dolfinopt.multibody.mechanism import FEW, GROUND, ElasticBodies, Mechanism, Site, several
+from dolfinopt.multibody.measured import LEAST_INSTANTS
+from dolfinopt.multibody.mechanism import GROUND, ElasticBodies, Mechanism, Site, several
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -189,7 +190,7 @@ def interface_place(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, *, second: bool = False
 ) -> InterfacePlace:
     """Return place, Jacobian and, if asked for, Hessian at the motion's n instants; q (n, N)."""
-    if 0 < len(q) < FEW:
+    if 0 < len(q) < LEAST_INSTANTS:
         few = interface_place(*several(mechanism, motion, q), second=second)
         H = None if few.hessian is None else few.hessian[: len(q)]
         return InterfacePlace(few.place[: len(q)], few.jacobian[: len(q)], H)
@@ -271,7 +272,7 @@ def place_gradient(
     Returns:
         Of every body, by its outboard modes (3, q) and K0_outboard (3, q, q).
     """
-    if 0 < len(q) < FEW:
+    if 0 < len(q) < LEAST_INSTANTS:
         few = several(mechanism, motion, q, weights, moved, pull)
         for x in few[3:]:
             x[len(q) :] = 0.0

@@ -225,8 +225,6 @@ def load_coefficients(mechanism: Any, motion: RigidMotion, rates: Rates) -> list
 
 # -- how much the loads of a motion stiffen or soften the arms, before anything is simulated -----
 
-WARN = 0.05  # change of an arm's stiffness from which a motion without it is not to be trusted
-
 
 @dataclass(frozen=True)
 class Stiffening:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.exchange.mbdyn import Invariants, ModalElement
+from dolfinopt.multibody.measured import SAME_NODE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION
 from dolfinopt.multibody.standard_input import centrifugal, outboard_interfaces, turning
@@ -22,9 +23,6 @@ from dolfinopt.multibody.standard_input import centrifugal, outboard_interfaces,
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
     from dolfinopt.reduction import Basis
-
-# Nodes of two ranks that coincide to this, relative to the arm's extent, are one.
-SAME_PLACE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +54,7 @@ def lumped_nodes(arm: ElasticArm, basis: Basis, thickness: float) -> LumpedNodes
     if pieces is None:
         return None
     places, rows, V = (np.concatenate(part) for part in zip(*pieces, strict=True))
-    rounded = np.round(places / (SAME_PLACE * np.ptp(places, axis=0).max())) + 0.0  # no -0
+    rounded = np.round(places / (SAME_NODE_SHARE * np.ptp(places, axis=0).max())) + 0.0  # no -0
     # Sorted by x, then y. Nodes that ranks share have several shares of mass and the same motion.
     _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     total = np.bincount(place.ravel(), weights=rows)

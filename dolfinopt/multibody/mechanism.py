@@ -25,6 +25,7 @@ from dolfinopt.multibody.body_motion import (
     at,
 )
 from dolfinopt.multibody.dimension import DIMENSIONS
+from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
 # closures
-
-LINEAR = 0.95  # share of its limit up to which a drive gives what is wanted of it
 
 
 def saturated(wanted: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,9 +49,9 @@ def saturated(wanted: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.nda
         wanted: w (..., R), N, N m.
         limit: L > 0 (R,), finite.
     """
-    width = 2.0 * (1.0 - LINEAR)
-    x = np.clip((np.abs(wanted) / limit - LINEAR) / width, 0.0, 1.0)
-    bent = LINEAR + width * (x - x**4 * (2.5 - 3.0 * x + x * x))
+    width = 2.0 * (1.0 - LINEAR_DRIVE_SHARE)
+    x = np.clip((np.abs(wanted) / limit - LINEAR_DRIVE_SHARE) / width, 0.0, 1.0)
+    bent = LINEAR_DRIVE_SHARE + width * (x - x**4 * (2.5 - 3.0 * x + x * x))
     u = np.where(x > 0.0, np.sign(wanted) * limit * bent, wanted)
     return u, 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
 
@@ -184,19 +183,14 @@ class Closure:
 # Scenarios of the same bodies (other payloads, gravity, materials) lie one after the other in the
 # arrays of instants; what they share is stored once.
 
-# Fewer instants are computed as so many. On processors with AVX-512, NumPy 1.24 multiplies complex
-# arrays of less than 64 bytes in one of two ways that round differently, and chooses by how far the
-# arrays lie from each other in memory: equal runs would end in different bits.
-FEW = 4
-
 
 def repeated(count: int) -> np.ndarray | None:
-    """Return indices that make few instants `FEW`, the last one repeated; None: not so few."""
-    return np.minimum(np.arange(FEW), count - 1) if 0 < count < FEW else None
+    """Return indices that make `LEAST_INSTANTS` of fewer, the last one repeated; None: enough."""
+    return np.minimum(np.arange(LEAST_INSTANTS), count - 1) if 0 < count < LEAST_INSTANTS else None
 
 
 def several(*arguments: Any) -> tuple[Any, ...]:
-    """Return the arguments at `FEW` instants, the last one as often as it takes."""
+    """Return the arguments at `LEAST_INSTANTS` instants, the last one as often as it takes."""
     every = repeated(len(arguments[-1]))
     return arguments if every is None else tuple(x[every] for x in arguments)
 

@@ -15,6 +15,12 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.measured import (
+    DEAD_CENTRE_SHARE,
+    DENSE_INSTANTS,
+    SINGULAR_DISTANCE_SHARE,
+    TABLE_CORNERS_LIMIT,
+)
 from dolfinopt.multibody.mechanism import repeated
 from dolfinopt.paths.tables import (
     TIME,
@@ -38,14 +44,7 @@ from dolfinopt.scene.duration import (
 )
 from dolfinopt.scene.load import Motion, Scene
 
-# Nearer to a singular position than this share of the largest arm, joint speeds lose their
-# digits: accelerations grow with the inverse cube of sin(elbow angle).
-SINGULAR = 1e-6
-# Instants of the whole motion at which its reach is checked and its angles are told apart.
-DENSE = 2001
 CART = "cart"  # first column of a table of joints
-# With more rows a table's corners are many and small; the integrator's steps need not end there.
-MAX_CORNERS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +117,7 @@ def check_plane_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed at every sampled instant."""
     motion = scene.motion
     end = motion.horizon if motion.path == "rotation" else motion.duration
-    rigid_motion(np.linspace(0.0, end, DENSE), scene)
+    rigid_motion(np.linspace(0.0, end, DENSE_INSTANTS), scene)
 
 
 def curve_of_table(scene: Scene) -> tuple[Curve, bool]:
@@ -140,7 +139,7 @@ def breakpoints(
         curve, timed = curve_of(scene)
         corners = np.array(curve.kinks)
     if not timed:
-        rows = _when(corners, motion) if 0 < len(corners) <= MAX_CORNERS else []
+        rows = _when(corners, motion) if 0 < len(corners) <= TABLE_CORNERS_LIMIT else []
         corners = np.concatenate([rows, time_law(motion).knots * motion.duration])
     instants = np.sort(np.append(corners, motion.duration))
     apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
@@ -498,7 +497,7 @@ def _loop_angles(t: np.ndarray, joints: Derivatives, scene: Scene) -> Derivative
 @lru_cache(maxsize=64)
 def _continuous_loop(scene: Scene, stamp: int) -> tuple[np.ndarray, np.ndarray]:
     """Return dense instants and all joint angles there (n, arms) without jumps, rad."""
-    t = np.linspace(0.0, scene.motion.horizon, DENSE)
+    t = np.linspace(0.0, scene.motion.horizon, DENSE_INSTANTS)
     angles = _loop_angles(t, _prescribed_joints(t, scene), scene)[0]
     return t, np.unwrap(angles, axis=0)
 
@@ -537,14 +536,14 @@ def columns_of(scene: Scene) -> tuple[str, ...]:
 def _continuous_shoulder(scene: Scene, stamp: int) -> tuple[np.ndarray, np.ndarray]:
     """Return dense instants and the first arm's angle there without jumps, rad."""
     motion = scene.motion
-    t = np.linspace(0.0, motion.duration, DENSE)
+    t = np.linspace(0.0, motion.duration, DENSE_INSTANTS)
     alpha = _chain(t, desired_path(t, motion), scene).q[:, 1]
     return t, np.unwrap(alpha)
 
 
 def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, scene: Scene) -> None:
     """Raise when the shoulder's distance to the path leaves the reach of the arms."""
-    margin = SINGULAR * max(bend.lengths)
+    margin = SINGULAR_DISTANCE_SHARE * max(bend.lengths)
     near, far = bend.reach
     if len(distance) == 0 or (distance.min() >= near + margin and distance.max() <= far - margin):
         return
@@ -566,7 +565,7 @@ def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, scene: Scen
 
 def _check_height(t: np.ndarray, height: np.ndarray, length: float, scene: Scene) -> None:
     """Raise when the path is higher or lower than one arm reaches."""
-    wrong = np.flatnonzero(~(np.abs(height) <= (1.0 - SINGULAR) * length))
+    wrong = np.flatnonzero(~(np.abs(height) <= (1.0 - SINGULAR_DISTANCE_SHARE) * length))
     if wrong.size:
         worst = wrong[np.argmax(np.abs(height[wrong]))]
         side = "below" if height[worst] < 0.0 else "above"
@@ -598,9 +597,6 @@ def _remedies(scene: Scene) -> str:
 # Plane vectors are complex numbers.
 
 Derivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives
-GAUSS = 8  # points of a phase of the law: exact to degree 15, more than any law has
-# Nearer to a dead centre than this share of an arm's length, rates lose their digits.
-DEAD_CENTRE = 1e-6
 
 
 def rotation(
@@ -619,7 +615,7 @@ def rotation(
         duration: of the run-up, s.
     """
     s, sd, _ = law(t, duration)
-    x, w = np.polynomial.legendre.leggauss(GAUSS)
+    x, w = np.polynomial.legendre.leggauss(8)  # exact to degree 15, more than any law has
     knots = np.unique(np.concatenate([[0.0], law.knots, [1.0]])) * duration
     phases = pairwise(knots)
     angle = np.maximum(t - duration, 0.0)  # the speed is 1 from there on
@@ -772,7 +768,7 @@ def _pinned(t: np.ndarray, place: Derivatives, loop: Loop, way: int, source: str
 
 def _check(t: np.ndarray, room: np.ndarray, size: float, source: str, what: str) -> None:
     """Raise where there is no room (n,), m, before a dead centre."""
-    if room.size and not room.min() > DEAD_CENTRE * size:
+    if room.size and not room.min() > DEAD_CENTRE_SHARE * size:
         worst = int(np.argmin(np.where(np.isfinite(room), room, -np.inf)))
         raise InputError(
             f"{source}: closure: at t = {t[worst]:.4g} s {what}; change the arms' lengths, "

@@ -43,18 +43,13 @@ from dolfinopt.exchange.sid import (
     structure_of,
     taylor,
 )
+from dolfinopt.multibody.measured import CENTRIFUGAL_EXCESS_SHARE, FILE_ROUNDING_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION, skew
 
 # Entries of J, and products of the angular velocity in the columns of Oe.
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 PRODUCTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-# How far matrices that must be symmetric, or zero, may be from it, relative to their largest
-# entry: finite elements leave 1e-12, files with six digits 1e-6.
-SMALL = 1e-6
-# How far the centrifugal matrix may be from that of the mass, relative to Me: lumped masses reach
-# 5 %, geometric stiffening by rotation changes the sign of its diagonal for slender bodies.
-CENTRIFUGAL = 0.1
 
 Place = tuple[float, float, float]
 
@@ -204,7 +199,7 @@ def load_body(
     axis: Place = (length, 0.0, 0.0)
     wanted = [axis, *further.values()]
     for name, point, expected in zip(("", *further), body.points, wanted, strict=True):
-        if np.linalg.norm(point - expected[:dimension]) > SMALL * length:
+        if np.linalg.norm(point - expected[:dimension]) > FILE_ROUNDING_SHARE * length:
             if name:
                 where, told = f"node {name}", f"the arm's interface {name!r} is at {expected} m"
             else:
@@ -406,7 +401,7 @@ def _check_nodes(first: Node, tips: Sequence[Node], dimension: int, source: str)
         ]
     checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, *tips)]
     for node, name, values, scale, must in checks:
-        if np.abs(values).max() > SMALL * scale:
+        if np.abs(values).max() > FILE_ROUNDING_SHARE * scale:
             raise InputError(
                 f"{source}: {name} of node {node.name} deviates by {np.abs(values).max():.3g}; the "
                 f"{'inboard' if node is first else 'outboard'} node must be {must}"
@@ -422,7 +417,8 @@ def _check_body(data: StandardInputData, dimension: int, source: str) -> None:
         moment, coriolis = {"J(3, 3)": inertia[2, 2]}, coriolis[:, :, 2:]
     else:
         principal = np.linalg.eigvalsh(inertia)
-        if principal[0] < -SMALL * np.abs(principal).max():  # 0 of a thin bar about its axis
+        # 0 of a thin bar about its axis.
+        if principal[0] < -FILE_ROUNDING_SHARE * np.abs(principal).max():
             raise InputError(
                 f"{source}: J has a moment of {principal[0]:g} kg m2; none can be negative"
             )
@@ -439,7 +435,8 @@ def _check_body(data: StandardInputData, dimension: int, source: str) -> None:
             f"{source}: Oe has no m1, by which deflections feel the rotation of the frame; write "
             "the file with matrices of order 1"
         )
-    if np.abs(coriolis + coriolis.swapaxes(0, 1)).max() > 2.0 * SMALL * np.abs(data.Me.M0).max():
+    least = 2.0 * FILE_ROUNDING_SHARE * np.abs(data.Me.M0).max()
+    if np.abs(coriolis + coriolis.swapaxes(0, 1)).max() > least:
         raise InputError(
             f"{source}: every third column of Ge must make a skew matrix: a block of three columns "
             "for each coordinate, not one of all coordinates for each axis"
@@ -456,7 +453,7 @@ def _check_plane(data: StandardInputData, inertia: np.ndarray, source: str) -> N
         ("column 3 of Ct", data.Ct.M0[:, 2], data.Ct.M0),
         ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
     ):
-        if np.abs(values).max() > SMALL * np.abs(whole).max():
+        if np.abs(values).max() > FILE_ROUNDING_SHARE * np.abs(whole).max():
             raise InputError(
                 f"{source}: {name} reach(es) {np.abs(values).max():.3g}; an arm must move in the "
                 "x-y plane only"
@@ -485,7 +482,7 @@ def _is_stiffened(
     # little.
     along, _ = _axes(dimension)
     excess, Me = _centrifugal_excess(data, dimension), data.Me.M0
-    rotation = bool(np.abs(excess).max() > CENTRIFUGAL * np.abs(Me).max())
+    rotation = bool(np.abs(excess).max() > CENTRIFUGAL_EXCESS_SHARE * np.abs(Me).max())
     found = {"m1 of Ct": bool(_first_order(data.Ct)[:, :, along].any())}
     if dimension == 2:
         found["m1 of Oe beyond -Me"] = rotation
@@ -512,7 +509,7 @@ def _check_symmetric(matrices: Mapping[str, np.ndarray], source: str) -> None:
     """Check that what one load or rotation does to the coordinates (loads, q, q) is symmetric."""
     # Relative to the largest under the same name: of a load that does nothing rounding is left.
     for name, loads in matrices.items():
-        if np.abs(loads - loads.swapaxes(1, 2)).max() > SMALL * np.abs(loads).max():
+        if np.abs(loads - loads.swapaxes(1, 2)).max() > FILE_ROUNDING_SHARE * np.abs(loads).max():
             raise InputError(
                 f"{source}: m1 of {name} must be symmetric in coordinates and rows or columns: "
                 "it is what one load or rotation does to the stiffness"

@@ -19,7 +19,8 @@ from dolfinopt.density.members import Width, Widths, thinnest, thinnest_solid
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
-from dolfinopt.multibody.inverse_dynamics import WARN, Stiffening
+from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -572,7 +573,7 @@ def _stiffening(stiffening: Stiffening | None) -> dict[str, Any] | None:
 
 def _unstiffened(stiffening: Stiffening | None) -> list[str]:
     """Return a sentence where geometric stiffening is left out and matters."""
-    if stiffening is None or stiffening.on or (stiffening.estimate or 0.0) < WARN:
+    if stiffening is None or stiffening.on or (stiffening.estimate or 0.0) < STIFFNESS_CHANGE_LIMIT:
         return []
     return [
         f"the loads of the motion change the stiffness of an arm by {stiffening.estimate:.2g} of "

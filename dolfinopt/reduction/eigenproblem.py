@@ -14,14 +14,22 @@ from slepc4py import SLEPc
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
+from dolfinopt.reduction.measured import (
+    ADJOINT_ITERATIONS,
+    ADJOINT_TOLERANCE,
+    EIGEN_TOLERANCE,
+    EIGENVALUE_GAP,
+    GUARD_VECTORS,
+    LOBPCG_INDEPENDENT_SHARE,
+    LOBPCG_ITERATIONS,
+    LOBPCG_TOLERANCE,
+    LOST_MODE_SHARE,
+    RAMP_SHARE,
+    WIDE_SPECTRUM_RATIO,
+)
 from dolfinopt.solver import has_options, obeying_options
 
 # -- the linear systems of the modes' derivatives ------------------------------------------------
-
-# Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
-# which leaves more digits than an optimiser can use.
-ADJOINT_TOLERANCE = 1e-8
-MAX_ADJOINT = 500  # steps of conjugate gradients for one mode
 
 
 def complement_solve(
@@ -65,7 +73,7 @@ def complement_solve(
         step, K_step, energy = conditioned(residual)
         image = K_step - value * pencil.mass(step)
         goal = ADJOINT_TOLERANCE**2 * energy
-        for _ in range(MAX_ADJOINT):
+        for _ in range(ADJOINT_ITERATIONS):
             if energy <= goal:
                 break
             if not np.isfinite(energy):
@@ -103,7 +111,7 @@ def _without_factor(
     Z = conditioned(R)
     P, energy = Z, lengths(R, Z)
     goal = ADJOINT_TOLERANCE**2 * energy
-    for _ in range(MAX_ADJOINT):
+    for _ in range(ADJOINT_ITERATIONS):
         if not np.isfinite(energy).all():
             break
         more = energy > goal[here]
@@ -136,10 +144,6 @@ def _too_close(pencil: Pencil, k: int) -> ConvergenceError:
 # doi:10.1016/j.jcp.2006.02.007.
 
 Columns = Callable[[np.ndarray], np.ndarray]
-GUARDS = 3  # vectors beyond those that are wanted: the last ones converge slowly
-MAX_STEPS = 200
-TOLERANCE = 1e-8  # of the vectors in energy
-INDEPENDENT = 1e-12  # share of a direction's length, squared, below which it is the others'
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,14 +195,14 @@ def lowest_without_factor(
         count: number of eigenpairs.
         start: (rows, k) vectors of a nearby design, or None.
     """
-    rows, size = operators.rows, count + GUARDS
+    rows, size = operators.rows, count + GUARD_VECTORS
     known = np.empty((rows, 0)) if start is None else start[:, :size]
     first = 0 if arm.comm.size == 1 else arm.comm.exscan(rows) or 0
     columns = 12.9898 + np.arange(size - known.shape[1])
     noise = np.sin(np.outer(np.arange(first + 1.0, first + rows + 1.0), columns))
     noise = np.modf(np.abs(noise) * 43758.5453)[0] - 0.5
     smooth = operators.precondition(operators.precondition(noise))
-    found = lobpcg(operators, np.hstack([known, smooth]), count, TOLERANCE)
+    found = lobpcg(operators, np.hstack([known, smooth]), count, LOBPCG_TOLERANCE)
     return None if found is None else found[:2]
 
 
@@ -221,7 +225,7 @@ def lobpcg(
     C, values = _ritz(operators, S)
     X, KX, MX = (part @ C[:, :m] for part in S)
     values, P = values[:m], [np.empty((len(start), 0))] * 3
-    for step in range(MAX_STEPS):
+    for step in range(LOBPCG_ITERATIONS):
         R = KX - MX * values
         W = operators.precondition(R)
         size = operators.total(np.einsum("nk,nk->k", R, W))
@@ -256,7 +260,7 @@ def _ritz(operators: Operators, space: list[np.ndarray]) -> tuple[np.ndarray, np
 
     def solved() -> tuple[np.ndarray, np.ndarray]:
         lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
-        kept = lengths > INDEPENDENT * lengths[-1]
+        kept = lengths > LOBPCG_INDEPENDENT_SHARE * lengths[-1]
         T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
         values, vectors = np.linalg.eigh(T.T @ K @ T)
         return T @ vectors, values
@@ -269,20 +273,6 @@ def _ritz(operators: Operators, space: list[np.ndarray]) -> tuple[np.ndarray, np
 # -- the lowest modes of an arm ------------------------------------------------------------------
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
-# Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
-# equal to 1e-8 on any number of ranks; each further digit costs a fraction of a step.
-EIGEN_TOLERANCE = 1e-12
-# Relative distance of eigenvalues up to which there may be more of the same: with the tolerance
-# above, vectors of values that close are known to 1e-6 of one another only.
-REPEATED = 1e-6
-# Share of a nearby mode, in M, beyond which the modes that were found do not contain it.
-LOST = 1e-2
-# Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
-# to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
-WIDE = 1e6
-# Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
-# finds modes of another symmetry, up to 1e-4 it is not slower.
-RAMP_SHARE = 1e-6
 
 Pairs = tuple[np.ndarray, np.ndarray]  # eigenvalues (k,) ascending, vectors (owned rows, k)
 
@@ -364,7 +354,7 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
 def _is_dense(pairs: Pairs, count: int) -> bool:
     """Return whether a search may have passed over modes: some are missing, or nearly equal."""
     values = pairs[0]
-    return len(values) < count or bool((np.diff(values) <= REPEATED * values[1:]).any())
+    return len(values) < count or bool((np.diff(values) <= EIGENVALUE_GAP * values[1:]).any())
 
 
 def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
@@ -379,10 +369,10 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
     for vector, before in zip(rest.T, start.T, strict=True):
         Mr = pencil.mass(vector)
         left, whole = pencil.total(np.array([vector @ Mr, before @ pencil.mass(before)]))
-        if left < LOST * whole:
+        if left < LOST_MODE_SHARE * whole:
             continue
         inverse = float(pencil.total(Mr @ pencil.inverse(Mr)))
-        if not inverse * values[-1] <= (1.0 + REPEATED) * left:  # not a number included
+        if not inverse * values[-1] <= (1.0 + EIGENVALUE_GAP) * left:  # not a number included
             return True
     return False
 
@@ -448,7 +438,7 @@ class _Eigenproblem:
         dense = start is None or _is_dense(pairs, count) or _passes_over(self.pencil, pairs, start)
         if dense and len(pairs[0]) == count:
             pairs = self.without_gaps(*pairs)
-        if len(pairs[0]) == count and pairs[0][-1] > WIDE * pairs[0][0]:
+        if len(pairs[0]) == count and pairs[0][-1] > WIDE_SPECTRUM_RATIO * pairs[0][0]:
             pairs = pairs[0], orthonormal(self.pencil, pairs[1])
         return pairs
 
@@ -538,7 +528,7 @@ class _Eigenproblem:
                     f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
                     "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"
                 )
-            if more[0] >= (1.0 - REPEATED) * values[-1]:
+            if more[0] >= (1.0 - EIGENVALUE_GAP) * values[-1]:
                 break
             values = np.append(values[:-1], more)
             vectors = np.column_stack([vectors[:, :-1], vector])

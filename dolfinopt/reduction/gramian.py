@@ -23,15 +23,13 @@ from dolfinopt.reduction.free_arm import (
     frame_loads,
     interface_loads,
 )
+from dolfinopt.reduction.measured import (
+    KRYLOV_BLOCKS_LIMIT,
+    RESPONSE_DEFLATION_SHARE,
+    RESPONSE_RANK_SHARE,
+    RESPONSE_TOLERANCE,
+)
 from dolfinopt.reduction.subspace import InverseSpace, dot, ritz
-
-# Relative residual of the responses in the band, after multiplication by K^-1, in energy.
-RESPONSE_TOLERANCE = 1e-10
-MAX_BLOCKS = 60  # of the Krylov space
-# Directions whose response is below this share of the largest are lost in RESPONSE_TOLERANCE.
-RANK_TOLERANCE = 1e-10
-INDEPENDENT = 1e-12  # share of a Krylov vector's length below which its remainder is rounding
-POINTS = 8  # of Gauss-Legendre in each panel, exact to degree 15
 
 
 def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
@@ -57,9 +55,9 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     """
     arm.profile.counts.reductions += 1
     free = FreeArm(arm)
-    space = InverseSpace(free, free.solve(_inputs(free)), INDEPENDENT)
+    space = InverseSpace(free, free.solve(_inputs(free)), RESPONSE_DEFLATION_SHARE)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
-    for _ in range(MAX_BLOCKS):
+    for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()
         reduced = _Reduced.of(space, options.damping)
         omega, weights = quadrature(low, high, reduced.theta, options.damping)
@@ -78,7 +76,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     upper = np.linalg.cholesky(arm.energy_matrix(V)).T
     _, triangle = np.linalg.qr((upper @ reduced.vectors @ factor).T)
     U, sigma, _ = on_root(arm.comm, partial(np.linalg.svd, triangle.T, full_matrices=False))
-    found = int((sigma > RANK_TOLERANCE * sigma[0]).sum())
+    found = int((sigma > RESPONSE_RANK_SHARE * sigma[0]).sum())
     if found < options.coordinates:
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: responses between {options.band[0]:g} and "
@@ -176,7 +174,7 @@ def quadrature(
         near = np.concatenate([peak - steps, peak + steps])
         edges += [*near[(near > max(low, begin)) & (near < min(high, end))]]
     grid = np.unique(edges)
-    nodes, weights = np.polynomial.legendre.leggauss(POINTS)
+    nodes, weights = np.polynomial.legendre.leggauss(8)  # exact to degree 15
     half_lengths = 0.5 * np.diff(grid)[:, None]
     centres = 0.5 * (grid[1:] + grid[:-1])[:, None]
     return (centres + half_lengths * nodes).ravel(), (half_lengths * weights).ravel()

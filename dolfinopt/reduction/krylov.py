@@ -22,11 +22,8 @@ from dolfinopt.reduction.free_arm import (
     frame_loads,
     interface_loads,
 )
+from dolfinopt.reduction.measured import KRYLOV_BLOCKS_LIMIT, SHIFT_TOLERANCE
 from dolfinopt.reduction.subspace import Expansion, dot, orthonormalise, ritz, solve_at
-
-# Relative residual of solutions at a shift, in the norm of M after multiplication by K^-1.
-SHIFT_TOLERANCE = 1e-12
-MAX_SHIFT_STEPS = 60  # blocks; 5 to 10 are the rule up to 40 times the first frequency
 
 
 def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
@@ -89,7 +86,7 @@ def krylov_adjoint(
         cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
         interior[:, old] -= cotangents[0] @ H[old].T
         outboard[:, old] -= cotangents[1] @ H[old].T
-        mu = solve_at(recursion.free, block.omega, cotangents, SHIFT_TOLERANCE, MAX_SHIFT_STEPS)
+        mu = solve_at(recursion.free, block.omega, cotangents, SHIFT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired
@@ -162,7 +159,7 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 now, columns = np.split(columns, [options.coordinates - V.shape[2]])
                 right = group(free) if group else arm.restrict(MV)
                 right = right[0][:, now], right[1][:, now]
-                raw = solve_at(free, omega, right, SHIFT_TOLERANCE, MAX_SHIFT_STEPS)
+                raw = solve_at(free, omega, right, SHIFT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
                 new = orthonormalise(arm, raw, V, MV)
                 blocks.append(_Block(omega, group, now, new))
                 V, MV = np.concatenate([V, new.Q], axis=2), np.concatenate([MV, new.MQ], axis=2)

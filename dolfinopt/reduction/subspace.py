@@ -13,18 +13,13 @@ from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
 from dolfinopt.reduction.basis import Basis, orient
 from dolfinopt.reduction.free_arm import FreeArm, Rows
-
-# A column whose remainder is below this share of its length adds nothing but rounding.
-DEFLATION = 1e-10
-# A second round leaves columns their length; what shrinks below this was rounding in the first.
-SHRINKS = 0.1
-# Largest entry of V' M V - I: two rounds leave 1e-15 to 1e-14.
-ORTHONORMAL = 1e-12
-MAX_ROUNDS = 4  # two are the rule
-# Least eigenvalue of the vectors' energies, scaled to one each, by the largest: rounding leaves
-# 1e-16 of dependent vectors, independent ones have 1e-2. Whether Cholesky's method
-# notices depends on the sign of that rounding.
-INDEPENDENT_ENERGY = 1e-12
+from dolfinopt.reduction.measured import (
+    DEFLATION_SHARE,
+    INDEPENDENT_ENERGY_RATIO,
+    ORTHONORMAL_ROUNDS_LIMIT,
+    ORTHONORMALITY_ERROR,
+    ROUNDING_LENGTH_SHARE,
+)
 
 
 def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -59,7 +54,7 @@ def orthonormalise(
     W: np.ndarray,
     V: np.ndarray,
     MV: np.ndarray,
-    deflation: float = DEFLATION,
+    deflation: float = DEFLATION_SHARE,
 ) -> Expansion:
     """Orthonormalise the columns of W against V and one another in the inner product of M.
 
@@ -80,16 +75,16 @@ def orthonormalise(
     Q, R, kept = _qr(arm, W - combine(V, by_V), deflation * size)
     if len(kept) == 0:
         return Expansion(Q, Q, by_V, kept)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(ORTHONORMAL_ROUNDS_LIMIT):
         # Differences of nearly equal fields have lost the rigid motion of the interface.
         Q = arm.expand(_interior(arm, Q), interface_coordinates(arm, Q))
         h = dot(arm, MV, Q)
-        Q, again, still = _qr(arm, Q - combine(V, h), np.full(len(kept), SHRINKS))
+        Q, again, still = _qr(arm, Q - combine(V, h), np.full(len(kept), ROUNDING_LENGTH_SHARE))
         by_V, R, kept = by_V + h @ R, again @ R, kept[still]
         MQ = arm.mass_times(Q)
         overlap = dot(arm, MQ, np.concatenate([V, Q], axis=2))
         goal = np.eye(V.shape[2] + len(kept))[V.shape[2] :]
-        if np.abs(overlap - goal).max(initial=0.0) <= ORTHONORMAL:
+        if np.abs(overlap - goal).max(initial=0.0) <= ORTHONORMALITY_ERROR:
             return Expansion(Q, MQ, np.vstack([by_V, R]), kept)
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the vectors of the reduction do not become orthonormal; ask for "
@@ -179,7 +174,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > INDEPENDENT_ENERGY * shares[-1]:  # not a number included
+            if not shares[0] > INDEPENDENT_ENERGY_RATIO * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:

@@ -26,6 +26,13 @@ from dolfinopt.multibody.shape_integrals import (
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
+from dolfinopt.responses.measured import (
+    NEGLECTED_DEVIATION_SHARE,
+    STIFFENING_INSTANTS,
+    STIFFENING_OFF_CHANGE,
+    STIFFENING_ON_CHANGE,
+    STIFFENING_UNKNOWN_CHANGE,
+)
 from dolfinopt.responses.motion import motion_objective, worst_instants
 from dolfinopt.responses.response import (
     Analysis,
@@ -422,17 +429,8 @@ def _figures(trajectory: Trajectory) -> Motion:
 #
 # "auto" simulates the machine twice, with and without it, with arms that have the static modes of
 # their outboard interfaces alone, and leaves out what changes the deviation by less than
-# `NEGLECTED`. Where the loads change the stiffness of no arm by more than `SURELY_OFF`, nothing is
-# simulated.
-
-INSTANTS = 201  # of the horizon, at which loads are looked at
-# Share of the largest deviation that "auto" may leave out: 0.5 %, less what the static modes do not
-# show of it (measured: a tenth).
-NEGLECTED = 4e-3
-# Largest change of an arm's stiffness with which it is left out, and that with which it is taken
-# into account, without a simulation. Measured: the deviation changes by 0.3 to 3 times as much.
-SURELY_OFF, SURELY_ON = 5e-4, 0.05
-UNKNOWN = 2e-3  # the change from which it is taken into account where the comparison fails
+# `NEGLECTED_DEVIATION_SHARE`. Where the loads change the stiffness of no arm by more than
+# `STIFFENING_OFF_CHANGE`, nothing is simulated.
 
 
 def decide_stiffening(
@@ -520,19 +518,23 @@ def _decided(
         if asked != "auto":
             found.append(Stiffening(estimate, asked))
             continue
-        if not SURELY_OFF < estimate < SURELY_ON:
-            found.append(Stiffening(estimate, estimate >= SURELY_ON))
+        if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
+            found.append(Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE))
             continue
         bodies = [bodies_in(first, one, owned) for one in group]
         neglected = _neglected(group, bodies)
-        on = estimate >= UNKNOWN if neglected is None else neglected > NEGLECTED
+        on = (
+            estimate >= STIFFENING_UNKNOWN_CHANGE
+            if neglected is None
+            else neglected > NEGLECTED_DEVIATION_SHARE
+        )
         found.append(Stiffening(estimate, on, neglected))
     return found
 
 
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
     """Return the largest change of an arm's stiffness by the loads of the motion."""
-    t = np.linspace(0.0, scene.motion.horizon, INSTANTS)
+    t = np.linspace(0.0, scene.motion.horizon, STIFFENING_INSTANTS)
     return largest_stiffness_change(scene, bodies, t)
 
 

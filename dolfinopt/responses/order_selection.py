@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import chain_of
+from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
@@ -21,19 +22,19 @@ from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis
 from dolfinopt.responses.evaluation import decide_stiffening
+from dolfinopt.responses.measured import (
+    RICHER_COORDINATES,
+    RICHER_RATIO,
+    TIME_ERROR_SHARE,
+    TRIED_COORDINATES_LIMIT,
+)
 from dolfinopt.responses.response import bodies_in, factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-# What the motion is compared with: at least so many coordinates, and so many times those tried.
-RICHER_METHOD, RICHER, TIMES = "craig-bampton", 24, 2
-MOST = 48  # coordinates of an arm that are tried
-# Time steps may add this share of the tolerance to a motion.
-TIME_SHARE = 0.03
-# An arm that nearly rests beside the others is measured against this share of the largest.
-RESTING = 1e-3
+RICHER_METHOD = "craig-bampton"  # of what the motion is compared with
 
 
 @dataclass(frozen=True)
@@ -75,14 +76,15 @@ def choose_coordinates(
         The choice; None where the scene states a number.
 
     Raises:
-        ConvergenceError: no number up to `MOST` meets the tolerance; on all ranks alike.
+        ConvergenceError: no number up to `TRIED_COORDINATES_LIMIT` meets the tolerance; on all
+            ranks alike.
     """
     if scene.reduction.coordinates != "auto":
         return None
     comparison = _Comparison(scene, partition, arms, x_phys, profile)
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
     goal = scene.reduction.tolerance / reserve
-    most = min(max(MOST, least), comparison.limit)
+    most = min(max(TRIED_COORDINATES_LIMIT, least), comparison.limit)
     tried: dict[int, float] = {}
     low, high = least - 1, least
     while not (error := comparison.error(high)) <= goal:  # not a number included
@@ -162,7 +164,7 @@ class _Comparison:
 
     def error(self, count: int) -> float:
         """Return the error that `count` coordinates make (collective)."""
-        richer = min(max(RICHER, TIMES * count), self.limit)
+        richer = min(max(RICHER_COORDINATES, RICHER_RATIO * count), self.limit)
         if richer > self.richer:
             self.bases = self._reduced(RICHER_METHOD, richer)
             self.motions = self._moved(self.bases)
@@ -211,7 +213,7 @@ class _Comparison:
 
 def _timed(scene: Scene) -> Scene:
     """Return the scene simulated so well that time steps do not matter to the comparison."""
-    tolerance = min(scene.simulation.tolerance, TIME_SHARE * scene.reduction.tolerance)
+    tolerance = min(scene.simulation.tolerance, TIME_ERROR_SHARE * scene.reduction.tolerance)
     # The estimate is of the bases: with the quick integrator whatever the scene's.
     update = {"tolerance": tolerance, "integrator": "radau"}
     simulation = scene.simulation.model_copy(update=update)
@@ -273,7 +275,7 @@ def _distance(
         K = factors(scene, many.scene, owner).stiffness * energy[owner]
         errors.append(_norm(K, np.hstack([q, -richer])))
         sizes.append(_norm(K, np.hstack([np.zeros_like(q), richer])))
-    size = np.maximum(sizes, RESTING * max(sizes))
+    size = np.maximum(sizes, RESTING_GROUP_SHARE * max(sizes))
     if not size.any():
         return 0.0
     return float((np.array(errors) / size).max())

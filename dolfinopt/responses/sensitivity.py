@@ -19,10 +19,8 @@ from dolfinopt.multibody.shape_integrals import (
     rigid_body,
 )
 from dolfinopt.reduction import METHODS, frame_fields
+from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
 from dolfinopt.responses.response import p_norm_of_lengths
-
-# Directions of A below this share of its largest are the rounding of its sums.
-RANK_TOLERANCE = 1e-14
 
 
 def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
@@ -41,7 +39,7 @@ def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
     """
     with state.elastic.profile.phase("gradient"):
         left, values, right = np.linalg.svd(A)
-        keep = values > RANK_TOLERANCE * values[0]
+        keep = values > LOAD_CASES_RANK_SHARE * values[0]
         V = state.basis.V
         energies = state.elastic.cell_stiffness_products(
             combine(V, left[:, keep] * values[keep]), combine(V, right[keep].T)

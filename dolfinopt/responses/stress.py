@@ -15,6 +15,18 @@ from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
+from dolfinopt.responses.measured import (
+    BOUND_BATCH_INSTANTS,
+    CHUNK_INSTANTS,
+    CHUNK_POINTS,
+    COARSE_INSTANTS,
+    FROZEN_LOADS_RANK_SHARE,
+    MAP_ERROR_SHARE,
+    NEGLIGIBLE_COLUMNS_SHARE,
+    NEGLIGIBLE_DIRECTION_SHARE,
+    NEGLIGIBLE_POWER_SHARE,
+    P_MEAN_STRIDE,
+)
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -35,8 +47,6 @@ from dolfinopt.scene.tables.objective import NEEDS
 # of the cell, less the less there is of it, so that void has none (qp relaxation). Source: Bruggi
 # (2008), doi:10.1007/s00158-007-0203-6; Le, Norato, Bruns, Ha & Tortorelli (2010),
 # doi:10.1007/s00158-009-0440-y.
-
-INSTANTS_AT_ONCE = 64  # looked at together, so that they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +138,7 @@ def _power(x: np.ndarray, exponent: float) -> np.ndarray:
 
 
 def _runs(count: int) -> list[slice]:
-    return [slice(first, first + INSTANTS_AT_ONCE) for first in range(0, count, INSTANTS_AT_ONCE)]
+    return [slice(first, first + CHUNK_INSTANTS) for first in range(0, count, CHUNK_INSTANTS)]
 
 
 # -- along a motion: the coefficients of every arm's static fields, whose sum is its
@@ -271,13 +281,6 @@ def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> Shap
 
 # -- von Mises stress of the arms along the motion -----------------------------------------------
 
-# Instants whose largest stress to the power p is below this part of the largest one's are left out
-# of the p-mean.
-NEGLIGIBLE = 1e-2
-SPARSE = 2  # of the screened instants every second one makes up the p-mean
-# Part of the loads' largest direction that counts as none for a gradient with frozen loads.
-RANK_TOLERANCE = 1e-7
-
 
 @register
 class Stress(Response):
@@ -358,7 +361,9 @@ class Stress(Response):
         largest = max(partition.world.allgather(largest))
         # Of the instants that are summed: the largest of all samples may lie between them.
         summed = [float(one.values.max(initial=0.0)) for each in seen.values() for one in each]
-        cut = NEGLIGIBLE ** (1.0 / p) * max(partition.world.allgather(max(summed, default=0.0)))
+        cut = NEGLIGIBLE_POWER_SHARE ** (1.0 / p) * max(
+            partition.world.allgather(max(summed, default=0.0))
+        )
         chosen = {k: [one.above(cut) for one in each] for k, each in seen.items()}
         sums = {k: 0.0 for k in chosen}
         with together(partition.world), analysis.profile.phase("stress"):
@@ -380,7 +385,7 @@ def _screened(
         coarse = every(len(one.coefficients))
         screened = screen(partition.comm, cells.A, one.coefficients, coarse)
         largest = max(largest, screened.largest)
-        found.append(_Chosen(one, coarse[::SPARSE], screened.values[::SPARSE]))
+        found.append(_Chosen(one, coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]))
     return found, largest
 
 
@@ -517,7 +522,7 @@ def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
     _, sizes, directions = np.linalg.svd(a * scale, full_matrices=False)
     if arm.comm.size > 1:
         sizes, directions = arm.comm.bcast((sizes, directions), root=0)
-    kept = directions[sizes > RANK_TOLERANCE * sizes[0]]
+    kept = directions[sizes > FROZEN_LOADS_RANK_SHARE * sizes[0]]
     # a = y D with D = kept / scale: derivatives by columns are those by y D.
     by_columns = cells.by_columns(part.by_A)
     right = combine(by_columns, (kept * scale).T)
@@ -538,15 +543,6 @@ def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
 #
 # and of a smooth motion d is small. Only where this bound exceeds the largest value found so far
 # are further instants looked at; so none that is larger is missed, whatever the motion.
-
-# Part of the largest length up to which directions in which the coefficients hardly vary are
-# bounded, not computed.
-NEGLIGIBLE_DIRECTION = 1e-4
-SINGULAR = 1e-13  # relative square below which a combination of columns counts as none
-MAPPED = 1e-3  # of the largest length, the error of a map of all points
-COARSE = 200  # instants, at most, at which all points are looked at first
-POINTS, INSTANTS = 2048, 64  # of one block, so that it stays in the cache
-BATCH = 16  # instants that are looked at before the bound is compared again
 
 
 @dataclass(frozen=True, eq=False)
@@ -588,7 +584,7 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
     best = float(np.max(values[coarse]))
     done = 0
     while done < len(open_) and bounds[open_[done]] > best:
-        batch = open_[done : done + BATCH]
+        batch = open_[done : done + BOUND_BATCH_INSTANTS]
         values[batch] = few.lengths(comm, batch)
         best = max(best, float(np.max(values[batch])))
         done += len(batch)
@@ -609,11 +605,12 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
 def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`).
 
-    Right to `MAPPED` times the largest of all; of instants no more are looked at than that takes.
+    Right to `MAP_ERROR_SHARE` times the largest of all; of instants no more are looked at than that
+    takes.
     """
     few, count = _condense(comm, A, a), A.shape[1]
     instants = every(len(a))
-    enough = MAPPED * float(few.lengths(comm, instants).max(initial=0.0))
+    enough = MAP_ERROR_SHARE * float(few.lengths(comm, instants).max(initial=0.0))
     while True:
         apart = few.apart(instants)
         crowded = np.unique(np.searchsorted(instants, np.flatnonzero(apart > enough)))
@@ -623,10 +620,10 @@ def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np
             break
         instants = wider
     by_point, when = np.full(count, -1.0), np.zeros(count, dtype=int)
-    for first in range(0, len(instants), INSTANTS):
-        part = instants[first : first + INSTANTS]
-        for start in range(0, count, POINTS):
-            here = slice(start, start + POINTS)
+    for first in range(0, len(instants), CHUNK_INSTANTS):
+        part = instants[first : first + CHUNK_INSTANTS]
+        for start in range(0, count, CHUNK_POINTS):
+            here = slice(start, start + CHUNK_POINTS)
             squares = _squares(few.B[:, here], few.y[part])
             worst = squares.argmax(axis=1)
             values = squares[np.arange(len(worst)), worst]
@@ -635,7 +632,7 @@ def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np
     return np.sqrt(np.maximum(by_point, 0.0)), when
 
 
-def every(count: int, most: int = COARSE) -> np.ndarray:
+def every(count: int, most: int = COARSE_INSTANTS) -> np.ndarray:
     """Return at most about `most` instants of `count`, evenly spaced, and the last one."""
     step = max(1, -(-count // most))
     return np.unique(np.append(np.arange(0, count, step), count - 1))
@@ -692,7 +689,7 @@ def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
     values, vectors = np.linalg.eigh(0.5 * (gram + gram.T))
     if comm.size > 1:  # processors may round differently
         values, vectors = comm.bcast((values, vectors), root=0)
-    kept = values > SINGULAR * values[-1]
+    kept = values > NEGLIGIBLE_COLUMNS_SHARE * values[-1]
     root = np.sqrt(values[kept])
     inside = (a * scale) @ vectors
     _, _, directions = np.linalg.svd(inside[:, kept] * root, full_matrices=False)
@@ -703,7 +700,7 @@ def _condense(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> _Condensed:
     norms = _norms(comm, B)
     sizes = np.abs(y) * norms
     behind = np.cumsum(sizes[:, ::-1], axis=1)[:, ::-1]  # of a direction and all behind it
-    enough = NEGLIGIBLE_DIRECTION * behind.max(initial=0.0)
+    enough = NEGLIGIBLE_DIRECTION_SHARE * behind.max(initial=0.0)
     few = int(np.count_nonzero(behind.max(axis=0, initial=0.0) > enough))
     # No point has more than the sum over all points.
     rest = np.abs(inside[:, ~kept]) @ np.sqrt(np.maximum(values[~kept], 0.0))
@@ -721,10 +718,10 @@ def _norms(comm: MPI.Comm, A: np.ndarray) -> np.ndarray:
 def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return max_e |A_e a_n| (n,) (collective)."""
     out = np.zeros(len(a))
-    for first in range(0, len(a), INSTANTS):
-        part = slice(first, first + INSTANTS)
-        for start in range(0, A.shape[1], POINTS):
-            squares = _squares(A[:, start : start + POINTS], a[part])
+    for first in range(0, len(a), CHUNK_INSTANTS):
+        part = slice(first, first + CHUNK_INSTANTS)
+        for start in range(0, A.shape[1], CHUNK_POINTS):
+            squares = _squares(A[:, start : start + CHUNK_POINTS], a[part])
             np.maximum(out[part], squares.max(axis=0), out=out[part])
     return np.sqrt(_max(comm, out))
 

@@ -13,7 +13,8 @@ from dolfinopt.dynamics.collocation import even_steps
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.multibody.motion import DENSE, rigid_motion
+from dolfinopt.multibody.measured import DENSE_INSTANTS
+from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.paper.reproduction import load_paper
 from dolfinopt.profiling import Profile
 from dolfinopt.study.variants import changed, reduced
@@ -188,7 +189,7 @@ def test_random_cases_differ_and_come_back(draw):
     for case in cases:
         moved = case.scene.motion
         assert 0.5 <= moved.duration <= 6.0 and 0.0 <= case.scene.payload.mass <= 50.0
-        t = np.linspace(0.0, moved.duration, DENSE)
+        t = np.linspace(0.0, moved.duration, DENSE_INSTANTS)
         assert np.isfinite(rigid_motion(t, case.scene).qdd).all()
 
 

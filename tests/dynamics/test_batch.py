@@ -24,7 +24,7 @@ from dolfinopt.profiling import Profile
 pytestmark = pytest.mark.serial  # arrays of one process
 
 TOLERANCE = 1e-4
-LEFT = 2.0 * batch.GOAL * TOLERANCE  # by Newton's method, of either of two
+LEFT = 2.0 * batch.BATCH_NEWTON_SHARE * TOLERANCE  # by Newton's method, of either of two
 DAMPING = 1e-3  # s
 
 

@@ -24,7 +24,8 @@ from runs import TWO_ARM, overrides, run
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import LINEAR, saturated
+from dolfinopt.multibody.measured import LINEAR_DRIVE_SHARE
+from dolfinopt.multibody.mechanism import saturated
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 
@@ -193,7 +194,7 @@ def test_angles_of_motors_are_written(tmp_path) -> None:
 def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
     """As wanted within the limit, the limit beyond; derivative right, continuous to the second."""
     limit = np.array([40.0])
-    within = limit * np.array([[-LINEAR], [0.0], [0.3], [LINEAR]])
+    within = limit * np.array([[-LINEAR_DRIVE_SHARE], [0.0], [0.3], [LINEAR_DRIVE_SHARE]])
     u, slope = saturated(within, limit)
     np.testing.assert_array_equal(u, within)
     np.testing.assert_array_equal(slope, 1.0)
@@ -228,7 +229,7 @@ def test_robot_within_its_data_sheet() -> None:
     limits = [330.0, 150.0]  # N m
     free, held = (machine(simulated(lifting(18.0, one)))[0] for one in (None, limits))
     peak = np.abs(free.joint_forces[:, 1:]).max(axis=0) / limits
-    assert 0.8 < peak.max() < LINEAR
+    assert 0.8 < peak.max() < LINEAR_DRIVE_SHARE
     np.testing.assert_array_equal(held.deviation, free.deviation)
     weak = [260.0, 150.0]
     forces = np.abs(machine(simulated(lifting(17.0, weak)))[0].joint_forces[:, 1:])

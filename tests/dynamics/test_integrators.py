@@ -12,7 +12,7 @@ from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
 from remainders import build
 from scipy.integrate import solve_ivp
 
-from dolfinopt.dynamics import generalized_alpha, radau
+from dolfinopt.dynamics import generalized_alpha, measured, radau
 from dolfinopt.dynamics import newton as factors
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
@@ -527,7 +527,7 @@ def test_error_that_no_steps_lower(monkeypatch, on_grids, error, words, most) ->
         solve("radau", problem, 1e-4)
     assert "\n" not in str(raised.value)
     assert len(grids) <= most
-    assert max(grids) <= radau.MAX_STEPS
+    assert max(grids) <= radau.RADAU_STEPS_LIMIT
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
@@ -536,7 +536,7 @@ def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, on_grids, share
     problem, _ = two_arms()
     found = radau.on_grid(problem, even_steps(problem, 40), 1e-4, 3)
     on_grids(lambda *_: replace(found, error=share * 1e-4))
-    monkeypatch.setattr(radau, "MAX_STEPS", 40)
+    monkeypatch.setattr(radau, "RADAU_STEPS_LIMIT", 40)
     if share < 1.0:
         assert solve("radau", problem, 1e-4).error == share * 1e-4
     else:
@@ -554,7 +554,7 @@ def test_more_steps_than_there_is_room_for_are_refused() -> None:
 
 
 def test_patience_that_ends_is_not_tried_again(on_grids) -> None:
-    """Work beyond what is counted ends a simulation: no finer grid, no march."""
+    """Work beyond what is counted ends a simulation: no finer grid, no measured."""
     grids = on_grids(lambda number, true, grid: true())
     with counted(10.0), pytest.raises(ConvergenceError, match="more than 10 Newton iterations"):
         solve("radau", two_arms()[0], 1e-4)
@@ -600,7 +600,8 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(
     with pytest.raises(ConvergenceError, match=r"material\.young_modulus.*motion\.duration"):
         arms_of_a_scene(*changes, f"simulation.stages={stages}", cells=(40, 4))
     assert len(grids) <= 2
-    assert sum(work) <= radau.SWEEPS * sum(grids) + radau.LONGEST * radau.MAX_ITERATIONS
+    most = measured.LONGEST_WINDOW_STEPS * measured.MARCH_ITERATIONS_LIMIT
+    assert sum(work) <= measured.WINDOWS_ITERATIONS_LIMIT * sum(grids) + most
     assert len(told) >= 2
 
 
@@ -623,7 +624,7 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
     remedy = r"deflects by [0-9.]+ % .*50 %.*young_modulus"
     with pytest.raises(ConvergenceError, match="t = .* an arm " + remedy):
         arms_of_a_scene("motion.duration=0.45")
-    monkeypatch.setattr("dolfinopt.dynamics.simulation.VALID", 0.01)
+    monkeypatch.setattr("dolfinopt.dynamics.simulation.DEFLECTION_LIMIT", 0.01)
     with pytest.raises(ConvergenceError, match="arm1.*" + remedy):
         arms_of_a_scene("motion.duration=1.0", "payload.mass=1")
 
@@ -675,7 +676,7 @@ def some_stages(problem: ElasticSystem, count: int = 5) -> Stages:
 
 def slow_up_to(monkeypatch: pytest.MonkeyPatch, limits: tuple[float, ...]) -> None:
     """Treat coordinates densely up to these angles, tried in turn."""
-    monkeypatch.setattr(factors, "LIMITS", limits)
+    monkeypatch.setattr(factors, "SLOW_ANGLES", limits)
     monkeypatch.setattr(radau, "ONE_RUN", replace(radau.ONE_RUN, limits=limits))
 
 
@@ -811,7 +812,7 @@ def test_dense_matrices_are_kept_small(
     slow_up_to(monkeypatch, (np.inf,))
     whole = radau.on_grid(problem, edges, 1e-8, 3)
     slopes = Adjoint(problem, whole).gradient(t, whole.sample(t))
-    monkeypatch.setattr(factors, "MEMORY_BYTES", 1e6)
+    monkeypatch.setattr(factors, "FACTORS_BYTES", 1e6)
     matrices.clear()
     parts = radau.on_grid(problem, edges, 1e-8, 3)
     again = Adjoint(problem, whole).gradient(t, whole.sample(t))
@@ -834,7 +835,7 @@ def test_adjoint_is_exact_with_fast_coordinates(
     solution = radau.on_grid(problem, even_steps(problem, 60), 1e-8, 3)
     t = np.linspace(0.0, 1.0, 31)
     by_q = solution.sample(t) @ problem.mechanism.stiffness()
-    monkeypatch.setattr(factors, "LIMITS", limits)
+    monkeypatch.setattr(factors, "SLOW_ANGLES", limits)
     matrices.clear()
     found = Adjoint(problem, solution).gradient(t, by_q)
     assert min(size for _, size in matrices) < 16

@@ -19,14 +19,15 @@ from runs import overrides as options
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics import radau
+from dolfinopt.dynamics import measured, radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.fem.interface import MOST_ROUNDING, floats, rounding_error
+from dolfinopt.fem.interface import floats, rounding_error
+from dolfinopt.fem.measured import STIFFNESS_ROUNDING_LIMIT
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
@@ -195,10 +196,10 @@ def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
     for floor in 10.0 ** (-0.5 * np.arange(6.0, 17.0)):  # SIMP: its square to solid
         arm = one_arm("interpolation.law=simp", f"interpolation.floor={floor}", cells=cells)
         arm.set_design(DESIGNS[name](0, *arm.mesh.centroid.T))
-        if estimates and 10.0 * estimates[-1] > 0.9 * MOST_ROUNDING:
+        if estimates and 10.0 * estimates[-1] > 0.9 * STIFFNESS_ROUNDING_LIMIT:
             with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):
                 arm.elastic.constraint_modes()
-        if not estimates or 10.0 * estimates[-1] < 1.1 * MOST_ROUNDING:
+        if not estimates or 10.0 * estimates[-1] < 1.1 * STIFFNESS_ROUNDING_LIMIT:
             estimates.append(rounding_error(arm.elastic, arm.elastic.constraint_modes()))
     assert 3 <= len(estimates) <= 6
     np.testing.assert_allclose(np.diff(np.log10(estimates)), 1.0, atol=0.02)
@@ -399,7 +400,7 @@ def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> N
         moved(*overrides)
     said = str(refusal.value)
     deflection = re.search(r"deflects by ([0-9.]+) % of its length: beyond 50 %", said)
-    assert deflection is not None and float(deflection[1]) > 100.0 * radau.VALID
+    assert deflection is not None and float(deflection[1]) > 100.0 * measured.DEFLECTION_LIMIT
     assert "material.young_modulus" in said and "motion.duration" in said and "\n" not in said
 
 

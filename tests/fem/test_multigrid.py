@@ -109,7 +109,7 @@ def test_smaller_aggregates(iterative, monkeypatch):
     solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
     iterative.state(x).elastic.constraint_modes()
     cold = solver._iterative.steps
-    monkeypatch.setattr(multigrid, "SLOW", 0.0)
+    monkeypatch.setattr(multigrid, "STEPS_A_DIGIT_LIMIT", 0.0)
     solver._solutions.clear()
     iterative.state(0.99 * x).elastic.constraint_modes()
     grid = solver._iterative.grid
@@ -174,12 +174,12 @@ def test_gradient_of_modes_without_a_factor(monkeypatch, method, count):
 @pytest.mark.serial
 def test_which_solver(monkeypatch):
     """Factors where cross-sections are small and memory is free, on this machine's ranks."""
-    monkeypatch.setattr(interior, "FACTOR_AT", 100)
+    monkeypatch.setattr(interior, "FACTOR_ROWS", 100)
     free = [1e12]
     monkeypatch.setattr(interior, "free_memory", lambda: free[0])
     system = solid_arm(cells=(10, 3, 2)).substructure.interior
     rows = system._T.num_dofs
-    needed = interior.FACTOR_BYTES * rows * (rows / 100) ** interior.FACTOR_GROWTH
+    needed = interior.FACTOR_BYTES * rows * (rows / 100) ** interior.FACTOR_EXPONENT
     found = []
     for bytes_ in (2.1 * needed, 1.9 * needed):
         free[0] = bytes_

@@ -77,8 +77,8 @@ def test_one_tensor_for_all_cells(
     monkeypatch: pytest.MonkeyPatch, element: str, static: bool
 ) -> None:
     """Geometric stiffness and its derivatives, without the quadrature points, 7 cells at a time."""
-    monkeypatch.setattr(assembly, "CHUNK", 1)
-    monkeypatch.setattr(assembly, "LEAST", 7)
+    monkeypatch.setattr(assembly, "STRESS_CHUNK_ENTRIES", 1)
+    monkeypatch.setattr(assembly, "STRESS_CHUNK_CELLS", 7)
     arm = make_arm(element)
     other = cell_by_cell(arm)
     assert len(arm.substructure.stress_tensor.tensor) == 1

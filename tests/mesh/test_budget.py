@@ -52,7 +52,7 @@ def test_what_exceeds_the_memory_is_refused(changes, shared_tmp_path):
 )  # fmt: skip
 def test_estimate_is_what_was_measured(monkeypatch, make, low, high, words):
     scene = make()
-    room = budget.PROCESS * (COMM.size - 1)
+    room = budget.RANK_BYTES * (COMM.size - 1)
     monkeypatch.setattr(budget, "free_memory", lambda: 1e9 * high + room)
     check_budget(COMM, scene)
     monkeypatch.setattr(budget, "free_memory", lambda: 1e9 * low + room)

@@ -22,8 +22,8 @@ from dolfinopt.dynamics.build import check_motion
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.multibody.motion import (
-    MAX_CORNERS,
     Bend,
     RigidMotion,
     arc,
@@ -372,7 +372,7 @@ def test_breakpoints(tmp_path: Path) -> None:
     instants = breakpoints(of)
     assert len(instants) == len(POINTS) + 1
     assert_close(desired_path(np.array(instants[:-1]), of.motion).p, POINTS, 1e-13)
-    x = np.linspace(-0.5, 0.5, MAX_CORNERS + 3)
+    x = np.linspace(-0.5, 0.5, TABLE_CORNERS_LIMIT + 3)
     file = tmp_path / "many.csv"
     file.write_text("\n".join(["x,y", *(f"{a!r},{a * a!r}" for a in x.tolist())]))
     assert breakpoints(scene(path="points", file=str(file))) == (0.0, DURATION, 3.0)

@@ -225,7 +225,7 @@ def test_more_coordinates_than_dofs_are_not_tried():
 
 
 def test_none_is_enough(monkeypatch):
-    monkeypatch.setattr(coordinates, "MOST", 6)
+    monkeypatch.setattr(coordinates, "TRIED_COORDINATES_LIMIT", 6)
     built = auto("reduction.method=modal", tolerance=1e-3)
     words = "up to 6 coordinates", "reduction.tolerance = 0.001"
     with refused(*words, error=do.ConvergenceError):

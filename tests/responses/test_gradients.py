@@ -251,7 +251,7 @@ CASES = [
 def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypatch) -> None:
     """Along a random and a smooth direction; the gradient by ESL points the same way."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
-    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE", 0.0)
+    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
     scene = scene_of(base, changes, shared_tmp_path)
     # Forces are made of accelerations, which leave more rounding.
     steps = (1e-3, 2.5e-4) if scene.objective.kind in EXACT_ONLY else (4e-4, 1e-4)

@@ -13,6 +13,20 @@ from scipy.spatial.transform import Rotation
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.measured import (
+    DAMPED_ITERATIONS,
+    FOLLOWED_RESIDUAL_SHARE,
+    FOLLOWING_STEPS,
+    FOLLOWING_STEPS_A_ROW,
+    JOINT_NEWTON_ITERATIONS,
+    JOINT_STEP_LIMIT,
+    KEPT_INSTANT_SETS,
+    LEAST_FOLLOWING_SHARE,
+    REACHED_RESIDUAL_SHARE,
+    SINGULAR_VALUE_RATIO,
+    STALLED_GAIN,
+    START_GUESSES,
+)
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
 from dolfinopt.multibody.spatial.mechanism import (
     Pose,
@@ -264,21 +278,6 @@ def relative_vectors(R: np.ndarray) -> np.ndarray:
 # to rounding. Source: Siciliano, Sciavicco, Villani & Oriolo, Robotics (2009), ch. 3,
 # doi:10.1007/978-1-84628-642-1; Nakamura & Hanafusa (1986), doi:10.1115/1.3143764.
 
-REACHED = 1e-11  # residual over the reach that rounding leaves
-FOLLOWED = 1e-9  # residual over the reach, above which a pose is not reached
-# Singular values of the Jacobian, rotations times the reach, over the largest: below it the joints'
-# rates lose their digits.
-SINGULAR = 1e-6
-STEPS, STEPS_A_ROW = 50, 2  # of the dense table, cut where Newton's method needs it
-LEAST_STEP = 1e-7  # over the duration
-FAR = 0.3  # rad, or shares of the reach: a Newton step that may lead to another solution
-NEWTON = 3  # iterations from the dense table, right to 1e-5: the last one leaves rounding
-DAMPED = 200  # iterations at the start
-STALLED = 1e-9  # part by which the distance falls in one of them, below which it is the least
-GUESSES = 10  # at the start: the first as stated, the others around it at random
-MOST = 6  # joints that a pose determines
-KEPT = 16  # sets of instants whose joints are kept: the integrator asks for the same ones again
-
 
 @dataclass(frozen=True, eq=False)
 class Follower:
@@ -378,9 +377,9 @@ class Follower:
         """Return joints (1, joints) of the nearest pose by damped least squares, how far off, m."""
         reach, damping, pose = self.chain.reach, 1e-3, self.chain.at(q)
         error = self.residual(pose, path)
-        for _ in range(DAMPED):
+        for _ in range(DAMPED_ITERATIONS):
             far = float(np.linalg.norm(error))
-            if far <= REACHED * reach:
+            if far <= REACHED_RESIDUAL_SHARE * reach:
                 break
             J = self.jacobian(pose, path.rows)[0]
             normal = J.T @ J + damping * reach**2 * np.eye(len(self.unknown))
@@ -392,7 +391,7 @@ class Follower:
             if gain > 0.0:
                 q, pose, error = other, moved, new
             damping = max(0.1 * damping, 1e-15) if gain > 0.0 else 10.0 * damping
-            if np.abs(step).max() < 1e-13 or 0.0 < gain < STALLED:
+            if np.abs(step).max() < 1e-13 or 0.0 < gain < STALLED_GAIN:
                 break
         return q, float(np.linalg.norm(error))
 
@@ -408,12 +407,12 @@ class Follower:
         guess[self.given] = path.joints[0][0]
         random, best, far = np.random.default_rng(0), guess[None], np.inf
         width = 1.5 if stated is None else 0.1
-        for k in range(GUESSES):
+        for k in range(START_GUESSES):
             shift = random.uniform(-width, width, size=(1, len(self.unknown))) * (k > 0)
             q, distance = self.nearest(guess + self.spread(shift * self._units), path)
             if distance < far:
                 best, far = q, distance
-            if far <= REACHED * self.chain.reach:
+            if far <= REACHED_RESIDUAL_SHARE * self.chain.reach:
                 break
         else:
             raise self._unreachable(0.0, best, path)
@@ -430,7 +429,7 @@ class Follower:
             InputError: the path leaves the reach or passes a singular position.
         """
         end = self.scene.motion.duration
-        longest = end / max(STEPS, STEPS_A_ROW * num_rows(self.scene))
+        longest = end / max(FOLLOWING_STEPS, FOLLOWING_STEPS_A_ROW * num_rows(self.scene))
         t, step = 0.0, longest
         q = self.start()
         qd = self.rates(q, end_path(np.zeros(1), self.scene))[0]
@@ -441,8 +440,8 @@ class Follower:
             guess = q + (ahead - t) * qd
             guess[:, self.given] = path.joints[0]
             other, distance = self._corrected(guess, path)
-            if not distance <= FOLLOWED * self.chain.reach:  # not a number included
-                if step < LEAST_STEP * end:
+            if not distance <= FOLLOWED_RESIDUAL_SHARE * self.chain.reach:  # not a number included
+                if step < LEAST_FOLLOWING_SHARE * end:
                     raise self._lost(min(t + longest, end), q, ahead)
                 step *= 0.25
                 continue
@@ -460,7 +459,7 @@ class Follower:
         except np.linalg.LinAlgError:
             return guess, np.inf
         moved = np.abs((q - guess)[:, self.unknown] / self._units).max()
-        return q, np.inf if not moved <= FAR else float(distance[0])
+        return q, np.inf if not moved <= JOINT_STEP_LIMIT else float(distance[0])
 
     def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return joints and two derivatives (n, joints) at instants t (n,), s.
@@ -470,7 +469,7 @@ class Follower:
         """
         key = t.tobytes()
         if key not in self._kept:
-            while len(self._kept) >= KEPT:
+            while len(self._kept) >= KEPT_INSTANT_SETS:
                 del self._kept[next(iter(self._kept))]
             self._kept[key] = self._solved(t)
         return self._kept[key]
@@ -483,8 +482,8 @@ class Follower:
         path = end_path(t, self.scene)
         q = self.table(np.clip(t, 0.0, self.scene.motion.duration))
         q[:, self.given] = path.joints[0]
-        q, distance = self.newton(q, path, NEWTON)
-        wrong = np.flatnonzero(~(distance <= FOLLOWED * self.chain.reach))
+        q, distance = self.newton(q, path, JOINT_NEWTON_ITERATIONS)
+        wrong = np.flatnonzero(~(distance <= FOLLOWED_RESIDUAL_SHARE * self.chain.reach))
         if wrong.size:
             raise self._lost(float(t[wrong[0]]), q[wrong[:1]])
         qd, qdd = self.rates(q, path)
@@ -495,7 +494,7 @@ class Follower:
     def _check_singular(self, t: float, q: np.ndarray, path: EndPath) -> None:
         J = self.jacobian(self.chain.at(q), path.rows)[0]
         sizes = np.linalg.svd(J, compute_uv=False)
-        if sizes[-1] < SINGULAR * sizes[0]:
+        if sizes[-1] < SINGULAR_VALUE_RATIO * sizes[0]:
             raise self._singular(t)
 
     def _lost(self, t: float, q: np.ndarray, first: float | None = None) -> InputError:
@@ -510,7 +509,7 @@ class Follower:
             path = end_path(np.array([instant]), self.scene)
             guess = self.spread(q[:, self.unknown], path.joints[0])
             best, far = self.nearest(guess, path)
-            if far > FOLLOWED * self.chain.reach:
+            if far > FOLLOWED_RESIDUAL_SHARE * self.chain.reach:
                 return self._unreachable(instant, best, path)
         return self._singular(t if first is None else first)
 
@@ -580,7 +579,7 @@ def _follower(scene: Scene, stamp: int) -> Follower:
         if rows == 3:
             what = "x, y and z determine"
             turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
-            more = f"the orientation ({turn}), " if len(unknown) <= MOST else ""
+            more = f"the orientation ({turn}), " if len(unknown) <= 6 else ""  # a pose has six
         raise InputError(
             f"{where}: expected at most {rows} joints, which {what}, found {len(unknown)} "
             f"({moving}); give {more}{column}, or {tables}"

@@ -1,0 +1,87 @@
+"""Constants of the room that were chosen by measurement or trial, by the file that uses them.
+
+Each stands with its unit, what it rules, and what was measured.
+"""
+
+# -- cells: assembly, elements ---------------------------------------------------------------
+
+# Largest difference of cells' matrices, or edges, from their mean, in its largest entry, that is
+# rounding of the nodes' places: 1e-16 m in cells of 1 mm, and what Gmsh adds in a file's grid.
+ALIKE_CELLS_ERROR = 1e-11
+# Entries of the products of the modes' differences at a time: they stay in the cache; and the least
+# cells at a time, for more modes.
+STRESS_CHUNK_ENTRIES = 120_000
+STRESS_CHUNK_CELLS = 256
+# NumPy copies factors that it repeats along an axis into buffers, unless rows are longer than
+# these: by default 8192, which takes longer than the products.
+BUFFER_ENTRIES = 256
+QUADRATURE_CHUNK_CELLS = 4096  # whose matrices are summed up at a time
+TWIST_COUPLING = 0.8  # s; 1 has no energy left where two faces of a cell turn against each other
+
+# -- interface -------------------------------------------------------------------------------
+
+SAME_PLACE_SHARE = 1e-9  # of an arm's length: places no farther apart than this are one
+# Largest relative error that rounding may make in the stiffness of a design in which solids float:
+# a tenth of what an optimiser's step changes. Against long double errors are 0.03 to 0.35 of the
+# estimate.
+STIFFNESS_ROUNDING_LIMIT = 1e-3
+# Part of a cell's displacement as a rigid translation in that estimate. The energy does not know
+# translations, the assembled matrix does: where they are lost in it, refinement fails.
+ROUNDING_TRANSLATION_SHARE = 0.03
+ROUNDING_ITERATIONS = 6  # of that estimate; four give two digits
+DEFLECTION_ROUNDING_ERROR = 1e-8  # of a deflection, by factors of long arms
+# Ratio of Young's moduli up to which floating solids do no harm: the stiffness of an arm is then
+# off by at most a few 1e-7, from rounding.
+HARMLESS_CONTRAST = 1e6
+
+# -- interior: the choice of a solver --------------------------------------------------------
+
+# Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
+# has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
+BAND_WORK_LIMIT = 1e9
+# Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
+# takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
+SOLID_BAND_WORK_LIMIT = 1.5e11
+# Rows from which MUMPS takes less time than PETSc's Cholesky, in the plane on one rank, if a design
+# takes 10 solves. Factorisation and 18 solves: 121 878 rows (1000 x 60 cells) 0.23 and 1.00 s by
+# MUMPS, 0.78 and 0.42 s by PETSc; 205 242 rows 0.55 and 1.67 s, 1.48 and 0.69 s.
+MUMPS_ROWS = 150_000
+# Bandwidth beyond which a solid arm is solved by conjugate gradients: they take the same time a row
+# whatever the shape, factors the longer the larger the cross-sections. With this one a nearby
+# design takes equally long: slender arms of 250 000 and cubes of 22 000 rows (`dolfinopt bench
+# solid`).
+WIDEST = 1200
+# Times that of quadratic tetrahedra, whose meshes are irregular: with 90 801 rows, a bandwidth of
+# 1484, a body takes 11 s by factors and 38 s by conjugate gradients.
+TETRAHEDRA_BANDWIDTH_RATIO = 2.0
+# Conjugate gradients, too, where factors take more than this part of the memory that is free. Bytes
+# a row of MUMPS' factor with so many rows, and the power of the rows with which they grow.
+FREE_MEMORY_SHARE = 0.5
+FACTOR_BYTES = 14e3
+FACTOR_ROWS = 50_000
+FACTOR_EXPONENT = 0.12
+# Bandwidth of K with the interfaces' rows behind, of that without, up to which it is factorised in
+# its place: nodes numbered along the arm end at the interface, others may lie anywhere.
+EXTENDED_BANDWIDTH_RATIO = 1.05
+
+# -- interior, multigrid: conjugate gradients ------------------------------------------------
+
+# Relative, in energy, where nobody says what is needed: stiffness is then right to its square, mass
+# and inertia to it, gradients of frozen loads to five times it, geometric stiffness to ten times.
+ENERGY_TOLERANCE = 1e-8
+KRYLOV_TOLERANCE = 1e-12  # the same where a Krylov space is made of solutions
+# Smoother: Chebyshev's polynomial of degree 2 in the diagonally scaled matrix on this part of its
+# spectrum, of the largest eigenvalue from so many steps of Lanczos' method, with a margin.
+SMOOTHED_LOWER_SHARE = 0.1
+SMOOTHED_UPPER_SHARE = 1.1
+LANCZOS_ITERATIONS = 10
+ZERO_DIAGONAL_SHARE = 1e-15  # of the largest diagonal entry
+RIGHT_SIDES_CHUNK = 12  # right sides at a time: memory of their vectors on all levels
+SOLVER_ITERATIONS = 500
+# The hierarchy of another design is kept while it takes at most so many times the steps a digit.
+KEPT_HIERARCHY_RATIO = 1.5
+# Steps a digit from cold beyond which a hierarchy of smaller aggregates is made: it takes half of
+# the steps, each as long again, and three times the work to make it.
+STEPS_A_DIGIT_LIMIT = 12.0
+SOLUTION_ROUNDING_ERROR = 1e-12  # least tolerance, of the right side's own length
+INDEPENDENT_LENGTH_SHARE = 1e-12  # least part of a direction's length that is none of the others'

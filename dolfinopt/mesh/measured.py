@@ -1,0 +1,74 @@
+"""Constants of the room that were chosen by measurement or trial, by the file that uses them.
+
+Each stands with its unit, what it rules, and what was measured.
+"""
+
+import math
+
+# -- several files ---------------------------------------------------------------------------
+
+# Of the arm's height, or of the extent of a model: coordinates in a file have seven digits or more.
+FILE_ROUNDING_SHARE = 1e-6
+# How far an interface's middle may be off its joint axis and the mesh's height off `height`,
+# relative to `height`: far more than a polygon in place of a circle needs.
+FRAME_TOLERANCE = 0.05
+
+# -- arm_mesh --------------------------------------------------------------------------------
+
+GRID_ROUNDING_SHARE = 1e-9  # of a cell: a node is so near to its line of the grid by rounding
+# Of an interface's radius, up to which sides belong to it: those as far from its point do, too.
+INTERFACE_REACH_RATIO = 1.0 + 1e-9
+
+# -- checks ----------------------------------------------------------------------------------
+
+FLAT_CORNER_SINE = 1e-6  # of a corner's angle, below which a cell has no area
+FULL_TURN_ANGLE = 2.0 * math.pi + 1e-6  # rad about a point: rounding of at most some dozen angles
+TOUCHING_AREA_SHARE = 1e-9  # of the longest line squared: lines that meet at an end
+FLAT_VOLUME_SHARE = 1e-6  # of the cube of a cell's longest edge, below which it has no volume
+
+# -- budget ----------------------------------------------------------------------------------
+
+# Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
+# quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm:
+#   n =   9 600:  265 MB,  0.38 s;      n =  38 400:  648 MB,  2.4 s
+#   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
+# Fill-in of a nested dissection makes both grow faster than n.
+RANK_BYTES = 0.2e9  # of a rank without cells
+BUDGET_CELLS = 38_400  # n for which the next ones hold
+CELL_BYTES = 6.9e3  # of a cell
+FILL_BYTES = 0.2e3  # more, of a cell, for every doubling of n
+CELL_SECONDS = 32e-6  # s, of a cell
+CELL_SECONDS_EXPONENT = 0.33  # power of n with which that grows
+SMALL_MESH_CELLS = 100_000  # of all arms, 1 GB: not worth a look
+# Bytes a node of a quadratic element over those of others: 400 x 24 of them, with the nodes of
+# 800 x 48 others, take the latters' time.
+QUADRATIC_BYTES_RATIO = 1.3
+# Bytes of a hexahedron over those of a quadrilateral, with conjugate gradients, which replace the
+# factor where memory is short: 378 000 dofs 3.1 GB, 996 000 8.2 GB (`dolfinopt bench solid`); and
+# of a solid arm on several ranks over one on one: 12.7 GB.
+SOLID_BYTES_RATIO = 3.6
+SHARED_BYTES_RATIO = 1.5
+# Bytes a cell of a solid from a file, whose cells are all different: without and with geometric
+# stiffness, which takes the stress of 18 loads in all cells. A bar of 16 755 tetrahedra of second
+# order takes 1.04 and 3.25 GB, of first order 0.23 and 0.46 GB, one of 4468 hexahedra 0.28 and
+# 0.42 GB. Of other elements by their nodes.
+FILE_CELL_BYTES = {
+    ("tetrahedron", "quadratic"): (62e3, 194e3),
+    ("tetrahedron", "linear"): (14e3, 28e3),
+    ("hexahedron", "incompatible"): (62e3, 95e3),
+}
+
+# -- geometry --------------------------------------------------------------------------------
+
+THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
+END_FACE_COSINE_GAP = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
+SIDE_FACE_COSINE = 1e-6  # to z, of a side face's normal: rounding of splines
+FACES_EDGE_ANGLE = math.radians(40.0)  # between triangles, from which on it parts two faces
+LOST_VOLUME_SHARE = 0.1  # largest one that flat cells may miss at curved faces
+INTERFACE_AREA_SHARE = 0.5  # of a face, from which on it is the interface's
+
+# -- file_check, gmsh_session ----------------------------------------------------------------
+
+WORD_CHARACTERS_LIMIT = 250  # of a name, number or text; Gmsh's parser has buffers of 256 and 1024
+LINE_CHARACTERS_LIMIT = 1000  # of a line that Gmsh sees; it reads blocks of 8192
+UNREAD_STATEMENTS_LIMIT = 1000  # of a .geo file that Gmsh gave up: no file of an arm has more

@@ -1,0 +1,46 @@
+"""Constants of the room that were chosen by measurement or trial, by the file that uses them.
+
+Each stands with its unit, what it rules, and what was measured.
+"""
+
+# -- evaluation: whether the arms get geometric stiffness ------------------------------------
+
+STIFFENING_INSTANTS = 201  # of the horizon, at which loads are looked at
+# Of the largest deviation, that "auto" may leave out: 0.5 %, less what the static modes do not show
+# of it (measured: a tenth).
+NEGLECTED_DEVIATION_SHARE = 4e-3
+# Largest change of an arm's stiffness with which it is left out, and that with which it is taken
+# into account, without a simulation. Measured: the deviation changes by 0.3 to 3 times as much.
+STIFFENING_OFF_CHANGE = 5e-4
+STIFFENING_ON_CHANGE = 0.05
+STIFFENING_UNKNOWN_CHANGE = 2e-3  # that from which it is taken where the comparison fails
+
+# -- order_selection -------------------------------------------------------------------------
+
+# The motion is compared with one of at least so many coordinates, and so many times those tried.
+RICHER_COORDINATES = 24
+RICHER_RATIO = 2
+TRIED_COORDINATES_LIMIT = 48  # of an arm
+TIME_ERROR_SHARE = 0.03  # of the tolerance, that time steps may add to a motion
+
+# -- sensitivity, stress: directions of loads ------------------------------------------------
+
+LOAD_CASES_RANK_SHARE = 1e-14  # of the largest direction: less is the rounding of its sums
+FROZEN_LOADS_RANK_SHARE = 1e-7  # of the largest direction, that counts as none for a gradient
+
+# -- stress: p-mean and screening ------------------------------------------------------------
+
+# Instants whose largest stress to the power p is below this part of the largest one's are left out
+# of the p-mean.
+NEGLIGIBLE_POWER_SHARE = 1e-2
+P_MEAN_STRIDE = 2  # of the screened instants every second one makes up the p-mean
+# Part of the largest length up to which directions in which the coefficients hardly vary are
+# bounded, not computed.
+NEGLIGIBLE_DIRECTION_SHARE = 1e-4
+NEGLIGIBLE_COLUMNS_SHARE = 1e-13  # relative square below which a combination of columns is none
+MAP_ERROR_SHARE = 1e-3  # of the largest length, the error of a map of all points
+COARSE_INSTANTS = 200  # at most, at which all points are looked at first
+BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
+# Of one block, so that it stays in the cache.
+CHUNK_POINTS = 2048
+CHUNK_INSTANTS = 64
