@@ -53,8 +53,8 @@ STRICT_SHARPENINGS = 4  # parts of design.continuation in which strict steps hav
 # with a percent of a limit.
 LIMIT_PRICE = 10.0
 
-# Times the nominal design's limits: what the eroded one keeps at most. Without it the eroded design of
-# lightest_two_arm.toml falls apart after 97 iterations; with 2 a SCARA arm is 5 % heavier than with 4.
+# Times the nominal design's limits: what the eroded one keeps at most. Without it that of
+# lightest_two_arm.toml falls apart after 97 iterations; with 2 a SCARA arm is 7 % heavier.
 ERODED_LIMIT_FACTOR = 4.0
 
 # -- Residual and endings (stopping, loop) --
