@@ -89,6 +89,14 @@ def _superiority(coordinates: int, frame: Frame) -> Figure:
     return math.nan if untold else worst, "; ".join(shown)
 
 
+def _demo(frame: Frame) -> Figure:
+    """Return the seconds of a whole optimisation, and its iterations: more than of the others."""
+    done = _at(frame, ranks=2, elements_per_arm=DEMO)
+    done = done[done["iterations"] > iterations.COUNTED]
+    said = "; ".join(f"{count:.0f} iterations" for count in done["iterations"])
+    return done["all iterations, wall clock [s]"].min(), said
+
+
 def _worst_error(frame: Frame) -> Figure:
     """Return the largest true error over the tolerance."""
     known = (over := frame["true error [-]"] / frame["tolerance [-]"]).dropna()
@@ -199,9 +207,8 @@ GOALS = (
          partial(_over_plain, iterations.TWO_RANKS, "wall clock [s]")),
     Goal("whole", "exponent of an iteration's time, elements up to 40000 per arm, 1 rank [-]", 1.3,
          _power_of_elements),
-    Goal("whole", "400 iterations of demos/two_arm.toml on two ranks, set-up included, wall clock "
-         "[s]", 20.0, partial(_least, "all iterations, wall clock [s]", 1.0, dict(
-             ranks=2, elements_per_arm=DEMO, iterations=iterations.ITERATIONS))),
+    Goal("whole", "demos/two_arm.toml on two ranks until it has converged, set-up included, wall "
+         "clock [s]", 20.0, _demo),
     Goal("mesh", "error of tip compliance, 50 x 3 cells of the default element [%]", 0.5,
          partial(_least, "error of tip compliance [-]", 100.0, dict(
              element=arms.DEFAULT, cells="{} x {}".format(*arms.CELLS[0])))),
