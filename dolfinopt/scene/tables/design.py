@@ -447,7 +447,7 @@ class Optimizer(Table):
         description="largest change of x of a converged design [-]",
     )
     kkt_tolerance: float = Field(
-        default=1e-2,
+        default=2e-2,
         ge=0,
         le=1e6,
         description="largest Karush-Kuhn-Tucker residual of a converged design [-]",
