@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.optimization import certificate
+from dolfinopt.optimization import certificate, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import gather_arms
 from dolfinopt.responses import order_selection as coordinates
@@ -258,7 +258,7 @@ def test_optimises_with_the_choice():
     assert same.choice is None
     for k in found.x_phys:
         np.testing.assert_array_equal(found.x_phys[k], same.x_phys[k])
-    assert dict(found.choice.tried)[count] <= 0.01 / certificate.RESERVE
+    assert dict(found.choice.tried)[count] <= 0.01 / measured.COORDINATE_RESERVE_FACTOR
     built = Built(small(), found.partition, dict(found.arms), do.Profile())
     assert found.choice.error == error(built, found.x_phys, count)
     assert found.choice.error != dict(found.choice.tried)[count]
