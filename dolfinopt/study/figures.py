@@ -189,6 +189,8 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if any(len(line.x) > FEW for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
+    if panel.log:
+        axes.set(xscale="log", yscale="log")
     _label(axes, panel.title, panel.x_label, panel.y_label)
     axes.grid(True, alpha=0.3)
 

@@ -82,6 +82,7 @@ class Panel:
         lines: curves.
         x_log2: numbers that are doubled rather than added to, as those of coordinates.
         y_log: logarithmic y although the values span no decade; False: never logarithmic.
+        log: both axes logarithmic.
     """
 
     title: str
@@ -90,6 +91,7 @@ class Panel:
     lines: tuple[Line, ...]
     x_log2: bool = False
     y_log: bool | None = None
+    log: bool = False
 
 
 @dataclass(frozen=True)
