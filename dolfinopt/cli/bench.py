@@ -30,8 +30,8 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    from dolfinopt.bench.run import bench as run
     from dolfinopt.bench.run import QUICKLY, Plan, named
+    from dolfinopt.bench.run import bench as run
     from dolfinopt.paper.reproduction import load_paper
 
     chosen = named(names)
