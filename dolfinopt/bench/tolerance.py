@@ -26,7 +26,7 @@ CELLS = 48, 6
 TOLERANCES = 1e-2, 1e-3, 1e-4
 STAGES = 4  # as scenes have by default
 # The reference: another order, other steps, and a hundredth of the finest tolerance.
-REFERENCE_STAGES, FINER, MOST_STEPS = 5, 100.0, 5000
+REFERENCE_STAGES, FINER, MOST_STEPS = 5, 100.0, 20_000
 INSTANTS = 10_001
 KINDS = "uniform", "smooth", "void and solid", "weak tips"
 PATHS, LAWS = ("arc", "line"), ("quintic", "septic", "s-curve")

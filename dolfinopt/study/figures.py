@@ -11,7 +11,7 @@ import numpy as np
 from dolfinopt.output.design import read_views
 from dolfinopt.output.views import designed
 from dolfinopt.plots import style
-from dolfinopt.plots.style import GREY, PALETTE
+from dolfinopt.plots.style import GREY
 from dolfinopt.study import tables
 from dolfinopt.study.tables import FrameFigure, LineFigure, Panel
 
@@ -55,7 +55,7 @@ def common_looks(figures: Iterable[tables.Figure]) -> Looks:
     for figure in figures:
         if isinstance(figure, LineFigure):
             groups.append([line.label for row in figure.rows for p in row for line in p.lines])
-        elif isinstance(figure, FrameFigure) and figure.kind in ("histogram", "scatter"):
+        elif isinstance(figure, FrameFigure) and figure.kind == "histogram":
             groups.append(list(figure.frame["design"].unique()))
     return style.looks(groups)
 
@@ -66,7 +66,9 @@ def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
     if isinstance(figure, FrameFigure):
-        return FRAMES[figure.kind](figure, styles)
+        return (
+            matrix_figure(figure) if figure.kind == "matrix" else histogram_figure(figure, styles)
+        )
     return design_figure(figure)
 
 
@@ -198,7 +200,7 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
 # -- tables and samples ------------------------------------------------------------------------
 
 
-def matrix_figure(figure: FrameFigure, styles: Looks) -> Figure:
+def matrix_figure(figure: FrameFigure) -> Figure:
     """Return heat maps with their numbers: design i in scenario j.
 
     Columns: "made for ...", what designs i were made for; their values, one for each j; panel.
@@ -221,53 +223,6 @@ def matrix_figure(figure: FrameFigure, styles: Looks) -> Figure:
         ends = {(False, False): "neither", (True, False): "min", (False, True): "max"}
         beyond = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
         drawn.colorbar(image, ax=axes, shrink=0.8, extend=ends.get(beyond, "both"))
-    return drawn
-
-
-def tornado_figure(figure: FrameFigure, styles: Looks) -> Figure:
-    """Return bars from the lowest to the highest value, the most telling key on top.
-
-    Columns: design, quantity, key, and the changes at both ends.
-    """
-    panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
-    count = max(len(bars) for _, bars in panels)
-    drawn, grid = _grid(figure.title, (len(panels), 1), (8.4, 1.1 + 0.45 * count))
-    for axes, ((design, quantity), bars) in zip(grid[:, 0], panels, strict=True):
-        place = np.arange(len(bars))
-        # The second is narrower: both may point the same way.
-        for label, width, colour in zip(bars.columns[-2:], (0.7, 0.4), PALETTE):
-            axes.barh(place, bars[label], width, color=colour, label=label.removesuffix(" [%]"))
-        axes.set_yticks(place, bars["key"])
-        axes.invert_yaxis()
-        axes.axvline(0.0, color="black", linewidth=0.8)
-        _label(axes, f"{design}: {quantity}", "change [%]")
-        axes.grid(True, axis="x", alpha=0.3)
-    grid[0, 0].legend(frameon=False, fontsize=9, loc="best")
-    return drawn
-
-
-def bar_figure(figure: FrameFigure, styles: Looks) -> Figure:
-    """Return groups of bars with their intervals.
-
-    Columns: design, quantity, input, and for each group its value and both ends of its interval.
-    """
-    panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
-    # A key in two lines takes half the width.
-    inputs = [label.replace(".", ".\n", 1) for label in figure.frame["input"].unique()]
-    place, columns = np.arange(len(inputs)), figure.frame["quantity"].nunique()
-    shape = len(panels) // columns, columns
-    drawn, grid = _grid(figure.title, shape, (1.5 + 1.1 * max(3, len(inputs)), 3.3), sharey=True)
-    for axes, ((design, quantity), bars) in zip(grid.flat, panels, strict=True):
-        for k, colour, shift in ((3, PALETTE[0], -0.2), (6, PALETTE[1], 0.2)):
-            value, low, high = bars.iloc[:, k : k + 3].to_numpy(dtype=float).T
-            ends = np.maximum([value - low, high - value], 0.0)
-            label = str(bars.columns[k]).partition(" [")[0]
-            axes.bar(place + shift, value, 0.36, yerr=ends, capsize=3, label=label, color=colour,
-                     alpha=0.8)  # fmt: skip
-        axes.set_xticks(place, inputs, fontsize=8, parse_math=False)
-        _label(axes, f"{design}: {quantity}", "", "share of the variance [-]")
-        axes.grid(True, axis="y", alpha=0.3)
-    grid[0, 0].legend(frameon=False, fontsize=9)
     return drawn
 
 
@@ -295,40 +250,6 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
             share.set_ylim(0.0, 1.0)
             share.set_ylabel("share of samples below [-]", color=GREY)
     return drawn
-
-
-def scatter_figure(figure: FrameFigure, styles: Looks) -> Figure:
-    """Return points, a row a quantity and a column an input.
-
-    Columns: design, the inputs, and two quantities.
-    """
-    from matplotlib.ticker import EngFormatter
-
-    inputs, quantities = figure.frame.columns[1:-2], figure.frame.columns[-2:]
-    designs = figure.frame.groupby("design", sort=False)
-    rows = [(design, what, own) for design, own in designs for what in quantities]
-    shape = len(rows), len(inputs)
-    drawn, grid = _grid(figure.title, shape, (3.2, 2.5), sharex="col", sharey="row")
-    for row, (design, what, own) in zip(grid, rows, strict=True):
-        for axes, name in zip(row, inputs, strict=True):
-            axes.plot(own[name], own[what], ".", color=styles[design]["color"], alpha=0.35,
-                      markersize=3)  # fmt: skip
-            axes.grid(True, alpha=0.3)
-            if own[name].abs().max() >= 1e4:  # 70 G rather than a power of ten in a corner
-                axes.xaxis.set_major_formatter(EngFormatter())
-        row[0].set_ylabel(f"{design}\n{what}", fontsize=9, parse_math=False)
-    for axes, name in zip(grid[-1], inputs, strict=True):
-        axes.set_xlabel(name, fontsize=9, parse_math=False)
-    return drawn
-
-
-FRAMES = {
-    "matrix": matrix_figure,
-    "tornado": tornado_figure,
-    "bars": bar_figure,
-    "histogram": histogram_figure,
-    "scatter": scatter_figure,
-}
 
 
 # -- designs ---------------------------------------------------------------------------------

@@ -29,9 +29,6 @@ from uuid import uuid4
 
 import numpy as np
 from mpi4py import MPI
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column
 
 from dolfinopt.disk import make_folder, write_text
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
@@ -42,12 +39,10 @@ from dolfinopt.output.run import optimize
 from dolfinopt.output.run_folder import write_result, write_simulation
 from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
-from dolfinopt.reduction import BasisErrors
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.simulate import (
-    compare,
     scales_bodies,
     simulate_samples,
     simulate_scenarios,
@@ -228,7 +223,7 @@ def _do(job: Job, place: _Place) -> None:
     elif action == "sample":
         _sample(cases, design, place)
     else:
-        _examine(job, design, place)
+        _simulate(job, design, place)
 
 
 # -- what is done ----------------------------------------------------------------------------
@@ -253,10 +248,9 @@ def _optimise(case: Case, place: _Place) -> None:
     write_result(scene, folder, result, earlier + time.perf_counter() - begun, paraview=False)
 
 
-def _examine(job: Job, design: Path | None, place: _Place) -> None:
-    """Simulate or compare one design in many scenes."""
-    examine: Any = compare if job[0][0].action == "compare" else simulate_scenarios
-    found = examine([_unnamed(case) for batch in job for case in batch], design)
+def _simulate(job: Job, design: Path | None, place: _Place) -> None:
+    """Simulate one design in many scenes."""
+    found = simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
     for batch in job:
         for case in batch:
             begun = time.perf_counter()
@@ -265,9 +259,6 @@ def _examine(job: Job, design: Path | None, place: _Place) -> None:
             part = place.work / case.key
             if isinstance(result, ConvergenceError):
                 place.fail(case, str(result))
-            elif isinstance(result, dict):
-                bases = [{"arm": arm, **_lists(vars(one))} for arm, one in result.items()]
-                _write_table(part, case, wall, bases=bases)
             else:
                 make_folder(part)
                 write_simulation(part, result, wall, paraview=False)
@@ -324,8 +315,6 @@ def _read(case: Case, place: _Place) -> Outcome:
     if case.action == "sample":
         found["samples"] = _arrays(data.get("samples", {}))
         found["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
-    elif not failed and case.action == "compare":
-        found["bases"] = {one.pop("arm"): BasisErrors(**_arrays(one)) for one in data["bases"]}
     elif not failed:
         found |= {name: data[name] for name in FIGURES}
     if not failed:
@@ -346,46 +335,27 @@ def _arrays(lists: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
 
 @contextmanager
 def _told(missing: Sequence[Case], place: _Place, shown: bool) -> Iterator[None]:
-    """Tell of every case when it has ended, on a terminal also how far the others are."""
+    """Tell of every case when it has ended, a line each."""
     # A thread looks at the files of all ranks; nothing that is computed depends on it.
-    if not (shown and missing):
-        yield
-        return
-    words = TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1))
-    columns, console = (words, BarColumn(bar_width=20), TimeElapsedColumn()), Console(stderr=True)
-    display = Progress(*columns, expand=True, console=console, disable=not console.is_terminal)
     total, left, ended = len(missing), list(missing), Event()
-    task = display.add_task(f"0/{total} cases", total=total)
 
     def look() -> None:
         for case in [case for case in left if place.has(case)]:
             left.remove(case)
             count = f"{total - len(left):>{len(str(total))}}/{total}"
             print(f"{count}  {_read(case, place)}", file=sys.stderr, flush=True)
-        text = "; ".join([f"{total - len(left)}/{total} cases", *_running(left, place)])
-        display.update(task, completed=total - len(left), description=text)
 
     def watch() -> None:
         while not ended.wait(TOLD):
             look()
 
     watcher = Thread(target=watch, name="progress", daemon=True)
-    with display:
+    if shown:
         watcher.start()
-        try:
-            yield
-        finally:
-            ended.set()
+    try:
+        yield
+    finally:
+        ended.set()
+        if shown:
             watcher.join()
             look()
-
-
-def _running(left: Iterable[Case], place: _Place) -> Iterator[str]:
-    """Yield how far the optimisations are that ranks are at."""
-    for case in left:
-        if case.action == "optimize" and place.taken(case).exists():
-            with suppress(OSError):
-                if rows := (place[case] / HISTORY).read_text("utf-8").split("\n")[1:-1]:
-                    iteration, objective, *_ = rows[-1].split(",")
-                    limit = case.scene.optimizer.max_iterations
-                    yield f"{case.label}: {iteration}/{limit} objective {float(objective):.4g}"

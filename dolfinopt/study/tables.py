@@ -127,11 +127,11 @@ class DesignFigure:
 
 @dataclass(frozen=True, eq=False)
 class FrameFigure:
-    """A figure of a data frame; see `figures.FRAMES` for the columns that each kind needs."""
+    """A figure of a data frame; `figures` says which columns each kind needs."""
 
     name: str
     title: str
-    kind: Literal["matrix", "tornado", "bars", "histogram", "scatter"]
+    kind: Literal["matrix", "histogram"]
     frame: pd.DataFrame
 
 

@@ -253,10 +253,6 @@ def _report(
         figures.append(FrameFigure("", title, "histogram", shown))
         if several:
             tables.append(_indices_table(samples, inputs, sampling))
-            title = f"Sobol' indices with {INTERVAL}"
-            figures.append(FrameFigure("indices", title, "bars", tables[-1].frame))
-        points = drawn.loc[drawn["sample"] > 0, ["design", *axes, *QUANTITIES]]
-        figures.append(FrameFigure("scatter", "Samples by each random value", "scatter", points))
     results = (*QUANTITIES, "at [s]")
     wide = by_design(samples[samples["sample"] > 0], ["sample", *axes], results)
     return [*tables, Table("", "All samples.", wide, long=True)], figures

@@ -195,14 +195,6 @@ def test_losses_have_one_scale(factor):
     assert (axes.get_ylabel(), axes.get_xlabel()) == ("made for [kg]", "used at [kg]")
 
 
-def test_tornado():
-    columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
-    frame = pd.DataFrame([("one", "compliance", "mass", -3.0, 4.0)], columns=columns)
-    drawn = draw(FrameFigure("", "T", "tornado", frame))
-    assert [patch.get_width() for patch in drawn.axes[0].patches] == [-3.0, 4.0]
-    assert drawn.axes[0].get_xlabel() == "change [%]"
-
-
 def sweep_figure(factor=1.0):
     """Return a sweep's figure: three designs, one of another magnitude, two quantities."""
     mass = np.linspace(4.0, 8.0, 5)
