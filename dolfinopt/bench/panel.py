@@ -108,15 +108,14 @@ def least_x(points: Frame, goal: float) -> float:
 
 
 def figure_of(diagram: Diagram, frame: Frame) -> LineFigure:
-    """Return the diagram's panels: a column a quantity."""
+    """Return the diagram's panels: by group and quantity."""
     shown = diagram.drawn(frame)
     groups = shown.groupby([*diagram.each], sort=False) if diagram.each else [((), shown)]
-    rows = []
+    panels = []
     for values, part in groups:
-        title, panels = ", ".join(f"{k}: {v}" for k, v in zip(diagram.each, values)), []
+        title = ", ".join(f"{k}: {v}" for k, v in zip(diagram.each, values))
         for y in diagram.y:
             found = curves(part, diagram.x, y, diagram.by)
             lines = [Line(name, *points.to_numpy().T) for name, points in found.items()]
             panels.append(Panel(title, diagram.x, y, tuple(lines), log=True))
-        rows.append(tuple(panels))
-    return LineFigure(diagram.name, diagram.title, tuple(rows))
+    return LineFigure(diagram.name, diagram.title, tuple(panels))

@@ -317,13 +317,13 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
 
 
 def _plot(title: str, panels: Iterable[Panel]) -> LineFigure:
-    return LineFigure("", title, tuple((panel,) for panel in panels))
+    return LineFigure("", title, tuple(panels))
 
 
 def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
     """Return deviations over time; empty axes where nothing could be simulated."""
-    rows = [panel for outcomes in found for (panel,) in studies.deviation_panels("", outcomes)]
-    return _plot(title, rows or [Panel("", "time [s]", "deviation [mm]", ())])
+    panels = [panel for outcomes in found for panel in studies.deviation_panels(outcomes)]
+    return _plot(title, panels or [Panel("", "time [s]", "deviation [mm]", ())])
 
 
 def _sweep(rows: pd.DataFrame, name: str, number: int) -> dict[int, LineFigure]:
@@ -356,7 +356,7 @@ def write_report(
         from dolfinopt.study.figures import draw_all
 
         named = {f"fig{number:02d}": figure for number, (figure, _) in figures.items()}
-        files = draw_all(named, folder, narrow=True)
+        files = draw_all(named, folder)
         differing = differences(load_paper(), plan.scene).items()
         content = html_page(
             "report.html",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +23,6 @@ FEW = 40  # points a line that get markers
 NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
-PANEL = 3.2  # inches, height of a panel of curves
-LEAST = 3.4  # inches, of a panel without the names of its curves: less is no picture
 LEGEND: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9, "handlelength": 5.0}
 
 Looks = Mapping[str, Mapping[str, Any]]
@@ -35,18 +33,10 @@ def draw_study(study: tables.Study, folder: Path) -> list[Path]:
     return draw_all({tables.joined(study.name, one.name): one for one in study.figures}, folder)
 
 
-def draw_all(
-    figures: Mapping[str, tables.Figure], folder: Path, narrow: bool = False
-) -> list[Path]:
-    """Draw figures in common looks as FOLDER/<name>.png, curves in one column if `narrow`."""
-    styles, files = common_looks(figures.values()), []
-    for name, one in figures.items():
-        if narrow and isinstance(one, LineFigure):
-            drawn = column_figure(one, styles)
-        else:
-            drawn = draw(one, styles)
-        files.append(style.save(drawn, folder / f"{name}.png"))
-    return files
+def draw_all(figures: Mapping[str, tables.Figure], folder: Path) -> list[Path]:
+    """Draw figures in common looks as FOLDER/<name>.png; return the paths."""
+    styles = common_looks(figures.values())
+    return [style.save(draw(one, styles), folder / f"{name}.png") for name, one in figures.items()]
 
 
 def common_looks(figures: Iterable[tables.Figure]) -> Looks:
@@ -54,7 +44,7 @@ def common_looks(figures: Iterable[tables.Figure]) -> Looks:
     groups = []
     for figure in figures:
         if isinstance(figure, LineFigure):
-            groups.append([line.label for row in figure.rows for p in row for line in p.lines])
+            groups.append([line.label for panel in figure.panels for line in panel.lines])
         elif isinstance(figure, FrameFigure) and figure.kind == "histogram":
             groups.append(list(figure.frame["design"].unique()))
     return style.looks(groups)
@@ -65,10 +55,10 @@ def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
     styles = styles or common_looks([figure])
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
+    if isinstance(figure, FrameFigure) and figure.kind == "matrix":
+        return matrix_figure(figure)
     if isinstance(figure, FrameFigure):
-        return (
-            matrix_figure(figure) if figure.kind == "matrix" else histogram_figure(figure, styles)
-        )
+        return histogram_figure(figure, styles)
     return design_figure(figure)
 
 
@@ -93,71 +83,11 @@ def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") ->
 
 
 def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
-    """Return the panels of curves.
-
-    Names stand where the curves end, in the last panel of each row that shows them; or in a legend
-    beside it, where curves end anywhere. Panels of one quantity share its axis.
-    """
-    rows, columns = len(figure.rows), max(map(len, figure.rows))
-    styles = styles or common_looks([figure])
-    names = [line.label for row in figure.rows for panel in row for line in panel.lines]
-    width = (4.4 if columns > 1 else 6.5) + 2.4 / columns  # with the names beside them
-    width = max(width, LEAST + style.width_of_names(names))
-    drawn, grid = _grid(figure.title, (rows, columns), (width, PANEL + 0.4))
-    for row, panels in zip(grid, figure.rows, strict=True):
-        for axes in row[len(panels) :]:
-            axes.set_visible(False)
-        for axes, panel in zip(row, panels):
-            _draw_panel(axes, panel, styles)
-    _share_axes(grid, figure.rows)
-    for row, panels in zip(grid, figure.rows, strict=True):
-        _name_curves(row, panels)
-    return drawn
-
-
-def _share_axes(grid: np.ndarray, rows: Sequence[Sequence[Panel]]) -> None:
-    """Let panels below each other share x, and those beside each other y, of one quantity each."""
-    for row, panels in zip(grid, rows, strict=True):
-        for axes, panel in zip(row[1:], panels[1:]):
-            same = panel.y_label == panels[0].y_label
-            if same and axes.get_yscale() == row[0].get_yscale():
-                axes.sharey(row[0])
-                row[0].autoscale(axis="y")
-                if row[0].get_yscale() == "linear" and row[0].get_ylim()[0] > 0.0:
-                    row[0].set_ylim(bottom=0.0)
-    for j, column in enumerate(grid.T):
-        shown = [(axes, row[j]) for axes, row in zip(column, rows, strict=True) if j < len(row)]
-        for axes, panel in shown[1:]:
-            first, one = shown[0]
-            if panel.x_label == one.x_label and axes.get_xscale() == first.get_xscale():
-                limits = [v for a in (first, axes) for v in a.get_xlim()]
-                axes.sharex(first)
-                first.set_xlim(min(limits), max(limits))
-
-
-def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
-    """Write the names of a row's curves, each once."""
-    last = len(panels) - 1
-    left = dict.fromkeys(line.label for panel in panels for line in panel.lines)
-    if all(list(left) == [panel.title] for panel in panels):  # the title says it
-        return
-    if all(style.ends_right(axes) for axes in row[: last + 1] if axes.lines):
-        for k in range(last, -1, -1):
-            mine = {line.label for line in panels[k].lines} & set(left)
-            style.label_ends(row[k], PANEL - 0.7, mine)
-            left = {name: None for name in left if name not in mine}
-        return
-    handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
-    names = list(map(style.shortened, left))
-    row[last].legend([handles[name] for name in left], names, **LEGEND, bbox_to_anchor=(1.0, 1.02))
-
-
-def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     """Return the panels below each other, each with its legend below: legible on a phone.
 
     Their left edges are one line.
     """
-    panels = [panel for row in figure.rows for panel in row]
+    panels = figure.panels
     styles = styles or common_looks([figure])
     heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
     drawn = style.new_figure(NARROW, sum(heights), 160)
@@ -165,7 +95,8 @@ def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     for axes, panel in zip(grid, panels, strict=True):
         _draw_panel(axes, panel, styles)
         if panel.lines and [line.label for line in panel.lines] != [panel.title]:
-            axes.legend(**LEGEND, bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
+            names = [style.shortened(line.label) for line in panel.lines]
+            axes.legend(axes.lines, names, **LEGEND, bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
     drawn.align_ylabels(list(grid))
     return drawn
 

@@ -19,7 +19,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,9 +53,8 @@ CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, follo
 SUMMARY, HISTORY = "summary.json", "history.csv"
 IDLE = 0.02  # s between two looks for a job
 TOLD = 0.5  # s between two looks at what is done
-FIGURES = ("objective", "compliance", "max_deviation", "max_deviation_time", "grayness",
-           "iterations", "stop_reason")  # fmt: skip
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
+FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
 
 # Cases of the same arms and design, which one rank does in one go: batches, each done at once.
 Job = Sequence[Sequence[Case]]
@@ -63,12 +62,7 @@ Job = Sequence[Sequence[Case]]
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a run keeps its cases.
-
-    Attributes:
-        cases: folder of all cases.
-        work: folder of this run: jobs that are taken, why cases failed, what is not complete yet.
-    """
+    """Folder of all cases, and of this run: jobs taken, why cases failed, what is not complete."""
 
     cases: Path
     work: Path
@@ -87,12 +81,7 @@ class _Place:
     def failure(self, case: Case) -> dict[str, Any]:
         """Return what the case left when it failed in this run, nothing if it did not."""
         path = self.work / f"{case.key}.json"
-        found: dict[str, Any] = json.loads(path.read_text("utf-8")) if path.exists() else {}
-        return found
-
-    def taken(self, case: Case) -> Path:
-        """Return the file that tells that the job whose first case this is has been taken."""
-        return self.work / f"{case.key}.taken"
+        return dict(json.loads(path.read_text("utf-8"))) if path.exists() else {}
 
     def check(self) -> None:
         """Raise OthersFailed if another rank has failed."""
@@ -106,17 +95,12 @@ def run_cases(
     """Do all cases that are not done yet, and those they depend on (collective).
 
     A case that fails to converge is reported in its outcome, and so are those that need its
-    design; it is tried again in the next run.
-
-    Args:
-        cases: any number, in any order, also repeated.
-        folder: DIR; no other run may work there.
-        world: all ranks, which share a file system.
-        shown: tell of the progress on the root's standard error.
+    design; it is tried again in the next run. Ranks share a file system; `shown`: the root tells
+    of every case on its standard error.
 
     Raises:
         InputError: a scene or design cannot be used, the others stay unfinished; another run works
-            in the folder, or it cannot be written.
+            in the folder DIR, or it cannot be written.
     """
     both = (one for case in cases for one in (case.design, case))
     wanted = list(dict.fromkeys(one for one in both if isinstance(one, Case)))
@@ -187,7 +171,7 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
                 continue
             left.remove(job)
             try:
-                place.taken(job[0][0]).touch(exist_ok=False)
+                (place.work / f"{job[0][0].key}.taken").touch(exist_ok=False)
             except FileExistsError:  # by another rank
                 continue
             _do(job, place)
@@ -288,23 +272,19 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
                 worst = worst_instants(trajectory, trajectory.scene.objective.load_cases)
                 compliance = float(trajectory.compliance[worst].sum())
                 rows.append((compliance, *trajectory.max_deviation))
-        samples = _lists(dict(zip(SAMPLED, np.transpose(rows), strict=True)))
+        samples = dict(zip(SAMPLED, np.transpose(rows).tolist(), strict=True))
         if messages:
             place.fail(case, f"{len(messages)} samples", samples=samples, messages=messages)
         else:
-            _write_table(place[case], case, time.perf_counter() - begun, samples=samples)
+            folder, wall = place[case], time.perf_counter() - begun
+            make_folder(folder)
+            more = {"seconds": {"total": wall}, "versions": versions(), "scene": scene.to_dict()}
+            write_summary(folder, {"name": case.key, "samples": samples, **more})
 
 
 def _unnamed(case: Case) -> Scene:
     """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
     return case.scene.model_copy(update={"name": case.key})
-
-
-def _write_table(folder: Path, case: Case, wall: float, **results: Any) -> None:
-    """Write the summary of a case that has no other files."""
-    make_folder(folder)
-    more = {"seconds": {"total": wall}, "versions": versions(), "scene": case.scene.to_dict()}
-    write_summary(folder, {"name": case.key, **results, **more})
 
 
 def _read(case: Case, place: _Place) -> Outcome:
@@ -313,21 +293,14 @@ def _read(case: Case, place: _Place) -> Outcome:
     data = failed or json.loads((place[case] / SUMMARY).read_text("utf-8"))
     found: dict[str, Any] = {"failure": failed.get("message", "")}
     if case.action == "sample":
-        found["samples"] = _arrays(data.get("samples", {}))
+        samples = data.get("samples", {})
+        found["samples"] = {name: np.array(values, float) for name, values in samples.items()}
         found["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
     elif not failed:
         found |= {name: data[name] for name in FIGURES}
     if not failed:
         found["seconds"] = data["seconds"]["total"]
     return Outcome(case, place[case], **found)
-
-
-def _lists(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    return {name: array.tolist() for name, array in arrays.items()}
-
-
-def _arrays(lists: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
-    return {name: np.array(values, float) for name, values in lists.items()}
 
 
 # -- progress --------------------------------------------------------------------------------

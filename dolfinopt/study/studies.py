@@ -104,8 +104,7 @@ def study(
     """Do a study (collective); the result is the same on all ranks.
 
     Args:
-        scene: what is varied.
-        preset: which study; None: a sweep over `vary` alone.
+        scene, preset: what is varied; which study, None for a sweep over `vary` alone.
         vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
         folder, world, shown: see `run_cases`.
@@ -167,9 +166,8 @@ def _plan(
     """Check what is asked and plan it (root only)."""
     asked = [parse_vary(text) for text in vary]
     keys = [one.key for one in asked]
-    for key in keys:
-        if keys.count(key) > 1:
-            raise InputError(f"--vary {key} twice; give all its values in one")
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise InputError(f"--vary {twice[0]} twice; give all its values in one")
     if preset in ("objective", "reduction", "coordinates"):
         command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
         for one in asked:
@@ -243,14 +241,14 @@ def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> t
     )
 
 
-def deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel, ...]]:
+def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
     """Return the deviation over time; designs of another magnitude get a panel of their own."""
-    rows: list[tuple[Panel, ...]] = []
+    panels = []
     for group in magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
         curves = [(one.case.label, *one.deviation()) for one in group]
         lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
-        rows.append((Panel(title, "time [s]", "deviation [mm]", lines),))
-    return rows
+        panels.append(Panel("", "time [s]", "deviation [mm]", lines))
+    return panels
 
 
 def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
@@ -366,8 +364,8 @@ def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -
     return tables, figures
 
 
-def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[tuple[Panel, ...], ...]:
-    """Return a column a quantity; designs share a row where they are of one magnitude."""
+def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[Panel, ...]:
+    """Return panels by quantity; designs share one where they are of one magnitude."""
     names, x = list(shown["design"].unique()), keys[0].axis
     by, label, groups = "design", "", [[name] for name in names]
     if len(keys) == 1:
@@ -375,11 +373,11 @@ def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[tuple[Pane
         groups = magnitudes(names, lambda name: float(largest[name]), 3.0)
     else:
         by, label = keys[1].axis, f"{keys[1].key} = "
-    rows = []
+    panels = []
     for group in groups:
         own, title = shown[shown["design"].isin(group)], group[0] if len(group) == 1 else ""
-        rows.append(tuple(Panel(title, x, y, lines_by(own, by, x, y, label)) for y in QUANTITIES))
-    return tuple(rows)
+        panels += [Panel(title, x, y, lines_by(own, by, x, y, label)) for y in QUANTITIES]
+    return tuple(panels)
 
 
 def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
@@ -508,12 +506,14 @@ def _reduction(scene: Scene) -> dict[str, Any]:
 
 def _coordinates(frame: pd.DataFrame) -> Report:
     title = "Given designs against the number of elastic coordinates of each arm."
-    x, rows = "elastic coordinates of each arm [-]", []
-    for label, design in frame.groupby("design", sort=False):
-        lines = {what: lines_by(design, "method", "coordinates", what) for what in QUANTITIES}
-        rows.append(tuple(Panel(str(label), x, *one, x_log2=True) for one in lines.items()))
+    x = "elastic coordinates of each arm [-]"
+    panels = tuple(
+        Panel(str(label), x, y, lines_by(one, "method", "coordinates", y), x_log2=True)
+        for label, one in frame.groupby("design", sort=False)
+        for y in QUANTITIES
+    )
     table = Table("", title, by_design(frame, ["method", "coordinates"]))
-    return [table], [LineFigure("", title, tuple(rows))]
+    return [table], [LineFigure("", title, panels)]
 
 
 def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:

@@ -96,22 +96,21 @@ class Panel:
 
 @dataclass(frozen=True)
 class LineFigure:
-    """Panels in rows; the curves of a name look alike in all of them."""
+    """Panels below one another; the curves of a name look alike in all of them."""
 
     name: str
     title: str
-    rows: tuple[tuple[Panel, ...], ...]
+    panels: tuple[Panel, ...]
 
     def csv(self) -> str:
         """Return all curves: a row a point."""
-        panels = [panel for row in self.rows for panel in row]
         points = [
             (panel.title, line.label, float(x), float(y))
-            for panel in panels
+            for panel in self.panels
             for line in panel.lines
             for x, y in zip(line.x, line.y, strict=True)
         ]
-        labels = {(panel.x_label, panel.y_label) for panel in panels}
+        labels = {(panel.x_label, panel.y_label) for panel in self.panels}
         axes = labels.pop() if len(labels) == 1 else ("x", "y")
         return Table("", "", pd.DataFrame(points, columns=["panel", "line", *axes])).csv()
 

@@ -213,16 +213,19 @@ def test_least_x_interpolates():
     assert least_x(curve, 1e-6) == pytest.approx(100.0)
 
 
-def test_figure_has_a_column_a_quantity_and_a_row_a_group():
+def test_figure_has_a_panel_a_group_and_quantity():
     diagram = toy(None, columns="name | ranks | x | y | z", x="x", y=("y", "z"), by="name",
                   each=("ranks",))  # fmt: skip
     frame = diagram.frame([("a", 1, 1.0, 2.0, 3.0), ("a", 2, 1.0, 4.0, 5.0), ("b", 2, 6.0, 7.0, 8)])
-    rows = figure_of(diagram, frame).rows
-    shown = [[(p.title, p.y_label, [(one.label, *one.y) for one in p.lines]) for p in row]
-             for row in rows]  # fmt: skip
+    shown = [
+        (panel.title, panel.y_label, [(one.label, *one.y) for one in panel.lines])
+        for panel in figure_of(diagram, frame).panels
+    ]
     assert shown == [
-        [("ranks: 1", "y", [("a", 2.0)]), ("ranks: 1", "z", [("a", 3.0)])],
-        [("ranks: 2", "y", [("a", 4.0), ("b", 7.0)]), ("ranks: 2", "z", [("a", 5.0), ("b", 8.0)])],
+        ("ranks: 1", "y", [("a", 2.0)]),
+        ("ranks: 1", "z", [("a", 3.0)]),
+        ("ranks: 2", "y", [("a", 4.0), ("b", 7.0)]),
+        ("ranks: 2", "z", [("a", 5.0), ("b", 8.0)]),
     ]
 
 

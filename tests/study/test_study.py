@@ -207,7 +207,7 @@ def test_grid_of_two(folder):
     compliance = np.array([row[2] for row in cells_of(table)]).reshape(2, 3)
     assert (compliance[1] > compliance[0]).all()  # a heavier payload
     assert (np.diff(compliance) < 0.0).all()  # more damping
-    [[left, _]] = figure.rows
+    left, _ = figure.panels
     np.testing.assert_array_equal([line.y for line in left.lines], compliance.T)
 
 
