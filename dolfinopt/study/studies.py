@@ -229,7 +229,7 @@ def by_design(
     wide = next(iter(parts.values()))[[*index]].copy()
     for name, part in parts.items():
         for what in results:
-            wide[f"{name}: {what}"] = part[what]
+            wide[": ".join(filter(None, (name, what)))] = part[what]
     return wide
 
 
@@ -320,7 +320,7 @@ def _sweep(
 ) -> Rows:
     """Return all scenarios of the keys' values for every design."""
     # Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
-    # "made for" in scenario "point", where it fits their arms; "optimum" its optimisation.
+    # "made for" in scenario "point", where it fits their arms.
     swept = ", ".join(vary.key for vary in keys)
     points, labels, columns = [], [], []
     for j, values in enumerate(product(*(vary.values for vary in keys))):
@@ -343,7 +343,6 @@ def _sweep(
         if fits:
             rows += [row("crossed", f"made for {labels[i]}", optima[i], j, i)
                      for i, j in product(every, every)]  # fmt: skip
-            rows += [({"role": "optimum", **columns[j]}, optima[j]) for j in every]
     return rows
 
 
@@ -396,10 +395,7 @@ def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
         tables.append(square_table(f"{name}_loss", lost, axis, labels, loss))
         losses[f"loss of {quantity} [%]"] = tables[-1]
     title = "What a design loses where it was not made for"
-    figures: list[Figure] = [square_figure(joined(prefix, "cross"), title, losses)]
-    if optima := _good(frame.loc[frame["role"] == "optimum", "outcome"]):
-        figures.append(design_figure(joined(prefix, "designs"), "Designs by scenario", optima))
-    return tables, figures
+    return tables, [square_figure(joined(prefix, "cross"), title, losses)]
 
 
 def square_table(

@@ -286,19 +286,17 @@ def _input_table(inputs: Sequence[Input]) -> Table:
 
 def _statistics_table(samples: pd.DataFrame, used: int) -> Table:
     """Return all statistics, designs beside one another."""
-    parts = []
-    for what in QUANTITIES:
-        columns: dict[str, dict[str, float]] = {}
-        for design, own in samples.groupby("design", sort=False):
+    ends, rows = ("", "from", "to"), []
+    for design, own in samples.groupby("design", sort=False):
+        for what in QUANTITIES:
             values = own[what].to_numpy()
             found = {"nominal": (values[0], math.nan, math.nan), **stats.statistics(values[1:])}
-            for k, end in enumerate(("", ": from", ": to")):
-                columns[f"{design}{end}"] = {name: one[k] for name, one in found.items()}
-        part = pd.DataFrame(columns).rename_axis("statistic").reset_index()
-        part.insert(0, "quantity", what)
-        parts.append(part)
+            for name, one in found.items():
+                known = {"design": design, "quantity": what, "statistic": name}
+                rows.append(known | dict(zip(ends, one)))
     title = f"Designs under {used} samples, with {INTERVAL} as for independent samples."
-    return Table("statistics", title, pd.concat(parts, ignore_index=True))
+    wide = by_design(pd.DataFrame(rows), ["quantity", "statistic"], ends)
+    return Table("statistics", title, wide)
 
 
 def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input], sampling: Sampling) -> Table:

@@ -181,7 +181,7 @@ def test_cross_evaluation(folder):
     # Those made for each scenario stand in the main table, too.
     made_for_it = [row[-2] for row in cells_of(tables[""])]
     np.testing.assert_array_equal(made_for_it, np.diag(values))
-    assert [figure.name for figure in done.figures] == ["", "cross", "designs"]
+    assert [figure.name for figure in done.figures] == ["", "cross"]
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
