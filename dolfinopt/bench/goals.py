@@ -55,10 +55,14 @@ def _at(frame: Frame, **values: object) -> Frame:
 # -- plane arms ------------------------------------------------------------------------------
 
 
-def _simulation(coordinates: int, frame: Frame) -> float:
-    """Return the seconds of a simulation as scenes have it by default, of the slower design."""
+def _usual(coordinates: int, frame: Frame) -> Frame:
+    """Return the rows of a simulation as scenes have it by default."""
     here = _at(frame, method=motion.USUAL, coordinates_per_arm=coordinates)
-    return here[here["tolerance [-]"] == motion.USUAL_TOLERANCE][motion.SECONDS].max()
+    return here[here["tolerance [-]"] == motion.USUAL_TOLERANCE]
+
+
+def _simulation(coordinates: int, frame: Frame) -> float:
+    return _usual(coordinates, frame)[motion.SECONDS].max()
 
 
 def _superiority(coordinates: int, frame: Frame) -> float:
@@ -66,11 +70,11 @@ def _superiority(coordinates: int, frame: Frame) -> float:
 
     A method that does not get there counts with what its finest tolerance took: a lower bound.
     """
-    here = _at(frame, coordinates_per_arm=coordinates)
-    theirs, ours = here[here["method"].str.startswith("SciPy")], _at(here, method=motion.USUAL)
+    theirs = _at(frame, coordinates_per_arm=coordinates)
+    theirs = theirs[theirs["method"].str.startswith("SciPy")]
     ratios = [
         least_x(points, one[motion.ERROR]) / one[motion.SECONDS]
-        for _, one in ours[ours["tolerance [-]"] == motion.USUAL_TOLERANCE].iterrows()
+        for _, one in _usual(coordinates, frame).iterrows()
         for points in curves(_at(theirs, design=one["design"]), *motion.CURVES).values()
     ]
     return min(ratios, default=math.nan)
@@ -108,9 +112,8 @@ def _worst_error(frame: Frame) -> float:
 # -- solid links -----------------------------------------------------------------------------
 
 
-def _links(frame: Frame, what: str, ranks: int, fewest: float = FEWEST) -> Frame:
-    here = _at(frame, what=what, ranks=ranks)
-    return here[here["dofs"] >= fewest]
+def _links(frame: Frame, what: str, ranks: int) -> Frame:
+    return _at(frame[frame["dofs"] >= FEWEST], what=what, ranks=ranks)
 
 
 def _beside_plain(what: str, ranks: int, frame: Frame) -> float:
@@ -126,7 +129,7 @@ def _power_of_dofs(what: str, ranks: int, frame: Frame) -> float:
 
 
 def _memory(frame: Frame) -> float:
-    return _links(frame, solid.COLD, 2, MILLION)["memory [GB]"].max()
+    return _links(frame[frame["dofs"] >= MILLION], solid.COLD, 2)["memory [GB]"].max()
 
 
 # -- the optimiser ---------------------------------------------------------------------------

@@ -19,9 +19,8 @@ from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import changed
 
 CELLS = (200, 12), (400, 24), (800, 48), (1600, 96)
-DEMO = 200, 12  # cells of demos/two_arm.toml, done in full on two ranks
+DEMO, SETTLED = CELLS[:2]  # of demos/two_arm.toml, done in full; at which programs are compared
 COUNTED, FEW = 10, 4  # iterations of the others, of the largest
-SETTLED = 400, 24  # cells at which programs are compared
 OURS, STATIC = "dolfinopt, two arms with their motion", "dolfinopt, static, two arms"
 TWO_RANKS = f"{OURS}, two ranks"
 PLAIN, PYMOTO = "plain DOLFINx, static, one arm", "pyMOTO, static, one arm"
@@ -30,8 +29,8 @@ PLAIN, PYMOTO = "plain DOLFINx, static, one arm", "pyMOTO, static, one arm"
 def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
     """Optimise for the scene's iterations, at least two (collective); return on the root:
 
-    Median of their CPU seconds on the root, and of those on the wall; iterations done; seconds of
-    the whole, on the wall. Not the least: no two iterations do the same.
+    Median of their CPU seconds on the root, and of those on the wall, as no two iterations do the
+    same; iterations done; seconds of the whole, on the wall.
     """
     clock: list[tuple[float, float]] = []
 
@@ -94,8 +93,8 @@ DIAGRAM = Diagram(
     "elements per arm",
     ("iteration, wall clock [s]", "peak memory [MB]"),
     "program",
-    "CPU seconds of the first rank, waiting for others included: median of whole iterations. "
-    "Static iterations of other programs: K assembled and factorised anew (plain DOLFINx: MUMPS "
-    "Cholesky), one load, the gradient; the least of the repeats. Memory is that of all ranks.",
+    "CPU seconds of the first rank, waiting for others included: median of whole iterations. Other "
+    "programs: K assembled and factorised anew (plain DOLFINx: MUMPS), one load, the gradient; the "
+    "least of the repeats. Memory is that of all ranks.",
     uses=("pymoto",),
 )

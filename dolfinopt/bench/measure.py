@@ -65,8 +65,7 @@ def timed(
     """Call `repeats` times; return the least seconds of CPU and on the wall, and the last value.
 
     CPU time of this process leaves out others on the machine; whatever disturbs a call makes it
-    longer. No garbage of earlier calls is collected meanwhile. What takes more than `short` seconds
-    is called once.
+    longer. What takes more than `short` seconds is called once.
     """
     cpu = wall = math.inf
     for _ in range(repeats):

@@ -151,9 +151,8 @@ DIAGRAM = Diagram(
     SECONDS,
     (ERROR,),
     "method",
-    f"Reference: Radau with {REFERENCE_STAGES} stages to {REFERENCE_TOLERANCE:g}. Errors in the "
-    "energy norm, largest in time over the largest value. Radau from cold, estimate and "
-    "refinements included. SciPy solves the same residual, with its exact Jacobian, in the arms' "
-    f"own vibrations. No finer tolerance where it would take over {FULL[1]:g} s ({QUICK[1]:g}).",
+    f"Reference: Radau with {REFERENCE_STAGES} stages. Errors in the energy norm, largest in time "
+    "over the largest value. SciPy solves the same residual, with its exact Jacobian, in the arms' "
+    f"own vibrations; no finer tolerance where it would take over {FULL[1]:g} s ({QUICK[1]:g}).",
     each=("design", "coordinates per arm"),
 )

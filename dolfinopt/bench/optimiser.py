@@ -6,7 +6,6 @@ rod of uniform width that keeps the same limit.
 
 from __future__ import annotations
 
-import time
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 from dolfinopt.arms.arm import uniform_design
-from dolfinopt.bench.measure import Plan, arms_of
+from dolfinopt.bench.measure import Plan, arms_of, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
 from dolfinopt.data import template_folder
 from dolfinopt.output.run import optimize
@@ -58,9 +57,8 @@ def posed(tables: Table, start: str, iterations: int) -> Scene:
 
 def solved(name: str, start: str, iterations: int) -> Rows:
     """Measure one problem from one start."""
-    begun = time.process_time()
-    result = optimize(posed(problems()[name], start, iterations), world=MPI.COMM_SELF)
-    seconds = time.process_time() - begun
+    scene = posed(problems()[name], start, iterations)
+    seconds, _, result = timed(partial(optimize, scene, world=MPI.COMM_SELF))
     excess = max((one.excess for one in result.limits), default=0.0)
     asked = result.iterations, result.counts.simulations, result.counts.adjoints
     found = result.evaluation.objective, excess, result.best_iteration
@@ -83,12 +81,9 @@ def straight_rod() -> Rows:
         (stress,) = found.values_of("stress")
         return stress / limit - 1.0, found.objective
 
-    begun = time.process_time()
-    height = brentq(lambda h: looked_at(h)[0], *HEIGHTS, xtol=1e-6)
+    seconds, _, height = timed(lambda: brentq(lambda h: looked_at(h)[0], *HEIGHTS, xtol=1e-6))
     excess, mass = looked_at(height)
-    seconds = time.process_time() - begun
-    ending = f"straight, {1e3 * height:.2f} mm high"
-    yield ROD, BY_HAND, 0, 0, 0, mass, excess, 0, seconds, ending
+    yield ROD, BY_HAND, 0, 0, 0, mass, excess, 0, seconds, f"straight, {1e3 * height:.2f} mm high"
 
 
 def _steps(plan: Plan) -> Steps:
@@ -115,11 +110,8 @@ DIAGRAM = Diagram(
     "evaluations",
     (OVER,),
     "problem",
-    "The objective is that of the design that is returned, in its unit: mass in kg, compliance in "
-    "N m, deviation in m. The excess is the largest relative violation of a limit by its true "
-    "value; up to 1e-3 a limit counts as met. Runs have at most "
-    f"{ITERATIONS} iterations from uniform densities of {', '.join(map(str, STARTS.values()))}, "
-    "less where the volume is limited. A straight rod of uniform width, the lightest that keeps "
-    "the limit, stands beside the rod.",
+    "Objectives are of the design that is returned, kg, N m or m; the excess is the largest "
+    f"relative violation of a limit, met up to 1e-3. At most {ITERATIONS} iterations from uniform "
+    f"densities of {', '.join(map(str, STARTS.values()))}, less where the volume is limited.",
     drawn=compared,
 )

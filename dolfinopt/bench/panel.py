@@ -30,11 +30,10 @@ class Diagram:
     """One diagram: rows by steps, and curves over logarithmic axes.
 
     Attributes:
-        name, title: of its files; above it.
+        name, title, note: of its files; above it; on what is measured.
         columns: of the rows, with units, " | " between them.
         steps: what is measured; the rows of each are kept when it is done.
         x, y, by: columns: a panel for every y, a curve for every value of `by`.
-        note: on what is measured.
         each: columns; every combination of their values has panels of its own.
         drawn: returns the frame that is drawn.
         uses: packages whose versions, or absence, change the rows.

@@ -34,8 +34,8 @@ class PlainStatics:
     ) -> None:
         """Compile the forms of an arm that is clamped at its inboard facets.
 
-        In the plane the modulus is times the thickness, and the area, on which 1 N is spread, the
-        height of the end. The tolerance is that of conjugate gradients.
+        1 N is spread over the area of the end; in the plane the modulus is times the thickness, and
+        the area the height. The tolerance is that of conjugate gradients.
         """
         mesh, d, self.modulus, self.count = arm.mesh, arm.dim, modulus, arm.num_cells
         self.space = space = compat.lagrange_space(mesh, 1, components=d)

@@ -39,12 +39,7 @@ def bench(
 
     Rows are kept in FOLDER/<name>.json as soon as they are there: a bench that was ended goes on
     from the step it was at, and tries again what failed. The summary grows with every diagram.
-
-    Args:
-        plan: what is measured on.
-        folder: for <name>.json, .csv, .png and bench.md.
-        diagrams: in the order of the summary.
-        tell, done: take a line for every step, and for every diagram that is finished.
+    `tell` takes a line for every step, `done` one for every diagram that is finished.
     """
     head = (
         f"# Run time against error\n\nMeasured by `dolfinopt bench{' --quick' * plan.quick}`: CPU "

@@ -109,7 +109,6 @@ DIAGRAM = Diagram(
     "what",
     "CPU seconds of the slowest rank; a box beam. The first design makes the factor or hierarchy, "
     f"a nearby one (densities moved by up to {MOVE:g}) starts from its fields. Plain DOLFINx: K, "
-    "one load by conjugate gradients with GAMG to the same tolerance, energies. Factors are made "
-    f"up to a bandwidth of {interior.WIDEST}, where memory allows.",
+    "one load by conjugate gradients with GAMG to the same tolerance, energies.",
     each=("ranks",),
 )

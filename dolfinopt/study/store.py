@@ -19,11 +19,10 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 from uuid import uuid4
 
@@ -52,7 +51,6 @@ from dolfinopt.study.simulate import (
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
 SUMMARY, HISTORY = "summary.json", "history.csv"
 IDLE = 0.02  # s between two looks for a job
-TOLD = 0.5  # s between two looks at what is done
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
 FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
 
@@ -62,10 +60,14 @@ Job = Sequence[Sequence[Case]]
 
 @dataclass(frozen=True)
 class _Place:
-    """Folder of all cases, and of this run: jobs taken, why cases failed, what is not complete."""
+    """Folder of all cases, and of this run: jobs taken, why cases failed, what is not complete.
+
+    Of the cases that are `untold` this rank tells when they have ended, whoever does them.
+    """
 
     cases: Path
     work: Path
+    untold: list[Case] = field(default_factory=list)
 
     def __getitem__(self, case: Case) -> Path:
         return self.cases / case.key
@@ -83,8 +85,15 @@ class _Place:
         path = self.work / f"{case.key}.json"
         return dict(json.loads(path.read_text("utf-8"))) if path.exists() else {}
 
+    def tell(self) -> None:
+        """Tell of cases that have ended meanwhile, a line each."""
+        for case in [case for case in self.untold if self.has(case)]:
+            self.untold.remove(case)
+            print(f"{_read(case, self)}; {len(self.untold)} to go", file=sys.stderr, flush=True)
+
     def check(self) -> None:
-        """Raise OthersFailed if another rank has failed."""
+        """Tell what has ended; raise OthersFailed if another rank has failed."""
+        self.tell()
         if (self.work / "stop").exists():
             raise OthersFailed("another rank failed")
 
@@ -109,7 +118,8 @@ def run_cases(
         try:
             done = on_root(world, _begin, place, wanted)
             missing = [case for case, there in zip(wanted, done, strict=True) if not there]
-            with _told(missing, place, shown and world.rank == 0), together(world):
+            place.untold.extend(missing * (shown and world.rank == 0))
+            with together(world):
                 _share(_jobs(missing, world.size), place, world)
             with together(world):
                 outcomes = {case: _read(case, place) for case in wanted}
@@ -185,6 +195,7 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
         ended = world.Ibarrier()
         while not ended.Test():  # asleep: waiting in MPI would keep the processor busy
             time.sleep(IDLE)
+        place.tell()
 
 
 def _is_ready(case: Case, place: _Place) -> bool:
@@ -236,6 +247,7 @@ def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
     found = simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
     for batch in job:
+        place.check()
         for case in batch:
             begun = time.perf_counter()
             result = next(found)
@@ -301,34 +313,3 @@ def _read(case: Case, place: _Place) -> Outcome:
     if not failed:
         found["seconds"] = data["seconds"]["total"]
     return Outcome(case, place[case], **found)
-
-
-# -- progress --------------------------------------------------------------------------------
-
-
-@contextmanager
-def _told(missing: Sequence[Case], place: _Place, shown: bool) -> Iterator[None]:
-    """Tell of every case when it has ended, a line each."""
-    # A thread looks at the files of all ranks; nothing that is computed depends on it.
-    total, left, ended = len(missing), list(missing), Event()
-
-    def look() -> None:
-        for case in [case for case in left if place.has(case)]:
-            left.remove(case)
-            count = f"{total - len(left):>{len(str(total))}}/{total}"
-            print(f"{count}  {_read(case, place)}", file=sys.stderr, flush=True)
-
-    def watch() -> None:
-        while not ended.wait(TOLD):
-            look()
-
-    watcher = Thread(target=watch, name="progress", daemon=True)
-    if shown:
-        watcher.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        if shown:
-            watcher.join()
-            look()
