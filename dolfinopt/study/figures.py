@@ -112,18 +112,18 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
     y = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
     x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
     wide = bool(len(y)) and panel.y_log is not False and style.spans_decade(y)
-    if wide or (panel.y_log and len(y) and y.min() > 0.0):
+    if panel.log:
+        axes.set(xscale="log", yscale="log")
+    elif wide or (panel.y_log and len(y) and y.min() > 0.0):
         style.log_scale(axes, y)
     elif len(y) and y.min() >= 0.0 and y.min() < 0.5 * y.max():
         axes.set_ylim(bottom=0.0)
     if panel.x_log2 and len(x) and x.min() > 0.0:
         style.log2_scale(axes)
-    elif len(x) and (x % 1 == 0).all():
+    elif len(x) and (x % 1 == 0).all() and not panel.log:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if any(len(line.x) > FEW for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
-    if panel.log:
-        axes.set(xscale="log", yscale="log")
     _label(axes, panel.title, panel.x_label, panel.y_label)
     axes.grid(True, alpha=0.3)
 
