@@ -13,7 +13,7 @@ from scipy.linalg import lapack
 from dolfinopt.errors import InputError
 
 # From so many rows on nested dissection beats the narrow band in PETSc's Cholesky on one rank; and
-# from there on both beat MUMPS and CHOLMOD up to 120 000 rows (`dolfinopt bench`, solvers).
+# from there on both beat MUMPS and CHOLMOD up to 120 000 rows.
 NESTED_ROWS = 30_000
 # LAPACK factorises wider bands block by block, which is faster in the lower triangle; narrower ones
 # entry by entry, faster in the upper triangle. Solutions with the upper one take 60 to 80 %.

@@ -1,9 +1,8 @@
-"""The clock, designs to measure, and measurements in processes of their own.
+"""The clock, and measurements in processes of their own: several ranks, a memory of their own.
 
-These have several ranks or threads and a memory of their own:
 `python -m dolfinopt.bench.measure MODULE FUNCTION FILE`, also under mpirun, calls a function of
-MODULE with all ranks, the scene and the arguments in FILE; prints one line of
-JSON: what the root's returned, and the peak memory of all ranks, MB.
+MODULE with all ranks, the scene and the arguments in FILE; prints one line of JSON: what the root's
+returned, and the peak memory of all ranks, MB.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import gc
 import json
 import math
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -20,33 +18,27 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from dolfinopt.arms.arm import Arm, build_arms, chain_of, uniform_design
+from dolfinopt.arms.arm import Arm, build_arms, chain_of
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.output.run import optimize
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
-from dolfinopt.study.variants import changed
 
 Arms: TypeAlias = dict[int, Arm]
 Densities: TypeAlias = dict[int, np.ndarray]
 Cells: TypeAlias = tuple[int, int]  # of an arm
-DESIGNS = INITIAL, OPTIMISED = "initial design", "optimised design"
 # As dolfinopt.sh has it: containers run as root; more ranks than cores are fine; ranks are not
 # bound to the cores of another run. Open MPI 4 (OMPI), then 5 (PRTE).
-ENVIRONMENT = {
-    "OMPI_ALLOW_RUN_AS_ROOT": "1",
-    "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+ENVIRONMENT = dict.fromkeys(("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM"), "1")
+ENVIRONMENT |= {
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
     "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
     "OMPI_MCA_hwloc_base_binding_policy": "none",
@@ -67,18 +59,13 @@ class Plan:
         return 1 if self.quick else 5
 
 
-def tidy() -> None:
-    """Free matrices and factors that nothing refers to: PETSc keeps them until it is told."""
-    gc.collect()
-    if hasattr(PETSc, "garbage_cleanup"):  # from 3.18 on
-        PETSc.garbage_cleanup(MPI.COMM_SELF)
-
-
-def timed(action: Callable[[], Any], repeats: int = 1) -> tuple[float, float, Any]:
+def timed(
+    action: Callable[[], Any], repeats: int = 1, short: float = math.inf
+) -> tuple[float, float, Any]:
     """Call `repeats` times; return the least seconds of CPU and on the wall, and the last value.
 
     CPU time of this process leaves out others on the machine; whatever disturbs a call makes it
-    longer. No garbage of earlier calls is collected meanwhile.
+    longer. What takes more than `short` seconds is called once.
     """
     cpu = wall = math.inf
     for _ in range(repeats):
@@ -87,6 +74,8 @@ def timed(action: Callable[[], Any], repeats: int = 1) -> tuple[float, float, An
         value = action()
         cpu = min(cpu, time.process_time() - begun)
         wall = min(wall, time.perf_counter() - since)
+        if cpu > short:
+            break
     return cpu, wall, value
 
 
@@ -97,21 +86,7 @@ def arms_of(scene: Scene) -> Arms:
 
 def bodies_of(scene: Scene, arms: Arms, x_phys: Densities) -> list[ShapeIntegrals]:
     """Reduce the arms as `scene` asks for; return the bodies from the cart outwards."""
-    owned = {}
-    for k, arm in arms.items():
-        arm.set_design(x_phys[k])  # shared with those `under` other scenes, which rely on it
-        owned[k] = arm.under(scene).reduce(x_phys[k])
-    return chain_of(scene, owned)
-
-
-@cache
-def designs(plan: Plan) -> dict[str, tuple[Arms, Densities]]:
-    """Return arms and physical densities of the initial and an optimised design."""
-    scene = changed(plan.scene, f"optimizer.max_iterations={15 if plan.quick else 100}")
-    result = optimize(scene, world=MPI.COMM_SELF)
-    arms = dict(result.arms)
-    uniform = uniform_design(scene, result.partition, arms, scene.design.initial)
-    return {INITIAL: (arms, uniform), OPTIMISED: (arms, dict(result.x_phys))}
+    return chain_of(scene, {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()})
 
 
 # -- processes -------------------------------------------------------------------------------
@@ -123,7 +98,7 @@ def mpirun() -> str | None:
 
 
 def in_processes(
-    function: Callable[..., Any], scene: Scene, *given: Any, ranks: int = 1, threads: int = 1
+    function: Callable[..., Any], scene: Scene, *given: Any, ranks: int
 ) -> tuple[Any, float]:
     """Return what function(comm, scene, *given) does there, and the peak memory, MB.
 
@@ -136,7 +111,7 @@ def in_processes(
         command = [sys.executable, "-m", __name__, function.__module__, function.__name__]
         command = [str(mpirun()), "-n", str(ranks)] * (ranks > 1) + [*command, str(path)]
         # os.environ is as Python found it: without what MPI added for this process alone.
-        environment = {**ENVIRONMENT, **os.environ, "OMP_NUM_THREADS": str(threads)}
+        environment = {**ENVIRONMENT, **os.environ, "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise ConvergenceError(f"{' '.join(command)}: {done.stderr.strip()[-2000:]}")
@@ -146,10 +121,8 @@ def in_processes(
 
 def _peak() -> float:
     """Return this process's peak memory, MB; not that of its parent, which getrusage inherits."""
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-    return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 1024.0
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return float(status.partition("VmHWM:")[2].split()[0]) / 1024.0
 
 
 def _main(module: str, name: str, file: str) -> None:

@@ -1,4 +1,4 @@
-"""Diagrams: rows that are measured, panels of curves, and their part of bench.md."""
+"""Diagrams: rows that are measured, one picture of curves, and a part of bench.md."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 
 from dolfinopt.bench.measure import Plan
 from dolfinopt.disk import write_text
-from dolfinopt.plots.style import looks, new_figure, save
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from dolfinopt.plots.style import save
+from dolfinopt.study.figures import draw
+from dolfinopt.study.tables import Line, LineFigure, Panel, Table
 
 Row: TypeAlias = Sequence[Any]
 Rows: TypeAlias = Iterator[Row]
@@ -27,52 +26,16 @@ Frame: TypeAlias = pd.DataFrame
 
 
 @dataclass(frozen=True)
-class Panel:
-    """Curves over logarithmic axes: columns x and y, a curve for every value of column `by`.
-
-    Attributes:
-        each: columns; every combination of their values has a panel of its own.
-        rows: returns the frame that is drawn from the diagram's.
-        powers: tell p of y = c x^p of every curve.
-        errors: values of y; tell which curve gets there with the least x.
-    """
-
-    x: str
-    y: str
-    by: str
-    title: str = ""
-    each: tuple[str, ...] = ()
-    rows: Callable[[Frame], Frame] = Frame.copy
-    powers: bool = False
-    errors: tuple[float, ...] = ()
-
-    def parts(self, frame: Frame) -> Iterator[tuple[str, dict[str, Frame]]]:
-        """Yield the title and the curves of every panel."""
-        shown = self.rows(frame)
-        groups = shown.groupby([*self.each], sort=False) if self.each else [((), shown)]
-        for values, part in groups:
-            words = [v if isinstance(v, str) else f"{k}: {v}" for k, v in zip(self.each, values)]
-            title = ", ".join(filter(None, [self.title, *words]))
-            yield title, curves(part, self.x, self.y, self.by)
-
-    def notes(self, frame: Frame) -> Iterator[str]:
-        """Yield what is told of every panel."""
-        for title, found in self.parts(frame):
-            powers = [f"{name} {fitted_power(points):.2f}" for name, points in found.items()]
-            if self.powers and powers:
-                yield f"{title}: {self.y} as a power of {self.x}: {'; '.join(powers)}."
-            least = [(error, fastest(found, error)) for error in self.errors]
-            if said := [f"{best[0]} {best[1]:.3g} (to {e:g})" for e, best in least if best]:
-                yield f"{title}: least {self.x} for an {self.y}: {'; '.join(said)}."
-
-
-@dataclass(frozen=True)
 class Diagram:
-    """One diagram: `name` of its files, a sentence, panels, a note on what is measured.
+    """One diagram: rows by steps, and curves over logarithmic axes.
 
     Attributes:
+        name, title, note: of its files; above it; on what is measured.
         columns: of the rows, with units, " | " between them.
         steps: what is measured; the rows of each are kept when it is done.
+        x, y, by: columns: a panel for every y, a curve for every value of `by`.
+        each: columns; every combination of their values has panels of its own.
+        drawn: returns the frame that is drawn.
         uses: packages whose versions, or absence, change the rows.
     """
 
@@ -80,8 +43,12 @@ class Diagram:
     title: str
     columns: str
     steps: Callable[[Plan], Steps]
-    panels: tuple[Panel, ...]
+    x: str
+    y: tuple[str, ...]
+    by: str
     note: str
+    each: tuple[str, ...] = ()
+    drawn: Callable[[Frame], Frame] = Frame.copy
     uses: tuple[str, ...] = ()
 
     def frame(self, rows: Iterable[Row]) -> Frame:
@@ -91,24 +58,16 @@ class Diagram:
 
 def write(diagram: Diagram, frame: Frame, folder: Path) -> str:
     """Write <name>.csv and <name>.png; return the diagram's part of the summary."""
-    text = frame.to_csv(index=False, float_format="%.10g", lineterminator="\n")
-    write_text(folder / f"{diagram.name}.csv", text)
-    save(draw(diagram, frame), folder / f"{diagram.name}.png")
-    notes = [note for panel in diagram.panels for note in panel.notes(frame)]
-    notes += [
+    table = Table(diagram.name, diagram.note, frame)
+    write_text(folder / f"{diagram.name}.csv", table.csv())
+    save(draw(figure_of(diagram, frame)), folder / f"{diagram.name}.png")
+    missing = [
         f"Left out, not installed (pip install 'dolfinopt[bench]'): {package}."
         for package in diagram.uses
         if not version(package)
     ]
-    head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)", diagram.note]
-    listed = "\n".join(f"- {note}" for note in notes)
-    return "\n\n".join(filter(None, [*head, listed, markdown(frame)]))
-
-
-def markdown(frame: Frame) -> str:
-    """Return a table, four digits a number, nothing for nan."""
-    cells = frame.astype(object).where(frame.notna(), None)
-    return str(cells.to_markdown(index=False, floatfmt=".4g"))
+    head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)"]
+    return "\n\n".join([*head, *missing, table.markdown()])
 
 
 def version(package: str) -> str:
@@ -137,39 +96,25 @@ def fitted_power(points: Frame) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
-def fastest(found: dict[str, Frame], goal: float) -> tuple[str, float] | None:
-    """Return which curve gets to y = `goal` with the least x, and that x, or None.
+def least_x(points: Frame, goal: float) -> float:
+    """Return the least x of a curve to y = `goal`, log over log, from coarse to fine; or the last.
 
-    Interpolated along curves from coarse to fine, log over log.
+    The last one is a bound where the curve does not get there.
     """
-    there = []
-    for name, points in found.items():
-        x, y = np.log(points.to_numpy(dtype=float)).T
-        y = np.minimum.accumulate(y)
-        if y[-1] <= math.log(goal):
-            there.append((name, float(np.exp(np.interp(-math.log(goal), -y, x)))))
-    return min(there, key=lambda one: one[1], default=None)
+    x, y = np.log(points.to_numpy(dtype=float)).T
+    y = np.minimum.accumulate(y)
+    return float(np.exp(np.interp(-math.log(goal), -y, x)))
 
 
-def draw(diagram: Diagram, frame: Frame) -> Figure:
-    """Return the diagram's panels; one legend names the curves of all."""
-    views = [(panel, *part) for panel in diagram.panels for part in panel.parts(frame)]
-    styles = looks([list(found) for _, _, found in views])
-    columns = 2 if len(views) in (2, 4) else 3
-    rows = max(1, math.ceil(len(views) / columns))
-    figure = new_figure(4.4 * columns + 2.6, 3.6 * rows + 0.4)
-    figure.suptitle(diagram.title, x=0.01, ha="left", fontsize=12)
-    handles: dict[str, Any] = {}
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, (panel, title, found) in zip(grid, views):
-        for name, points in found.items():
-            (handles[name],) = axes.plot(*points.to_numpy().T, mfc="none", **styles[name])
-        x, y = (name if name.endswith("]") else f"{name} [-]" for name in (panel.x, panel.y))
-        axes.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
-        axes.set_title(title, loc="left", fontsize=10)
-        axes.grid(True, alpha=0.3)
-    for axes in grid[len(views) :]:
-        axes.set_visible(False)
-    place = {"loc": "outside right upper", "frameon": False, "handlelength": 4.0}
-    figure.legend(handles.values(), handles, **place)
-    return figure
+def figure_of(diagram: Diagram, frame: Frame) -> LineFigure:
+    """Return the diagram's panels: by group and quantity."""
+    shown = diagram.drawn(frame)
+    groups = shown.groupby([*diagram.each], sort=False) if diagram.each else [((), shown)]
+    panels = []
+    for values, part in groups:
+        title = ", ".join(f"{k}: {v}" for k, v in zip(diagram.each, values))
+        for y in diagram.y:
+            found = curves(part, diagram.x, y, diagram.by)
+            lines = [Line(name, *points.to_numpy().T) for name, points in found.items()]
+            panels.append(Panel(title, diagram.x, y, tuple(lines), log=True))
+    return LineFigure(diagram.name, diagram.title, tuple(panels))

@@ -9,27 +9,19 @@ from functools import cache
 from pathlib import Path
 from time import perf_counter
 
-from dolfinopt.bench import arms, iterations, motion, optimiser, solid, tolerance
+from dolfinopt.bench import elements, iterations, motion, optimiser, solid, tolerance
 from dolfinopt.bench.goals import goal_table
 from dolfinopt.bench.measure import Plan
-from dolfinopt.bench.panel import Diagram, Frame, Row, markdown, version, write
+from dolfinopt.bench.panel import Diagram, Frame, Row, version, write
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene.load import Scene
+from dolfinopt.study.tables import Table
 
 Tell = Callable[[str], None]
 QUICKLY = ("arms.cells=[100,6]",)  # the scene of a quick bench
 # The main one first; what takes long, or is about designs, only when it is named.
-NAMED = (optimiser.DIAGRAM, solid.DIAGRAM)
-DIAGRAMS = (
-    motion.DIAGRAM, iterations.PEERS, iterations.WHOLE, arms.MESHES, arms.REDUCTIONS,
-    tolerance.DIAGRAM, iterations.SOLVERS,
-)  # fmt: skip
-
-
-def plan_of(load: Callable[[Sequence[str]], Scene], quick: bool) -> Plan:
-    """Return what is measured on, of what loads the scene with "key.path=value" changed."""
-    return Plan(load(QUICKLY if quick else ()), quick)
+DIAGRAMS = motion.DIAGRAM, iterations.DIAGRAM, elements.DIAGRAM, tolerance.DIAGRAM
+NAMED = optimiser.DIAGRAM, solid.DIAGRAM
 
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:
@@ -47,12 +39,7 @@ def bench(
 
     Rows are kept in FOLDER/<name>.json as soon as they are there: a bench that was ended goes on
     from the step it was at, and tries again what failed. The summary grows with every diagram.
-
-    Args:
-        plan: what is measured on.
-        folder: for <name>.json, .csv, .png and bench.md.
-        diagrams: in the order of the summary.
-        tell, done: take a line for every step, and for every diagram that is finished.
+    `tell` takes a line for every step, `done` one for every diagram that is finished.
     """
     head = (
         f"# Run time against error\n\nMeasured by `dolfinopt bench{' --quick' * plan.quick}`: CPU "
@@ -68,11 +55,10 @@ def bench(
         parts.append(write(diagram, frame, folder))
         failures += failed
         told = [f"Failed: {failure}" for failure in failures]
-        if rest := [one.name for one in diagrams[k:]]:
-            told.append(f"Not finished: {', '.join(rest)} are missing.")
+        told += [f"Not finished: {one.name} is missing." for one in diagrams[k:]]
         if len(goals := goal_table(frames)):
-            coarse = "A quick bench is coarser than what some goals are about."
-            told += ["## Goals", *[coarse] * plan.quick, markdown(goals)]
+            coarse = "A quick bench is coarser than what some goals are about." * plan.quick
+            told += ["## Goals", Table("goals", coarse, goals).markdown().strip()]
         write_text(folder / "bench.md", "\n\n".join([head, *told, *parts]) + "\n")
         done(f"{diagram.name}: {diagram.title}, {perf_counter() - begun:.0f} s")
     return failures
@@ -86,30 +72,23 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
     """
     path, versions = folder / f"{diagram.name}.json", [version(one) for one in diagram.uses]
     asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
-    content = {"stamp": json.loads(json.dumps(asked)), "complete": False, "rows": {}}
+    stamp = json.loads(json.dumps(asked))
+    kept: dict[str, list[Row]] = {}
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        if found["stamp"] == content["stamp"]:
-            content = found
+        kept = found["rows"] if found["stamp"] == stamp else {}
     except (OSError, ValueError, KeyError, TypeError):
         pass  # not there, or cut off: measured anew
-    kept: dict[str, list[Row]] = content["rows"]
     failures: list[str] = []
-
-    def keep() -> None:
-        write_text(path, json.dumps(content, default=lambda one: one.item()))
-
-    for name, step in () if content["complete"] else diagram.steps(plan):
-        if name in kept:
-            continue
-        tell(f"{diagram.name}: {name}")
-        try:
-            kept[name] = [*step()]
-        except ConvergenceError as error:
-            failures.append(f"{diagram.name}, {name}: {error}")
-        keep()
-    content["complete"] = not failures
-    keep()
+    for name, step in diagram.steps(plan):
+        if name not in kept:
+            tell(f"{diagram.name}: {name}")
+            try:
+                kept[name] = [*step()]
+            except ConvergenceError as error:
+                failures.append(f"{diagram.name}, {name}: {error}")
+            content = {"stamp": stamp, "rows": kept}
+            write_text(path, json.dumps(content, default=lambda one: one.item()))
     return [row for rows in kept.values() for row in rows], failures
 
 

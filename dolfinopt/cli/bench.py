@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import click
@@ -21,25 +20,25 @@ from dolfinopt.errors import ConvergenceError, InputError
 def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     """Measure run time against error.
 
-    Diagrams of integrators, meshes, reductions and iterations, beside other programs; or those
-    named alone: time, peers, whole, mesh, reduction, tolerance, solvers. Two run only when they are
-    named: solid measures solid links up to a million degrees of freedom (needs 14 GB), optimiser
-    solves thirteen problems from three starts (half an hour).
+    Diagrams of integrators, iterations, elements and errors, beside other programs; or those named
+    alone: time, iteration, mesh, tolerance. Two run only when they are named: solid measures solid
+    links up to a million degrees of freedom (needs 14 GB), optimiser solves thirteen problems from
+    three starts (half an hour).
 
     What is measured is kept in DIR; a call that was interrupted goes on.
     """
     world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
+    from dolfinopt.bench.run import QUICKLY, Plan, named
     from dolfinopt.bench.run import bench as run
-    from dolfinopt.bench.run import named, plan_of
     from dolfinopt.paper.reproduction import load_paper
 
     chosen = named(names)
     begun = time.perf_counter()
     folder = out or Path("results") / "bench"
     prepare(world, folder)
-    plan = plan_of(partial(load_paper, False), quick)
+    plan = Plan(load_paper(overrides=QUICKLY if quick else ()), quick)
     with _progress(len(chosen)) as (tell, done):
         failures = run(plan, folder, chosen, tell, done)
     seconds = time.perf_counter() - begun

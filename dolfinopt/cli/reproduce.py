@@ -35,7 +35,6 @@ def reproduce(
     world = start()
     from dolfinopt.output.summary import filter_warnings
     from dolfinopt.paper import reproduction as paper
-    from dolfinopt.paper.report import write_report
     from dolfinopt.paper.statements import check_paper, failed_checks
     from dolfinopt.parallel import on_root
 
@@ -45,10 +44,10 @@ def reproduce(
         warn(filter_warnings(scene, paper.cell_sizes(scene)))
     plan = paper.Plan(scene)
     results, outcomes = paper.reproduce(plan, folder, world)
-    checks = check_paper(results, scene)
+    checks = check_paper(results)
 
     def conclude() -> None:
-        write_report(plan, results, outcomes, checks, folder, plots=plots)
+        paper.write_report(plan, results, outcomes, checks, folder, plots=plots)
         for check in checks:
             click.echo(f"{check.name} (paper: {check.paper}). {check.sentence}")
         page = " and report.html" if plots else ""

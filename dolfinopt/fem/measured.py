@@ -37,7 +37,7 @@ HARMLESS_CONTRAST = 1e6
 # -- interior: the choice of a solver --------------------------------------------------------
 
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
-# has 8e8, and takes a quarter of the time of nested dissection (`dolfinopt bench`, solvers).
+# has 8e8, and takes a quarter of the time of nested dissection (docs/pages/develop/profile.md).
 BAND_WORK_LIMIT = 1e9
 # Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
 # takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
@@ -48,8 +48,7 @@ SOLID_BAND_WORK_LIMIT = 1.5e11
 MUMPS_ROWS = 150_000
 # Bandwidth beyond which a solid arm is solved by conjugate gradients: they take the same time a row
 # whatever the shape, factors the longer the larger the cross-sections. With this one a nearby
-# design takes equally long: slender arms of 250 000 and cubes of 22 000 rows (`dolfinopt bench
-# solid`).
+# design takes equally long: slender arms of 250 000 and cubes of 22 000 rows.
 WIDEST = 1200
 # Times that of quadratic tetrahedra, whose meshes are irregular: with 90 801 rows, a bandwidth of
 # 1484, a body takes 11 s by factors and 38 s by conjugate gradients.

@@ -1,10 +1,10 @@
-"""The paper's cases as a table, and the same table with what came out of them.
+"""The paper's figures 3 to 15: its cases, what comes out of them, figures, data and page.
 
-Every row is one design in one scene:
+Every row of the table is one design in one scene:
 
 | column | meaning |
 |---|---|
-| table | "objectives", "reductions", "coordinates", "payload", "path", "ends objectives" ... |
+| table | "objectives", "reductions", "coordinates", "payload", "path" |
 | label | what the design was made for or with |
 | kind | of its objective, or the reduction method; "" for neither |
 | x | number of coordinates, or value of the swept key; nan for neither |
@@ -12,30 +12,46 @@ Every row is one design in one scene:
 | case, made | what is simulated; the optimisation that made the design, else `case` |
 
 `add_outcomes` adds compliance (N m), deviation (largest, m), grayness, iterations, note (how it
-ended), own (compliance as the design's own model sees it, N m) and apart: of "reductions" the
-part of the cells on the other side of one half than in the design made with the most Craig-Bampton
-coordinates, of "coordinates" the largest distance over time of the deviation from that with the
-most, over the latter's largest. What failed has nan.
+ended), own (compliance as the design's own model sees it, N m) and apart: of "reductions" the part
+of the cells on the other side of one half than in the design made with the most Craig-Bampton
+coordinates, of "coordinates" the largest distance of the deviation from that with the most, over
+the latter's largest. What failed has nan.
+
+The figures bear the paper's numbers; where several show one thing, which of them shows what is our
+choice.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 
 from dolfinopt.data import paper_scene
-from dolfinopt.output.summary import FILTER_CELLS
+from dolfinopt.disk import write_text
+from dolfinopt.dynamics.build import check_motion
+from dolfinopt.output.folders import prepare_folder
+from dolfinopt.parallel import on_root, together
 from dolfinopt.scene.load import Scene, load_scene
+from dolfinopt.study import studies
 from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.store import run_cases
-from dolfinopt.study.variants import OBJECTIVES, changed, reduced, reference_scene, with_objective
+from dolfinopt.study.studies import QUANTITIES
+from dolfinopt.study.tables import Figure, LineFigure, Panel, Table, embedded, html_page
+from dolfinopt.study.variants import (
+    OBJECTIVES,
+    changed,
+    differences,
+    reduced,
+    reference_scene,
+    with_objective,
+)
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -49,7 +65,7 @@ FORCE_ALONE = ("static compliance, force alone", ("static", "loads=[[0, 1, 0]]")
 CUT_OFF = "attached=none"  # no mass at the ends: the optimiser would cut the arms off
 # Objectives: label, kind, and the settings that make it.
 VARIANTS = (*(one for one in OBJECTIVES if CUT_OFF not in one[1]), FORCE_ALONE)
-SHOWN = (  # in figure 3, and with solid ends
+SHOWN = (  # in figure 3
     "dynamic loads (esl)",
     "static compliance",
     "static compliance, force alone",
@@ -60,35 +76,25 @@ SWEEPS = {  # table: key, axis, what a value is called
     "payload": ("payload.mass", "payload [kg]", "{:g} kg"),
     "path": ("motion.flattening", "flattening s [-]", "s = {:g}"),
 }
-SOLID_ENDS = 0.03  # m of solid material at both ends, in the variant that tells what it changes
 # The paper's theory is linear, and so were its elements.
 LINEAR = ("simulation.stiffening=false", "arms.element=linear")
-COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60")
-# Both set the filter's radius; where neither is asked for, coarse cells get `FILTER_CELLS` of it.
-FILTER_KEYS = ("design.filter_radius", "design.minimum_member", "design.minimum_gap")
+# With the paper's filter, 0.75 of a coarse cell, the arms would hang together by corners of cells.
+COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60", "design.filter_radius=0.02")
+COLUMNS = ["table", "label", "kind", "x", "made_for", "case", "made"]
+MEASURED = [*COLUMNS[:5], "compliance", "deviation", "grayness", "iterations", "note", "own"]
+MEASURED += ["apart"]
 
-Row = tuple[str, str, str, float, float, Case, Case]
+Row: TypeAlias = tuple[str, str, str, float, float, Case, Case]
+Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what has their data
 
 
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
-    """Return the paper's scene.
-
-    Args:
-        coarse: `COARSE` cells and iterations, and a filter of at least `FILTER_CELLS` cells unless
-            the overrides set one: with the paper's radius, 0.75 of a coarse cell, the arms would
-            hang together by the corners of cells.
-        overrides: "key.path=value" each.
+    """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden.
 
     Raises:
         InputError: there is no such key, or it does not allow the value.
     """
-    from dolfinopt.dynamics.build import check_motion
-
     scene = load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
-    asked = {text.partition("=")[0].strip() for text in overrides}
-    if coarse and asked.isdisjoint(FILTER_KEYS):
-        radius = max(scene.design.radius, FILTER_CELLS * max(cell_sizes(scene).values()))
-        scene = changed(scene, f"design.filter_radius={radius!r}")
     check_motion(scene)
     return scene
 
@@ -130,75 +136,62 @@ class Plan:
     @cached_property
     def table(self) -> pd.DataFrame:
         """All cases, see the module."""
-        ends = changed(self.scene, f"arms.passive={SOLID_ENDS}")
-        columns = ["table", "label", "kind", "x", "made_for", "case", "made"]
         rows = [
-            *_objectives("objectives", self.scene, self.variants),
-            *_reductions("reductions", self.scene, self.optimised, self.optimised),
-            *_coordinates(self.scene, self.optimum, self.swept),
-            *_sweep("payload", self.scene, self.masses, self.payloads),
-            *_sweep("path", self.scene, self.flattenings, self.paths),
-            *_objectives("ends objectives", ends, [v for v in self.variants if v[0] in SHOWN]),
-            # Many Craig-Bampton coordinates make no other design than few.
-            *_reductions("ends reductions", ends, self.optimised[:1], self.optimised),
+            *self._objectives(),
+            *self._reductions(),
+            *self._coordinates(),
+            *self._sweep("payload", self.masses, self.payloads),
+            *self._sweep("path", self.flattenings, self.paths),
         ]
-        return pd.DataFrame(rows, columns=columns)
+        return pd.DataFrame(rows, columns=COLUMNS)
 
+    def _objectives(self) -> Iterator[Row]:
+        """Yield the initial design, and one for every objective."""
+        initial = Case(self.scene, label=INITIAL)
+        yield "objectives", INITIAL, "", math.nan, math.nan, initial, initial
+        for label, settings in self.variants:
+            scene = with_objective(self.scene, *settings)
+            case = Case(scene, "optimize", label=label)
+            yield "objectives", label, scene.objective.kind, math.nan, math.nan, case, case
 
-def _objectives(
-    table: str, scene: Scene, variants: Sequence[tuple[str, tuple[str, ...]]]
-) -> Iterator[Row]:
-    """Yield the initial design, and one for every objective."""
-    initial = Case(scene, label=INITIAL)
-    yield table, INITIAL, "", math.nan, math.nan, initial, initial
-    for label, settings in variants:
-        other = with_objective(scene, *settings)
-        case = Case(other, "optimize", label=label)
-        yield table, label, other.objective.kind, math.nan, math.nan, case, case
-
-
-def _reductions(table: str, scene: Scene, *counts: Sequence[int]) -> Iterator[Row]:
-    """Yield designs by reduction, so many coordinates of each method, in the reference model."""
-    reference = reference_scene(scene)
-    for method, mine in zip(METHODS, counts, strict=True):
-        for other in _reduced(scene, method, mine):
-            made = Case(other, "optimize", label=f"{method} {other.reduction.coordinates}")
+    def _reductions(self) -> Iterator[Row]:
+        """Yield designs made with either reduction, in the reference model."""
+        reference = reference_scene(self.scene)
+        for method, count, scene in self._reduced(self.optimised):
+            made = Case(scene, "optimize", label=f"{method} {count}")
             again = Case(reference, "simulate", made, f"{made.label} in the reference")
-            yield table, made.label, method, other.reduction.count, math.nan, again, made
+            yield "reductions", made.label, method, count, math.nan, again, made
 
-
-def _coordinates(scene: Scene, optimum: Case, counts: Sequence[int]) -> Iterator[Row]:
-    """Yield the initial and the optimised design with either method and more coordinates."""
-    for label, design in ((INITIAL, None), (OPTIMUM, optimum)):
-        for method in METHODS:
-            for other in _reduced(scene, method, counts):
-                count = other.reduction.count
-                case = Case(other, "simulate", design, f"{label}, {method} {count}")
+    def _coordinates(self) -> Iterator[Row]:
+        """Yield the initial and the optimised design with either method and more coordinates."""
+        for label, design in ((INITIAL, None), (OPTIMUM, self.optimum)):
+            for method, count, scene in self._reduced(self.swept):
+                case = Case(scene, "simulate", design, f"{label}, {method} {count}")
                 yield "coordinates", label, method, count, math.nan, case, case
 
+    def _reduced(self, counts: Sequence[int]) -> Iterator[tuple[str, int, Scene]]:
+        """Yield the scene with either method; small arms have no more than their coordinates."""
+        most = min([arm.n_reducible for arm in self.scene.arms if arm.n_reducible] + [max(counts)])
+        for method in METHODS:
+            for count in dict.fromkeys(min(n, most) for n in counts):
+                yield method, count, reduced(self.scene, method, count)
 
-def _reduced(scene: Scene, method: str, counts: Sequence[int]) -> list[Scene]:
-    """Return the scene with one method; small arms have no more than their own coordinates."""
-    most = min([arm.n_reducible for arm in scene.arms if arm.n_reducible] + [max(counts)])
-    return [reduced(scene, method, n) for n in dict.fromkeys(min(n, most) for n in counts)]
-
-
-def _sweep(
-    table: str, scene: Scene, values: Sequence[float], optimised: Sequence[float]
-) -> Iterator[Row]:
-    """Yield the initial design, on paths solid arms, and designs made for some of the values."""
-    key, _, words = SWEEPS[table]
-    scenes = {value: changed(scene, f"{key}={value}") for value in values}
-    designs: list[tuple[str, float, Case | None]] = [(INITIAL, math.nan, None)]
-    designs += [(SOLID, math.nan, None)] * (table == "path")
-    for value in optimised:
-        label = f"made for {words.format(value)}"
-        designs.append((label, value, Case(scenes[value], "optimize", label=label)))
-    for label, made_for, design in designs:
-        for value, one in scenes.items():
-            there = changed(one, "design.initial=1.0") if label == SOLID else one
-            case = Case(there, "simulate", design, f"{label}, {words.format(value)}")
-            yield table, label, "", value, made_for, case, design or case
+    def _sweep(
+        self, table: str, values: Sequence[float], optimised: Sequence[float]
+    ) -> Iterator[Row]:
+        """Yield the initial design, on paths solid arms, and designs made for some values."""
+        key, _, words = SWEEPS[table]
+        scenes = {value: changed(self.scene, f"{key}={value}") for value in values}
+        designs: list[tuple[str, float, Case | None]] = [(INITIAL, math.nan, None)]
+        designs += [(SOLID, math.nan, None)] * (table == "path")
+        for value in optimised:
+            label = f"made for {words.format(value)}"
+            designs.append((label, value, Case(scenes[value], "optimize", label=label)))
+        for label, made_for, design in designs:
+            for value, one in scenes.items():
+                there = changed(one, "design.initial=1.0") if label == SOLID else one
+                case = Case(there, "simulate", design, f"{label}, {words.format(value)}")
+                yield table, label, "", value, made_for, case, design or case
 
 
 # -- results ---------------------------------------------------------------------------------
@@ -207,17 +200,11 @@ def _sweep(
 def reproduce(
     plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True
 ) -> tuple[pd.DataFrame, Outcomes]:
-    """Do everything that is not done yet, kept in DIR `folder` (collective); the same on all ranks.
+    """Return the plan's table with results, and all outcomes; the same on all ranks (collective).
 
-    Returns:
-        The plan's table with results, those of cases that failed nan; and all outcomes.
-
-    Raises:
-        InputError: the scene does not allow what the paper varies, or DIR cannot be written.
+    What is done already is kept in DIR `folder`. InputError where the scene does not allow what the
+    paper varies, or DIR cannot be written.
     """
-    from dolfinopt.output.folders import prepare_folder
-    from dolfinopt.parallel import on_root, together
-
     with together(world):
         cases = [*plan.table.case, *plan.table.made]
     on_root(world, prepare_folder, folder)
@@ -237,13 +224,11 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
         own=[one.compliance for one in made],
         apart=math.nan,
     )
-    compared = results[results.table.isin(["coordinates", "reductions", "ends reductions"])]
-    for (name, _), group in compared.groupby(
-        ["table", compared.label.where(compared.table == "coordinates", "")]
-    ):
-        finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
-        distance = _distance if name == "coordinates" else _cells_apart
-        results.loc[group.index, "apart"] = [distance(outcomes[c], finest) for c in group.made]
+    for name, distance in (("coordinates", _distance), ("reductions", _cells_apart)):
+        rows = results[results.table == name]
+        for _, group in rows.groupby(rows.label if name == "coordinates" else rows.table):
+            finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
+            results.loc[group.index, "apart"] = [distance(outcomes[c], finest) for c in group.made]
     return results
 
 
@@ -274,3 +259,117 @@ def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
     """Return the relative loss (n, n) of a design made for i against the one made for j, at j."""
     values = cross_values(rows, quantity)
     return values / np.diag(values) - 1.0
+
+
+# -- figures and files -----------------------------------------------------------------------
+
+
+def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
+    """Return figures 3 to 15 with their data; curves of cases that failed are missing."""
+    results = results.assign(deviation=1e3 * results.deviation)
+    results = results.rename(columns=dict(zip(("compliance", "deviation"), QUANTITIES)))
+    by = dict(iter(results.groupby("table")))
+    objectives, reductions, coordinates = (
+        by[name] for name in ("objectives", "reductions", "coordinates")
+    )
+
+    def good(cases: Iterable[Case]) -> list[Outcome]:
+        return [outcome for case in cases if not (outcome := outcomes[case]).failure]
+
+    optimum = coordinates[coordinates.label == OPTIMUM]
+    ends = [
+        case for _, one in optimum.groupby("kind", sort=False) for case in one.case.iloc[[0, -1]]
+    ]
+    again = [replace(outcomes[c], case=made) for c, made in zip(reductions.case, reductions.made)]
+    shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
+    with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
+    objective, grayness = studies.convergence(good(reductions.made))
+    axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
+    lines = {
+        3: _over_time("Deviation of the end-effector by objective", *shown),
+        5: _plot("Convergence of the compliance by reduction", [objective]),
+        6: _plot("Convergence of the grayness by reduction", [grayness]),
+        7: _plot(
+            "Compliance against the number of coordinates",
+            [
+                Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
+                for label, one in coordinates.astype({"x": int}).groupby("label", sort=False)
+            ],
+        ),
+        8: _over_time("Deviation of the optimised design by reduction", good(dict.fromkeys(ends))),
+        9: _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
+        **_sweep(by["payload"], "payload", 10),
+        **_sweep(by["path"], "path", 12),
+    }
+    figures: Figures = {number: (figure, figure) for number, figure in lines.items()}
+    title = "Designs by objective"
+    names = {"label": "made for", "grayness": "grayness [-]", "note": "ended by"}
+    columns = ["label", *QUANTITIES, "grayness", "iterations", "note"]
+    table = Table("", title, objectives[columns].rename(columns=names))
+    figures[4] = studies.design_figure("", title, good(objectives.case)), table
+    labels = [f"{value:g}" for value in by["path"].made_for.dropna().unique()]
+    for number, what in enumerate(QUANTITIES, 14):
+        losses = 100.0 * loss(by["path"], what).to_numpy()
+        title = f"Loss of {what.partition(' [')[0]} against the design made for the path [%]"
+        table = studies.square_table("", title, SWEEPS["path"][1], labels, losses)
+        figures[number] = studies.square_figure("", title, {"": table}), table
+    return dict(sorted(figures.items()))
+
+
+def _plot(title: str, panels: Iterable[Panel]) -> LineFigure:
+    return LineFigure("", title, tuple(panels))
+
+
+def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
+    """Return deviations over time; empty axes where nothing could be simulated."""
+    panels = [panel for outcomes in found for panel in studies.deviation_panels(outcomes)]
+    return _plot(title, panels or [Panel("", "time [s]", "deviation [mm]", ())])
+
+
+def _sweep(rows: pd.DataFrame, name: str, number: int) -> dict[int, LineFigure]:
+    """Return compliance and deviation; the initial design has a scale of its own."""
+    axis, figures = SWEEPS[name][1], {}
+    for k, quantity in enumerate(QUANTITIES):
+        lines = studies.lines_by(rows, "label", "x", quantity)
+        panels = [Panel("", axis, quantity, group) for group in (lines[:1], lines[1:])]
+        what, by = (text.partition(" [")[0] for text in (quantity, axis))
+        figures[number + k] = _plot(f"{what.capitalize()} against {by}", panels)
+    return figures
+
+
+def write_report(
+    plan: Plan,
+    results: pd.DataFrame,
+    outcomes: Outcomes,
+    checks: Sequence[Any],
+    folder: Path,
+    *,
+    plots: bool = True,
+) -> None:
+    """Write figNN.csv, measured.json and, with plots, figNN.png and report.html (root only)."""
+    figures = all_figures(results, outcomes)
+    records = results[MEASURED].to_json(orient="records", double_precision=15, indent=1)
+    write_text(folder / "measured.json", records + "\n")
+    for number, (_, data) in figures.items():
+        write_text(folder / f"fig{number:02d}.csv", data.csv())
+    if plots:
+        from dolfinopt.study.figures import draw_all
+
+        named = {f"fig{number:02d}": figure for number, (figure, _) in figures.items()}
+        files = draw_all(named, folder)
+        differing = differences(load_paper(), plan.scene).items()
+        content = html_page(
+            "report.html",
+            checks=checks,
+            figures=[
+                (number, figure.title, embedded(file.read_bytes()))
+                for (number, (figure, _)), file in zip(figures.items(), files)
+            ],
+            tables=[data for _, data in figures.values() if isinstance(data, Table)],
+            cases=outcomes.by_case,
+            overridden=[
+                f"{key} = {ours} in place of {theirs}" for key, (theirs, ours) in differing
+            ],
+            failures=outcomes.failures,
+        )
+        write_text(folder / "report.html", content)

@@ -1,4 +1,4 @@
-"""How pictures look: colours and lines by name, labels at line ends, figures and their files.
+"""How pictures look: colours and lines by name, figures and their files.
 
 One name has one look in all pictures that belong together, and every curve has the same width.
 Matplotlib is imported where it is used: most commands draw nothing.
@@ -33,9 +33,7 @@ BLUE, ORANGE, GREY = PALETTE[0], PALETTE[1], "#6e6e6e"
 INITIAL, OPTIMISED = "initial design", "optimised design"
 KNOWN = {OPTIMISED: 0, INITIAL: 1}  # the same in all pictures of all runs
 LOOKS = len(PALETTE) * len(DASHES)
-LABEL_SIZE = 9.0  # points, at line ends
-LONGEST = 60  # characters of a name beside its curve
-WIDE = 0.55  # of its font size, about, a character
+LONGEST = 60  # characters of a name in a legend
 SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
 PathLike = str | os.PathLike[str]
@@ -89,7 +87,7 @@ def looks(groups: Iterable[Sequence[str]]) -> dict[str, dict[str, Any]]:
     return {label: look(number) for label, number in look_numbers(groups).items()}
 
 
-# -- labels at line ends ---------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------
 
 
 def spread(places: Sequence[float], gap: float, high: float = 1.0) -> np.ndarray:
@@ -110,72 +108,9 @@ def spread(places: Sequence[float], gap: float, high: float = 1.0) -> np.ndarray
     return result
 
 
-def ends_right(axes: Axes) -> bool:
-    """Return whether all curves end near the right edge: there is the place of their names."""
-    ends = [end for line in axes.lines if (end := _last_point(axes, line)) is not None]
-    return bool(ends) and min(x for x, _ in ends) > 0.9
-
-
-def label_ends(axes: Axes, height: float, names: Iterable[str] | None = None) -> None:
-    """Write the curves' names to the right of where they end, in their colours.
-
-    Args:
-        axes: with final limits.
-        height: of the axes, about, inches.
-        names: of the curves; default all.
-    """
-    wanted = None if names is None else set(names)
-    ends = []
-    for line in axes.lines:
-        place = _last_point(axes, line)
-        if place is not None and (wanted is None or line.get_label() in wanted):
-            ends.append((line, place))
-    places = spread([y for _, (_, y) in ends], 1.3 * LABEL_SIZE / 72.0 / height)
-    for (line, (x, y)), at in zip(ends, places, strict=True):
-        axes.annotate(
-            shortened(str(line.get_label())),
-            xy=(x, y),
-            xytext=(1.04, at),
-            xycoords="axes fraction",
-            textcoords="axes fraction",
-            va="center",
-            fontsize=LABEL_SIZE,
-            color=line.get_color(),
-            annotation_clip=False,
-            parse_math=False,
-            arrowprops={
-                "arrowstyle": "-",
-                "relpos": (0.0, 0.5),  # from the first letter, not through the words
-                "color": line.get_color(),
-                "linewidth": 0.7,
-                "shrinkA": 1.0,
-                "shrinkB": 3.0,
-            },
-        )
-
-
 def shortened(name: str) -> str:
     """Return a curve's name without its beginning where it is too long: of paths the end tells."""
     return name if len(name) <= LONGEST else "..." + name[3 - LONGEST :]
-
-
-def width_of_names(names: Iterable[str]) -> float:
-    """Return the width that names beside curves take, about, inches."""
-    return max((len(shortened(name)) for name in names), default=0) * WIDE * LABEL_SIZE / 72.0
-
-
-def _last_point(axes: Axes, line: Any) -> tuple[float, float] | None:
-    """Return where a curve ends, as shares of the axes; None where it has no finite value."""
-    points = np.column_stack([np.asarray(v, dtype=float) for v in line.get_data()])
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
-        return None
-    last = points[np.argmax(points[:, 0])]
-    # Asked for its limits, Matplotlib brings them up to date; `transLimits` does not.
-    axes.get_xlim()
-    axes.get_ylim()
-    x, y = (axes.transScale + axes.transLimits).transform(last)
-    return float(x), float(y)
 
 
 # -- scales ----------------------------------------------------------------------------------

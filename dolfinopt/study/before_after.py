@@ -211,8 +211,8 @@ def _words(table: Table, word: str, figure: str) -> str:
 
 def _plot(sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]) -> Image:
     """Return curves of both runs over time."""
-    from dolfinopt.study.figures import column_figure
+    from dolfinopt.study.figures import line_figure
 
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return embedded(png(column_figure(LineFigure("", title, ((panel,),)), LOOKS)))
+    return embedded(png(line_figure(LineFigure("", title, (panel,)), LOOKS)))

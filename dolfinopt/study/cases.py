@@ -16,13 +16,11 @@ import numpy as np
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import read_history
-from dolfinopt.reduction import BasisErrors
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, program, with_digests
-from dolfinopt.study import variants
-from dolfinopt.study.simulate import MODES, SCALING
+from dolfinopt.study.simulate import SCALING
 
-Action = Literal["optimize", "simulate", "compare", "sample"]
+Action = Literal["optimize", "simulate", "sample"]
 
 # Scenes that differ in these tables alone have the same arms, which are built and factorised once.
 SCENARIO = frozenset(
@@ -42,9 +40,8 @@ class Case:
 
     Attributes:
         scene: complete; its name does not matter.
-        action: "optimize" finds a design, "simulate" moves a given one, "compare" says what its
-            reduced basis misses of `variants.REFERENCE` Craig-Bampton coordinates, "sample" moves
-            it at several samples of the scene's values.
+        action: "optimize" finds a design, "simulate" moves a given one, "sample" moves it at
+            several samples of the scene's values.
         design: given; that of an optimising case, of a file, or None, the initial one.
         label: what progress and messages call it.
         samples: what each sample changes, "key.path=value" each.
@@ -61,10 +58,8 @@ class Case:
     @cached_property
     def key(self) -> str:
         """Sixteen hexadecimal digits that stand for everything the case computes."""
-        parts: list[Any] = [program(), self.action, scene_content(self.scene), self.design_key]
-        if self.action == "compare":
-            parts += [variants.REFERENCE_METHOD, variants.REFERENCE, MODES]
-        return _digest([*parts, self.samples])
+        content = scene_content(self.scene)
+        return _digest([program(), self.action, content, self.design_key, self.samples])
 
     @property
     def title(self) -> str:
@@ -81,7 +76,7 @@ class Case:
 
     @cached_property
     def arms_key(self) -> str:
-        """Equal where the same arms with the same design are simulated, compared or sampled."""
+        """Equal where the same arms with the same design are simulated or sampled."""
         if self.action == "optimize":
             return self.key
         free = frozenset() if self.action == "sample" else SCENARIO  # samples are of one scene
@@ -120,7 +115,6 @@ class Outcome:
         objective, compliance, max_deviation, max_deviation_time, grayness, iterations,
             stop_reason: of the summary; SI units.
         seconds: that it took.
-        bases: of a comparison, by the names of the arms with a design of their own.
         samples: compliance, max_deviation and max_deviation_time (n,) of samples.
         messages: of the samples that failed, by number.
     """
@@ -136,7 +130,6 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
-    bases: Mapping[str, BasisErrors] = field(default_factory=dict)
     samples: Mapping[str, np.ndarray] = field(default_factory=dict)
     messages: Mapping[int, str] = field(default_factory=dict)
 
@@ -147,7 +140,7 @@ class Outcome:
         if self.case.action == "optimize":
             found = f"{self.iterations} iterations, {found}"
         elif self.case.action != "simulate":
-            found = f"{len(self.case.samples)} samples" if self.case.samples else "compared"
+            found = f"{len(self.case.samples)} samples"
         return f"{self.case.title}: {found}, {self.seconds:.1f} s"
 
     @property
@@ -158,6 +151,11 @@ class Outcome:
         case = self.case
         names = {k: f"{k} ({', '.join(one)})" for k, one in enumerate(case.samples, case.first)}
         return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
+
+    @property
+    def stopped(self) -> str:
+        """Why an optimisation stopped."""
+        return self.stop_reason if self.case.action == "optimize" else ""
 
     @property
     def design(self) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from dolfinopt.output.design import read_views
 from dolfinopt.output.views import designed
 from dolfinopt.plots import style
-from dolfinopt.plots.style import GREY, PALETTE
+from dolfinopt.plots.style import GREY
 from dolfinopt.study import tables
 from dolfinopt.study.tables import FrameFigure, LineFigure, Panel
 
@@ -23,8 +23,6 @@ FEW = 40  # points a line that get markers
 NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
-PANEL = 3.2  # inches, height of a panel of curves
-LEAST = 3.4  # inches, of a panel without the names of its curves: less is no picture
 LEGEND: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9, "handlelength": 5.0}
 
 Looks = Mapping[str, Mapping[str, Any]]
@@ -35,18 +33,10 @@ def draw_study(study: tables.Study, folder: Path) -> list[Path]:
     return draw_all({tables.joined(study.name, one.name): one for one in study.figures}, folder)
 
 
-def draw_all(
-    figures: Mapping[str, tables.Figure], folder: Path, narrow: bool = False
-) -> list[Path]:
-    """Draw figures in common looks as FOLDER/<name>.png, curves in one column if `narrow`."""
-    styles, files = common_looks(figures.values()), []
-    for name, one in figures.items():
-        if narrow and isinstance(one, LineFigure):
-            drawn = column_figure(one, styles)
-        else:
-            drawn = draw(one, styles)
-        files.append(style.save(drawn, folder / f"{name}.png"))
-    return files
+def draw_all(figures: Mapping[str, tables.Figure], folder: Path) -> list[Path]:
+    """Draw figures in common looks as FOLDER/<name>.png; return the paths."""
+    styles = common_looks(figures.values())
+    return [style.save(draw(one, styles), folder / f"{name}.png") for name, one in figures.items()]
 
 
 def common_looks(figures: Iterable[tables.Figure]) -> Looks:
@@ -54,8 +44,8 @@ def common_looks(figures: Iterable[tables.Figure]) -> Looks:
     groups = []
     for figure in figures:
         if isinstance(figure, LineFigure):
-            groups.append([line.label for row in figure.rows for p in row for line in p.lines])
-        elif isinstance(figure, FrameFigure) and figure.kind in ("histogram", "scatter"):
+            groups.append([line.label for panel in figure.panels for line in panel.lines])
+        elif isinstance(figure, FrameFigure) and figure.kind == "histogram":
             groups.append(list(figure.frame["design"].unique()))
     return style.looks(groups)
 
@@ -65,8 +55,10 @@ def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
     styles = styles or common_looks([figure])
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
+    if isinstance(figure, FrameFigure) and figure.kind == "matrix":
+        return matrix_figure(figure)
     if isinstance(figure, FrameFigure):
-        return FRAMES[figure.kind](figure, styles)
+        return histogram_figure(figure, styles)
     return design_figure(figure)
 
 
@@ -91,71 +83,11 @@ def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") ->
 
 
 def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
-    """Return the panels of curves.
-
-    Names stand where the curves end, in the last panel of each row that shows them; or in a legend
-    beside it, where curves end anywhere. Panels of one quantity share its axis.
-    """
-    rows, columns = len(figure.rows), max(map(len, figure.rows))
-    styles = styles or common_looks([figure])
-    names = [line.label for row in figure.rows for panel in row for line in panel.lines]
-    width = (4.4 if columns > 1 else 6.5) + 2.4 / columns  # with the names beside them
-    width = max(width, LEAST + style.width_of_names(names))
-    drawn, grid = _grid(figure.title, (rows, columns), (width, PANEL + 0.4))
-    for row, panels in zip(grid, figure.rows, strict=True):
-        for axes in row[len(panels) :]:
-            axes.set_visible(False)
-        for axes, panel in zip(row, panels):
-            _draw_panel(axes, panel, styles)
-    _share_axes(grid, figure.rows)
-    for row, panels in zip(grid, figure.rows, strict=True):
-        _name_curves(row, panels)
-    return drawn
-
-
-def _share_axes(grid: np.ndarray, rows: Sequence[Sequence[Panel]]) -> None:
-    """Let panels below each other share x, and those beside each other y, of one quantity each."""
-    for row, panels in zip(grid, rows, strict=True):
-        for axes, panel in zip(row[1:], panels[1:]):
-            same = panel.y_label == panels[0].y_label
-            if same and axes.get_yscale() == row[0].get_yscale():
-                axes.sharey(row[0])
-                row[0].autoscale(axis="y")
-                if row[0].get_yscale() == "linear" and row[0].get_ylim()[0] > 0.0:
-                    row[0].set_ylim(bottom=0.0)
-    for j, column in enumerate(grid.T):
-        shown = [(axes, row[j]) for axes, row in zip(column, rows, strict=True) if j < len(row)]
-        for axes, panel in shown[1:]:
-            first, one = shown[0]
-            if panel.x_label == one.x_label and axes.get_xscale() == first.get_xscale():
-                limits = [v for a in (first, axes) for v in a.get_xlim()]
-                axes.sharex(first)
-                first.set_xlim(min(limits), max(limits))
-
-
-def _name_curves(row: Sequence[Axes], panels: Sequence[Panel]) -> None:
-    """Write the names of a row's curves, each once."""
-    last = len(panels) - 1
-    left = dict.fromkeys(line.label for panel in panels for line in panel.lines)
-    if all(list(left) == [panel.title] for panel in panels):  # the title says it
-        return
-    if all(style.ends_right(axes) for axes in row[: last + 1] if axes.lines):
-        for k in range(last, -1, -1):
-            mine = {line.label for line in panels[k].lines} & set(left)
-            style.label_ends(row[k], PANEL - 0.7, mine)
-            left = {name: None for name in left if name not in mine}
-        return
-    handles = {line.get_label(): line for axes in row[::-1] for line in axes.lines}
-    names = list(map(style.shortened, left))
-    row[last].legend([handles[name] for name in left], names, **LEGEND, bbox_to_anchor=(1.0, 1.02))
-
-
-def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     """Return the panels below each other, each with its legend below: legible on a phone.
 
     Their left edges are one line.
     """
-    panels = [panel for row in figure.rows for panel in row]
+    panels = figure.panels
     styles = styles or common_looks([figure])
     heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
     drawn = style.new_figure(NARROW, sum(heights), 160)
@@ -163,7 +95,8 @@ def column_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     for axes, panel in zip(grid, panels, strict=True):
         _draw_panel(axes, panel, styles)
         if panel.lines and [line.label for line in panel.lines] != [panel.title]:
-            axes.legend(**LEGEND, bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
+            names = [style.shortened(line.label) for line in panel.lines]
+            axes.legend(axes.lines, names, **LEGEND, bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
     drawn.align_ylabels(list(grid))
     return drawn
 
@@ -179,13 +112,15 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
     y = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
     x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
     wide = bool(len(y)) and panel.y_log is not False and style.spans_decade(y)
-    if wide or (panel.y_log and len(y) and y.min() > 0.0):
+    if panel.log:
+        axes.set(xscale="log", yscale="log")
+    elif wide or (panel.y_log and len(y) and y.min() > 0.0):
         style.log_scale(axes, y)
     elif len(y) and y.min() >= 0.0 and y.min() < 0.5 * y.max():
         axes.set_ylim(bottom=0.0)
     if panel.x_log2 and len(x) and x.min() > 0.0:
         style.log2_scale(axes)
-    elif len(x) and (x % 1 == 0).all():
+    elif len(x) and (x % 1 == 0).all() and not panel.log:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if any(len(line.x) > FEW for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
@@ -196,7 +131,7 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
 # -- tables and samples ------------------------------------------------------------------------
 
 
-def matrix_figure(figure: FrameFigure, styles: Looks) -> Figure:
+def matrix_figure(figure: FrameFigure) -> Figure:
     """Return heat maps with their numbers: design i in scenario j.
 
     Columns: "made for ...", what designs i were made for; their values, one for each j; panel.
@@ -219,53 +154,6 @@ def matrix_figure(figure: FrameFigure, styles: Looks) -> Figure:
         ends = {(False, False): "neither", (True, False): "min", (False, True): "max"}
         beyond = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
         drawn.colorbar(image, ax=axes, shrink=0.8, extend=ends.get(beyond, "both"))
-    return drawn
-
-
-def tornado_figure(figure: FrameFigure, styles: Looks) -> Figure:
-    """Return bars from the lowest to the highest value, the most telling key on top.
-
-    Columns: design, quantity, key, and the changes at both ends.
-    """
-    panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
-    count = max(len(bars) for _, bars in panels)
-    drawn, grid = _grid(figure.title, (len(panels), 1), (8.4, 1.1 + 0.45 * count))
-    for axes, ((design, quantity), bars) in zip(grid[:, 0], panels, strict=True):
-        place = np.arange(len(bars))
-        # The second is narrower: both may point the same way.
-        for label, width, colour in zip(bars.columns[-2:], (0.7, 0.4), PALETTE):
-            axes.barh(place, bars[label], width, color=colour, label=label.removesuffix(" [%]"))
-        axes.set_yticks(place, bars["key"])
-        axes.invert_yaxis()
-        axes.axvline(0.0, color="black", linewidth=0.8)
-        _label(axes, f"{design}: {quantity}", "change [%]")
-        axes.grid(True, axis="x", alpha=0.3)
-    grid[0, 0].legend(frameon=False, fontsize=9, loc="best")
-    return drawn
-
-
-def bar_figure(figure: FrameFigure, styles: Looks) -> Figure:
-    """Return groups of bars with their intervals.
-
-    Columns: design, quantity, input, and for each group its value and both ends of its interval.
-    """
-    panels = list(figure.frame.groupby(["design", "quantity"], sort=False))
-    # A key in two lines takes half the width.
-    inputs = [label.replace(".", ".\n", 1) for label in figure.frame["input"].unique()]
-    place, columns = np.arange(len(inputs)), figure.frame["quantity"].nunique()
-    shape = len(panels) // columns, columns
-    drawn, grid = _grid(figure.title, shape, (1.5 + 1.1 * max(3, len(inputs)), 3.3), sharey=True)
-    for axes, ((design, quantity), bars) in zip(grid.flat, panels, strict=True):
-        for k, colour, shift in ((3, PALETTE[0], -0.2), (6, PALETTE[1], 0.2)):
-            value, low, high = bars.iloc[:, k : k + 3].to_numpy(dtype=float).T
-            ends = np.maximum([value - low, high - value], 0.0)
-            label = str(bars.columns[k]).partition(" [")[0]
-            axes.bar(place + shift, value, 0.36, yerr=ends, capsize=3, label=label, color=colour,
-                     alpha=0.8)  # fmt: skip
-        axes.set_xticks(place, inputs, fontsize=8, parse_math=False)
-        _label(axes, f"{design}: {quantity}", "", "share of the variance [-]")
-        axes.grid(True, axis="y", alpha=0.3)
-    grid[0, 0].legend(frameon=False, fontsize=9)
     return drawn
 
 
@@ -293,40 +181,6 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
             share.set_ylim(0.0, 1.0)
             share.set_ylabel("share of samples below [-]", color=GREY)
     return drawn
-
-
-def scatter_figure(figure: FrameFigure, styles: Looks) -> Figure:
-    """Return points, a row a quantity and a column an input.
-
-    Columns: design, the inputs, and two quantities.
-    """
-    from matplotlib.ticker import EngFormatter
-
-    inputs, quantities = figure.frame.columns[1:-2], figure.frame.columns[-2:]
-    designs = figure.frame.groupby("design", sort=False)
-    rows = [(design, what, own) for design, own in designs for what in quantities]
-    shape = len(rows), len(inputs)
-    drawn, grid = _grid(figure.title, shape, (3.2, 2.5), sharex="col", sharey="row")
-    for row, (design, what, own) in zip(grid, rows, strict=True):
-        for axes, name in zip(row, inputs, strict=True):
-            axes.plot(own[name], own[what], ".", color=styles[design]["color"], alpha=0.35,
-                      markersize=3)  # fmt: skip
-            axes.grid(True, alpha=0.3)
-            if own[name].abs().max() >= 1e4:  # 70 G rather than a power of ten in a corner
-                axes.xaxis.set_major_formatter(EngFormatter())
-        row[0].set_ylabel(f"{design}\n{what}", fontsize=9, parse_math=False)
-    for axes, name in zip(grid[-1], inputs, strict=True):
-        axes.set_xlabel(name, fontsize=9, parse_math=False)
-    return drawn
-
-
-FRAMES = {
-    "matrix": matrix_figure,
-    "tornado": tornado_figure,
-    "bars": bar_figure,
-    "histogram": histogram_figure,
-    "scatter": scatter_figure,
-}
 
 
 # -- designs ---------------------------------------------------------------------------------

@@ -14,14 +14,12 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.output.run_folder import Simulated
 from dolfinopt.profiling import Counts, Profile
-from dolfinopt.reduction import METHODS, BasisErrors, Options, basis_errors
 from dolfinopt.responses.evaluation import Evaluation, evaluate_batch
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import bodies_in
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import variants
 
-MODES = 3  # natural modes that `compare` looks at
 # These values of material and arms scale the integrals of the reduced arms; the thickness in the
 # plane alone: in space it is one of the cells' sides.
 SCALING = ("young_modulus", "density", "thickness")
@@ -71,37 +69,6 @@ def _basis(number: int, scene: Scene) -> Any:
     if reduction.coordinates == "auto":
         return number
     return reduction, scene.damping if reduction.method == "balanced" else None
-
-
-def compare(
-    scenes: Sequence[Scene], design: Path | None
-) -> Iterator[dict[str, BasisErrors] | ConvergenceError]:
-    """Compare one design's bases with those of `variants.REFERENCE` coordinates, on this rank.
-
-    As `simulate_scenarios`; yields by the arms' names what the first `MODES` modes and the
-    interface miss.
-    """
-    profile = Profile()
-    partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
-    richer = {}
-    for k, arm in arms.items():
-        arm.set_design(x_phys[k])
-        most = min(variants.REFERENCE, arm.elastic.num_dofs)
-        richer[k] = METHODS[variants.REFERENCE_METHOD].reduce(arm.elastic, Options(most), None)
-    for scene in scenes:
-        errors = {}
-        try:
-            arms = {k: arm.under(scene) for k, arm in arms.items()}
-            choose_coordinates(scene, partition, arms, x_phys, profile)
-            for k, arm in arms.items():
-                arm.reduce(x_phys[k])
-                assert arm.basis is not None
-                found = basis_errors(arm.elastic, arm.basis, richer[k], MODES)
-                errors[scene.arms[k].name] = found
-        except ConvergenceError as error:
-            yield error
-        else:
-            yield errors
 
 
 # -- samples ---------------------------------------------------------------------------------

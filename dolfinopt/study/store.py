@@ -19,19 +19,15 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 from uuid import uuid4
 
 import numpy as np
 from mpi4py import MPI
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Column
 
 from dolfinopt.disk import make_folder, write_text
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
@@ -42,12 +38,10 @@ from dolfinopt.output.run import optimize
 from dolfinopt.output.run_folder import write_result, write_simulation
 from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
-from dolfinopt.reduction import BasisErrors
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.simulate import (
-    compare,
     scales_bodies,
     simulate_samples,
     simulate_scenarios,
@@ -57,10 +51,8 @@ from dolfinopt.study.simulate import (
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
 SUMMARY, HISTORY = "summary.json", "history.csv"
 IDLE = 0.02  # s between two looks for a job
-TOLD = 0.5  # s between two looks at what is done
-FIGURES = ("objective", "compliance", "max_deviation", "max_deviation_time", "grayness",
-           "iterations", "stop_reason")  # fmt: skip
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
+FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
 
 # Cases of the same arms and design, which one rank does in one go: batches, each done at once.
 Job = Sequence[Sequence[Case]]
@@ -68,15 +60,14 @@ Job = Sequence[Sequence[Case]]
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a run keeps its cases.
+    """Folder of all cases, and of this run: jobs taken, why cases failed, what is not complete.
 
-    Attributes:
-        cases: folder of all cases.
-        work: folder of this run: jobs that are taken, why cases failed, what is not complete yet.
+    Of the cases that are `untold` this rank tells when they have ended, whoever does them.
     """
 
     cases: Path
     work: Path
+    untold: list[Case] = field(default_factory=list)
 
     def __getitem__(self, case: Case) -> Path:
         return self.cases / case.key
@@ -92,15 +83,17 @@ class _Place:
     def failure(self, case: Case) -> dict[str, Any]:
         """Return what the case left when it failed in this run, nothing if it did not."""
         path = self.work / f"{case.key}.json"
-        found: dict[str, Any] = json.loads(path.read_text("utf-8")) if path.exists() else {}
-        return found
+        return dict(json.loads(path.read_text("utf-8"))) if path.exists() else {}
 
-    def taken(self, case: Case) -> Path:
-        """Return the file that tells that the job whose first case this is has been taken."""
-        return self.work / f"{case.key}.taken"
+    def tell(self) -> None:
+        """Tell of cases that have ended meanwhile, a line each."""
+        for case in [case for case in self.untold if self.has(case)]:
+            self.untold.remove(case)
+            print(f"{_read(case, self)}; {len(self.untold)} to go", file=sys.stderr, flush=True)
 
     def check(self) -> None:
-        """Raise OthersFailed if another rank has failed."""
+        """Tell what has ended; raise OthersFailed if another rank has failed."""
+        self.tell()
         if (self.work / "stop").exists():
             raise OthersFailed("another rank failed")
 
@@ -111,17 +104,12 @@ def run_cases(
     """Do all cases that are not done yet, and those they depend on (collective).
 
     A case that fails to converge is reported in its outcome, and so are those that need its
-    design; it is tried again in the next run.
-
-    Args:
-        cases: any number, in any order, also repeated.
-        folder: DIR; no other run may work there.
-        world: all ranks, which share a file system.
-        shown: tell of the progress on the root's standard error.
+    design; it is tried again in the next run. Ranks share a file system; `shown`: the root tells
+    of every case on its standard error.
 
     Raises:
         InputError: a scene or design cannot be used, the others stay unfinished; another run works
-            in the folder, or it cannot be written.
+            in the folder DIR, or it cannot be written.
     """
     both = (one for case in cases for one in (case.design, case))
     wanted = list(dict.fromkeys(one for one in both if isinstance(one, Case)))
@@ -130,7 +118,8 @@ def run_cases(
         try:
             done = on_root(world, _begin, place, wanted)
             missing = [case for case, there in zip(wanted, done, strict=True) if not there]
-            with _told(missing, place, shown and world.rank == 0), together(world):
+            place.untold.extend(missing * (shown and world.rank == 0))
+            with together(world):
                 _share(_jobs(missing, world.size), place, world)
             with together(world):
                 outcomes = {case: _read(case, place) for case in wanted}
@@ -192,7 +181,7 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
                 continue
             left.remove(job)
             try:
-                place.taken(job[0][0]).touch(exist_ok=False)
+                (place.work / f"{job[0][0].key}.taken").touch(exist_ok=False)
             except FileExistsError:  # by another rank
                 continue
             _do(job, place)
@@ -206,6 +195,7 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
         ended = world.Ibarrier()
         while not ended.Test():  # asleep: waiting in MPI would keep the processor busy
             time.sleep(IDLE)
+        place.tell()
 
 
 def _is_ready(case: Case, place: _Place) -> bool:
@@ -228,7 +218,7 @@ def _do(job: Job, place: _Place) -> None:
     elif action == "sample":
         _sample(cases, design, place)
     else:
-        _examine(job, design, place)
+        _simulate(job, design, place)
 
 
 # -- what is done ----------------------------------------------------------------------------
@@ -253,11 +243,11 @@ def _optimise(case: Case, place: _Place) -> None:
     write_result(scene, folder, result, earlier + time.perf_counter() - begun, paraview=False)
 
 
-def _examine(job: Job, design: Path | None, place: _Place) -> None:
-    """Simulate or compare one design in many scenes."""
-    examine: Any = compare if job[0][0].action == "compare" else simulate_scenarios
-    found = examine([_unnamed(case) for batch in job for case in batch], design)
+def _simulate(job: Job, design: Path | None, place: _Place) -> None:
+    """Simulate one design in many scenes."""
+    found = simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
     for batch in job:
+        place.check()
         for case in batch:
             begun = time.perf_counter()
             result = next(found)
@@ -265,9 +255,6 @@ def _examine(job: Job, design: Path | None, place: _Place) -> None:
             part = place.work / case.key
             if isinstance(result, ConvergenceError):
                 place.fail(case, str(result))
-            elif isinstance(result, dict):
-                bases = [{"arm": arm, **_lists(vars(one))} for arm, one in result.items()]
-                _write_table(part, case, wall, bases=bases)
             else:
                 make_folder(part)
                 write_simulation(part, result, wall, paraview=False)
@@ -297,23 +284,19 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
                 worst = worst_instants(trajectory, trajectory.scene.objective.load_cases)
                 compliance = float(trajectory.compliance[worst].sum())
                 rows.append((compliance, *trajectory.max_deviation))
-        samples = _lists(dict(zip(SAMPLED, np.transpose(rows), strict=True)))
+        samples = dict(zip(SAMPLED, np.transpose(rows).tolist(), strict=True))
         if messages:
             place.fail(case, f"{len(messages)} samples", samples=samples, messages=messages)
         else:
-            _write_table(place[case], case, time.perf_counter() - begun, samples=samples)
+            folder, wall = place[case], time.perf_counter() - begun
+            make_folder(folder)
+            more = {"seconds": {"total": wall}, "versions": versions(), "scene": scene.to_dict()}
+            write_summary(folder, {"name": case.key, "samples": samples, **more})
 
 
 def _unnamed(case: Case) -> Scene:
     """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
     return case.scene.model_copy(update={"name": case.key})
-
-
-def _write_table(folder: Path, case: Case, wall: float, **results: Any) -> None:
-    """Write the summary of a case that has no other files."""
-    make_folder(folder)
-    more = {"seconds": {"total": wall}, "versions": versions(), "scene": case.scene.to_dict()}
-    write_summary(folder, {"name": case.key, **results, **more})
 
 
 def _read(case: Case, place: _Place) -> Outcome:
@@ -322,70 +305,11 @@ def _read(case: Case, place: _Place) -> Outcome:
     data = failed or json.loads((place[case] / SUMMARY).read_text("utf-8"))
     found: dict[str, Any] = {"failure": failed.get("message", "")}
     if case.action == "sample":
-        found["samples"] = _arrays(data.get("samples", {}))
+        samples = data.get("samples", {})
+        found["samples"] = {name: np.array(values, float) for name, values in samples.items()}
         found["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
-    elif not failed and case.action == "compare":
-        found["bases"] = {one.pop("arm"): BasisErrors(**_arrays(one)) for one in data["bases"]}
     elif not failed:
         found |= {name: data[name] for name in FIGURES}
     if not failed:
         found["seconds"] = data["seconds"]["total"]
     return Outcome(case, place[case], **found)
-
-
-def _lists(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    return {name: array.tolist() for name, array in arrays.items()}
-
-
-def _arrays(lists: Mapping[str, list[float]]) -> dict[str, np.ndarray]:
-    return {name: np.array(values, float) for name, values in lists.items()}
-
-
-# -- progress --------------------------------------------------------------------------------
-
-
-@contextmanager
-def _told(missing: Sequence[Case], place: _Place, shown: bool) -> Iterator[None]:
-    """Tell of every case when it has ended, on a terminal also how far the others are."""
-    # A thread looks at the files of all ranks; nothing that is computed depends on it.
-    if not (shown and missing):
-        yield
-        return
-    words = TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1))
-    columns, console = (words, BarColumn(bar_width=20), TimeElapsedColumn()), Console(stderr=True)
-    display = Progress(*columns, expand=True, console=console, disable=not console.is_terminal)
-    total, left, ended = len(missing), list(missing), Event()
-    task = display.add_task(f"0/{total} cases", total=total)
-
-    def look() -> None:
-        for case in [case for case in left if place.has(case)]:
-            left.remove(case)
-            count = f"{total - len(left):>{len(str(total))}}/{total}"
-            print(f"{count}  {_read(case, place)}", file=sys.stderr, flush=True)
-        text = "; ".join([f"{total - len(left)}/{total} cases", *_running(left, place)])
-        display.update(task, completed=total - len(left), description=text)
-
-    def watch() -> None:
-        while not ended.wait(TOLD):
-            look()
-
-    watcher = Thread(target=watch, name="progress", daemon=True)
-    with display:
-        watcher.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            watcher.join()
-            look()
-
-
-def _running(left: Iterable[Case], place: _Place) -> Iterator[str]:
-    """Yield how far the optimisations are that ranks are at."""
-    for case in left:
-        if case.action == "optimize" and place.taken(case).exists():
-            with suppress(OSError):
-                if rows := (place[case] / HISTORY).read_text("utf-8").split("\n")[1:-1]:
-                    iteration, objective, *_ = rows[-1].split(",")
-                    limit = case.scene.optimizer.max_iterations
-                    yield f"{case.label}: {iteration}/{limit} objective {float(objective):.4g}"

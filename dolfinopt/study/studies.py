@@ -25,8 +25,7 @@ from dolfinopt.output.design import arms_with_design, read_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import need_of
-from dolfinopt.study.cases import Action, Case, Outcome, Outcomes
+from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.tables import (
     DesignFigure,
@@ -42,7 +41,6 @@ from dolfinopt.study.tables import (
 )
 from dolfinopt.study.variants import (
     COORDINATES,
-    METHODS,
     OBJECTIVES,
     RESPONSES,
     Vary,
@@ -67,15 +65,10 @@ COMPLIANCE, DEVIATION = QUANTITIES = ("compliance [N m]", "maximal deviation [mm
 RANGES = {"payload": "payload.mass=4:8:9", "flattening": "motion.flattening=0:1:9"}
 SWEPT = (4, 6, 8, 12, 16, 24, 48)  # coordinates of "coordinates"
 OPTIMISED = (4, 12, 48)  # coordinates of "reduction"
-COMPARED = (4, 12)
 # These tables say how a design is found and nothing about what a given one does.
 FOR_OPTIMISATION = ("design", "constraints", "optimizer")
 RESIZING = r"^arms\.(.+\.)?(length|height)$"
 MADE = "made for it"  # the design that was optimised for the scenario it is simulated in
-# Loads at the outboard interface that bend or twist an arm, and their places among all of them.
-BENDING = {"tip compliance lost, F_y [%]": 1, "moment [%]": 2}
-BENDING_IN_SPACE = {"tip compliance lost, F_y [%]": 1, "F_z [%]": 2, "M_x [%]": 3, "M_y [%]": 4,
-                    "M_z [%]": 5}  # fmt: skip
 
 
 # -- the run ---------------------------------------------------------------------------------
@@ -111,8 +104,7 @@ def study(
     """Do a study (collective); the result is the same on all ranks.
 
     Args:
-        scene: what is varied.
-        preset: which study; None: a sweep over `vary` alone.
+        scene, preset: what is varied; which study, None for a sweep over `vary` alone.
         vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
         folder, world, shown: see `run_cases`.
@@ -140,25 +132,20 @@ def tabulated(plan: Plan, outcomes: Outcomes) -> pd.DataFrame:
     found = [outcomes[case] for _, case in plan.rows]
     results = pd.DataFrame(
         {
-            "label": [one.case.label for one in found],
-            COMPLIANCE: [one.compliance for one in found],
-            DEVIATION: [1e3 * one.max_deviation for one in found],
-            "at [s]": [one.max_deviation_time for one in found],
-            "grayness [-]": [one.grayness for one in found],
-            "iterations": [one.iterations for one in found],
-            "seconds": [one.seconds for one in found],
-            "ended by": [_ended(one) for one in found],
-            "failure": [one.failure for one in found],
-            "outcome": pd.Series(found, dtype=object),
+            "label": one.case.label,
+            COMPLIANCE: one.compliance,
+            DEVIATION: 1e3 * one.max_deviation,
+            "at [s]": one.max_deviation_time,
+            "grayness [-]": one.grayness,
+            "iterations": one.iterations,
+            "seconds": one.seconds,
+            "ended by": f"failed: {one.failure}" if one.failure else one.stopped,
+            "failure": one.failure,
+            "outcome": one,
         }
+        for one in found
     )
     return pd.concat([pd.DataFrame([labels for labels, _ in plan.rows]), results], axis=1)
-
-
-def _ended(outcome: Outcome) -> str:
-    """Return why an optimisation stopped, or what failed."""
-    stopped = outcome.stop_reason if outcome.case.action == "optimize" else ""
-    return f"failed: {outcome.failure}" if outcome.failure else stopped
 
 
 def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
@@ -179,9 +166,8 @@ def _plan(
     """Check what is asked and plan it (root only)."""
     asked = [parse_vary(text) for text in vary]
     keys = [one.key for one in asked]
-    for key in keys:
-        if keys.count(key) > 1:
-            raise InputError(f"--vary {key} twice; give all its values in one")
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise InputError(f"--vary {twice[0]} twice; give all its values in one")
     if preset in ("objective", "reduction", "coordinates"):
         command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
         for one in asked:
@@ -237,38 +223,32 @@ def by_design(
 ) -> pd.DataFrame:
     """Return the columns `index`, and each design's `results` in columns beside one another.
 
-    Args:
-        frame: with a column "design"; all designs have the same rows, in one order.
-        index: columns of what was varied.
-        results: columns.
+    All designs, column "design", have the same rows, in one order.
     """
     parts = {name: part.reset_index() for name, part in frame.groupby("design", sort=False)}
     wide = next(iter(parts.values()))[[*index]].copy()
     for name, part in parts.items():
         for what in results:
-            wide[f"{name}: {what}"] = part[what]
+            wide[": ".join(filter(None, (name, what)))] = part[what]
     return wide
 
 
 def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> tuple[Line, ...]:
-    """Return a line for each value of the column `by`, columns y against x.
-
-    Its name is the value, of a number with the `label` before it.
-    """
+    """Return columns y against x by the column `by`: a value, a number with the label before it."""
     return tuple(
         Line(f"{label}{value:g}" if label else str(value), part[x].to_numpy(), part[y].to_numpy())
         for value, part in frame.groupby(by, sort=False)
     )
 
 
-def deviation_panels(title: str, found: Sequence[Outcome]) -> list[tuple[Panel, ...]]:
+def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
     """Return the deviation over time; designs of another magnitude get a panel of their own."""
-    rows: list[tuple[Panel, ...]] = []
+    panels = []
     for group in magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
         curves = [(one.case.label, *one.deviation()) for one in group]
         lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
-        rows.append((Panel(title, "time [s]", "deviation [mm]", lines),))
-    return rows
+        panels.append(Panel("", "time [s]", "deviation [mm]", lines))
+    return panels
 
 
 def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
@@ -340,7 +320,7 @@ def _sweep(
 ) -> Rows:
     """Return all scenarios of the keys' values for every design."""
     # Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
-    # "made for" in scenario "point", where it fits their arms; "optimum" its optimisation.
+    # "made for" in scenario "point", where it fits their arms.
     swept = ", ".join(vary.key for vary in keys)
     points, labels, columns = [], [], []
     for j, values in enumerate(product(*(vary.values for vary in keys))):
@@ -363,7 +343,6 @@ def _sweep(
         if fits:
             rows += [row("crossed", f"made for {labels[i]}", optima[i], j, i)
                      for i, j in product(every, every)]  # fmt: skip
-            rows += [({"role": "optimum", **columns[j]}, optima[j]) for j in every]
     return rows
 
 
@@ -384,8 +363,8 @@ def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -
     return tables, figures
 
 
-def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[tuple[Panel, ...], ...]:
-    """Return a column a quantity; designs share a row where they are of one magnitude."""
+def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[Panel, ...]:
+    """Return panels by quantity; designs share one where they are of one magnitude."""
     names, x = list(shown["design"].unique()), keys[0].axis
     by, label, groups = "design", "", [[name] for name in names]
     if len(keys) == 1:
@@ -393,11 +372,11 @@ def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[tuple[Pane
         groups = magnitudes(names, lambda name: float(largest[name]), 3.0)
     else:
         by, label = keys[1].axis, f"{keys[1].key} = "
-    rows = []
+    panels = []
     for group in groups:
         own, title = shown[shown["design"].isin(group)], group[0] if len(group) == 1 else ""
-        rows.append(tuple(Panel(title, x, y, lines_by(own, by, x, y, label)) for y in QUANTITIES))
-    return tuple(rows)
+        panels += [Panel(title, x, y, lines_by(own, by, x, y, label)) for y in QUANTITIES]
+    return tuple(panels)
 
 
 def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
@@ -416,10 +395,7 @@ def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
         tables.append(square_table(f"{name}_loss", lost, axis, labels, loss))
         losses[f"loss of {quantity} [%]"] = tables[-1]
     title = "What a design loses where it was not made for"
-    figures: list[Figure] = [square_figure(joined(prefix, "cross"), title, losses)]
-    if optima := _good(frame.loc[frame["role"] == "optimum", "outcome"]):
-        figures.append(design_figure(joined(prefix, "designs"), "Designs by scenario", optima))
-    return tables, figures
+    return tables, [square_figure(joined(prefix, "cross"), title, losses)]
 
 
 def square_table(
@@ -459,9 +435,7 @@ def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
             rows += [(base["design"], what.partition(" [")[0], *bar) for bar in bars]
     title = "Change at both ends of each key, the others as in the scene."
     columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
-    table = pd.DataFrame(rows, columns=columns)
-    figures.insert(0, FrameFigure("tornado", title, "tornado", table))
-    return [Table("", title, table), *tables], figures
+    return [Table("", title, pd.DataFrame(rows, columns=columns)), *tables], figures
 
 
 # -- objectives ------------------------------------------------------------------------------
@@ -490,17 +464,7 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     whole = pd.concat([frame[["label", *QUANTITIES, "at [s]"]], measures, frame[rest]], axis=1)
     title = "Designs optimised for every objective, simulated in the scene."
     table = Table("", title, whole.rename(columns={"label": "objective"}))
-    good = _good(frame["outcome"])
-    dynamic = [o for o in good if o.case.action == "optimize" and need_of(o.case.scene, "motion")]
-    others = [o for o in good if o not in dynamic]
-    panels = [
-        *deviation_panels("initial, static, eigenfrequency", others),
-        *deviation_panels("made for the loads of the motion", dynamic),
-    ]
-    return [table], [
-        LineFigure("deviation", "Deviation of the end-effector", tuple(panels)),
-        design_figure("designs", "Designs by objective", good),
-    ]
+    return [table], [design_figure("designs", "Designs by objective", _good(frame["outcome"]))]
 
 
 def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, float]:
@@ -521,52 +485,35 @@ def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, fl
 
 def coordinates_plan(scene: Scene, designs: Sequence[Path], counts: Sequence[int] | None) -> Plan:
     """Plan given designs, simulated with every method and number of coordinates."""
-    given = given_designs(scene, designs)
-    rows = _by_reduction("given", given, reductions(scene, counts, SWEPT), "simulate", "")
-    return Plan("coordinates", rows, partial(_coordinates, name=""))
-
-
-def _by_reduction(
-    role: str, given: Mapping[str, Design], scenes: Sequence[Scene], action: Action, words: str
-) -> Rows:
-    """Return every design with every reduction."""
-    return [
+    rows = [
         (
-            {"role": role, "design": label, **_reduction(scene)},
-            Case(scene, action, design, f"{label}, {words}{reduction_name(scene)}"),
+            {"design": label, **_reduction(other)},
+            Case(other, "simulate", design, f"{label}, {reduction_name(other)}"),
         )
-        for label, design in given.items()
-        for scene in scenes
+        for label, design in given_designs(scene, designs).items()
+        for other in reductions(scene, counts, SWEPT)
     ]
+    return Plan("coordinates", rows, _coordinates)
 
 
 def _reduction(scene: Scene) -> dict[str, Any]:
     return {"method": scene.reduction.method, "coordinates": scene.reduction.coordinates}
 
 
-def _coordinates(frame: pd.DataFrame, name: str) -> Report:
+def _coordinates(frame: pd.DataFrame) -> Report:
     title = "Given designs against the number of elastic coordinates of each arm."
-    table = Table(name, title, by_design(frame, ["method", "coordinates"]))
-    rows = []
-    x_label = "elastic coordinates of each arm [-]"
-    for label, design in frame.groupby("design", sort=False):
-        lines = {what: lines_by(design, "method", "coordinates", what) for what in QUANTITIES}
-        rows.append(tuple(Panel(str(label), x_label, *one, x_log2=True) for one in lines.items()))
-    figures: list[Figure] = [LineFigure(name, title, tuple(rows))]
-    # The last design's deviation with the fewest and the most coordinates.
-    found = []
-    for method, part in design.groupby("method", sort=False):
-        for outcome in dict.fromkeys(part["outcome"].iloc[[0, -1]]):
-            if method in METHODS[:2]:
-                case = replace(outcome.case, label=reduction_name(outcome.case.scene))
-                found.append(replace(outcome, case=case))
-    if panels := deviation_panels(str(label), _good(found)):
-        figures.append(LineFigure("deviation", "Deviation of the end-effector", tuple(panels)))
-    return [table], figures
+    x = "elastic coordinates of each arm [-]"
+    panels = tuple(
+        Panel(str(label), x, y, lines_by(one, "method", "coordinates", y), x_log2=True)
+        for label, one in frame.groupby("design", sort=False)
+        for y in QUANTITIES
+    )
+    table = Table("", title, by_design(frame, ["method", "coordinates"]))
+    return [table], [LineFigure("", title, panels)]
 
 
 def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
-    """Plan designs optimised with every reduction, simulated with the reference; and the sweep."""
+    """Plan designs optimised with every reduction, simulated with the reference."""
     reference = reference_scene(scene)
     called = reduction_name(reference)
     rows: Rows = []
@@ -575,31 +522,13 @@ def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
         again = Case(reference, "simulate", made, f"{made.label} in {called}")
         known = _reduction(other)
         rows += [({"role": "own", **known}, made), ({"role": "again", **known}, again)]
-    rows += coordinates_plan(scene, (), None).rows
-    compared = reductions(scene, None, COMPARED)
-    rows += _by_reduction("compared", given_designs(scene, ()), compared, "compare", "basis of ")
     return Plan("reduction", rows, partial(_reductions, called=called))
 
 
 def _reductions(frame: pd.DataFrame, called: str) -> Report:
+    """Return the designs' results in their own model and in the reference."""
     parts = {role: part.reset_index() for role, part in frame.groupby("role")}
     own, again = parts["own"], parts["again"]
-    tables, figures = _coordinates(parts["given"], "coordinates")
-    tables = [_reduction_table(own, again, called), *tables, _bases(parts["compared"], called)]
-    title = f"Designs optimised with every reduction, simulated with {called}"
-    pairs = zip(own["outcome"], again["outcome"], strict=True)
-    simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
-    if panels := deviation_panels("", simulated):
-        figures.append(LineFigure("optimised_deviation", title, tuple(panels)))
-        figures.append(design_figure("designs", title, simulated))
-    if good := _good(own["outcome"]):
-        panels = tuple((panel,) for panel in convergence(good))
-        figures.append(LineFigure("convergence", "Convergence", panels))
-    return tables, figures
-
-
-def _reduction_table(own: pd.DataFrame, again: pd.DataFrame, called: str) -> Table:
-    """Return the designs' results in their own model and in the reference."""
     ended = own["ended by"].where((own["failure"] != "") | (again["failure"] == ""),
                                   again["ended by"])  # fmt: skip
     known = {"method": own["method"], "coordinates": own["coordinates"]}
@@ -610,30 +539,13 @@ def _reduction_table(own: pd.DataFrame, again: pd.DataFrame, called: str) -> Tab
         f"maximal deviation, {called} [mm]": again[DEVIATION],
     }
     rest = {name: own[name] for name in ("grayness [-]", "iterations", "seconds")}
-    title = f"Designs optimised with every reduction, simulated with {called} as well."
-    return Table("", title, pd.DataFrame(known | compared | rest | {"ended by": ended}))
-
-
-def _bases(compared: pd.DataFrame, called: str) -> Table:
-    """Return what the bases miss of the reference's."""
-    rows = []
-    for row in compared.to_dict("records"):
-        for arm, b in row["outcome"].bases.items():
-            frequency, mac = ([*v, math.nan, math.nan, math.nan][:3] for v in (b.frequency, b.mac))
-            known = {"design": row["design"], "arm": arm, "method": row["method"]}
-            known["coordinates"] = row["coordinates"]
-            known |= {f"frequency {k} off by [%]": _percent(v) for k, v in enumerate(frequency, 1)}
-            known |= {f"MAC {k} [-]": round(value, 6) for k, value in enumerate(mac, 1)}
-            known["largest angle [deg]"] = round(math.degrees(max(b.angle)), 4)
-            loads = BENDING if len(b.compliance) == 3 else BENDING_IN_SPACE
-            rows.append(known | {name: _percent(b.compliance[i]) for name, i in loads.items()})
-    title = f"What the bases miss of {called}: first natural modes and tip."
-    return Table("bases", title, pd.DataFrame(rows))
-
-
-def _percent(share: float) -> float:
-    """Return a share in per cent, without the noise of rounding."""
-    return round(100.0 * share, 4) + 0.0
+    title = f"Designs optimised with every reduction, simulated with {called}"
+    table = Table(
+        "", f"{title} as well.", pd.DataFrame(known | compared | rest | {"ended by": ended})
+    )
+    pairs = zip(own["outcome"], again["outcome"], strict=True)
+    simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
+    return [table], [design_figure("designs", title, simulated)] * bool(simulated)
 
 
 def convergence(found: Sequence[Outcome]) -> tuple[Panel, Panel]:

@@ -82,6 +82,7 @@ class Panel:
         lines: curves.
         x_log2: numbers that are doubled rather than added to, as those of coordinates.
         y_log: logarithmic y although the values span no decade; False: never logarithmic.
+        log: both axes logarithmic.
     """
 
     title: str
@@ -90,26 +91,26 @@ class Panel:
     lines: tuple[Line, ...]
     x_log2: bool = False
     y_log: bool | None = None
+    log: bool = False
 
 
 @dataclass(frozen=True)
 class LineFigure:
-    """Panels in rows; the curves of a name look alike in all of them."""
+    """Panels below one another; the curves of a name look alike in all of them."""
 
     name: str
     title: str
-    rows: tuple[tuple[Panel, ...], ...]
+    panels: tuple[Panel, ...]
 
     def csv(self) -> str:
         """Return all curves: a row a point."""
-        panels = [panel for row in self.rows for panel in row]
         points = [
             (panel.title, line.label, float(x), float(y))
-            for panel in panels
+            for panel in self.panels
             for line in panel.lines
             for x, y in zip(line.x, line.y, strict=True)
         ]
-        labels = {(panel.x_label, panel.y_label) for panel in panels}
+        labels = {(panel.x_label, panel.y_label) for panel in self.panels}
         axes = labels.pop() if len(labels) == 1 else ("x", "y")
         return Table("", "", pd.DataFrame(points, columns=["panel", "line", *axes])).csv()
 
@@ -125,11 +126,11 @@ class DesignFigure:
 
 @dataclass(frozen=True, eq=False)
 class FrameFigure:
-    """A figure of a data frame; see `figures.FRAMES` for the columns that each kind needs."""
+    """A figure of a data frame; `figures` says which columns each kind needs."""
 
     name: str
     title: str
-    kind: Literal["matrix", "tornado", "bars", "histogram", "scatter"]
+    kind: Literal["matrix", "histogram"]
     frame: pd.DataFrame
 
 

@@ -22,6 +22,7 @@ from dolfinopt.scene.tables.base import without_none
 from dolfinopt.study import statistics as stats
 from dolfinopt.study.cases import Case
 from dolfinopt.study.simulate import scales_bodies, with_sample
+from dolfinopt.study.store import SAMPLED
 from dolfinopt.study.studies import (
     QUANTITIES,
     Design,
@@ -38,6 +39,7 @@ from dolfinopt.study.variants import asked_by, axis_of, changed
 TABLES = (
     "motion", "control", "closure", "payload", "damping", "material", "arms", "interpolation",
 )  # fmt: skip
+RESULTS = (*QUANTITIES, "at [s]")
 LEAST = 10  # samples: fewer tell nothing of the scatter
 CHUNK = 25  # samples that an interruption may cost
 REDUCED = 5  # of those that are meshed and reduced anew, which take longer
@@ -103,8 +105,7 @@ def study_random(
     Args:
         scene: with the nominal values; its scenarios are left out.
         random: texts "key.path=distribution", see `statistics.parse_distribution`.
-        designs: design.npz files in place of the initial and the optimised design.
-        folder, world, shown: see `run_cases`.
+        designs, folder, world, shown: see `studies.study`.
         sampling: how many samples, and how they are drawn.
 
     Raises:
@@ -133,14 +134,12 @@ def _plan(
     nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
     inputs = tuple(parse_input(nominal, text) for text in random)
     keys = [one.key for one in inputs]
-    for key in keys:
-        if keys.count(key) > 1:
-            raise InputError(f"--random {key} twice; a value has one distribution")
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise InputError(f"--random {twice[0]} twice; a value has one distribution")
     values = stats.draw([one.distribution for one in inputs], sampling.points(len(inputs)))
     samples = sample_texts(keys, values)
-    for column in values.T:  # what is refused is so at the ends, mostly
-        for index in (int(np.argmin(column)), int(np.argmax(column))):
-            with_sample(nominal, samples[1 + index], 1 + index)
+    for index in (*values.argmin(axis=0), *values.argmax(axis=0)):  # refused, it is so there mostly
+        with_sample(nominal, samples[1 + index], 1 + index)
     cases = [
         case
         for label, design in given_designs(scene, designs).items()
@@ -172,13 +171,11 @@ def sample_cases(
 
 
 def parse_input(scene: Scene, text: str) -> Input:
-    """Return what "key.path=distribution" asks for.
-
-    Distributions without bounds of their own are cut off where the key's range ends.
+    """Return what "key.path=distribution" asks for, cut off where the key's range ends.
 
     Raises:
         InputError: there is no such key or distribution, the key is no number, has no influence
-            or changes the arms' size; or the distribution leaves its range.
+            or changes the arms' size; or the distribution has bounds that leave its range.
     """
     key, equals, law = (part.strip() for part in text.partition("="))
     if not key or not equals:
@@ -253,12 +250,7 @@ def _report(
         figures.append(FrameFigure("", title, "histogram", shown))
         if several:
             tables.append(_indices_table(samples, inputs, sampling))
-            title = f"Sobol' indices with {INTERVAL}"
-            figures.append(FrameFigure("indices", title, "bars", tables[-1].frame))
-        points = drawn.loc[drawn["sample"] > 0, ["design", *axes, *QUANTITIES]]
-        figures.append(FrameFigure("scatter", "Samples by each random value", "scatter", points))
-    results = (*QUANTITIES, "at [s]")
-    wide = by_design(samples[samples["sample"] > 0], ["sample", *axes], results)
+    wide = by_design(samples[samples["sample"] > 0], ["sample", *axes], RESULTS)
     return [*tables, Table("", "All samples.", wide, long=True)], figures
 
 
@@ -270,12 +262,9 @@ def _samples(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -
     parts = []
     for design, own in frame.groupby("design", sort=False):
         found = pd.concat([pd.DataFrame(o.samples) for o in own["outcome"]], ignore_index=True)
-        results = {
-            QUANTITIES[0]: found["compliance"],
-            QUANTITIES[1]: 1e3 * found["max_deviation"],
-            "at [s]": found["max_deviation_time"],
-        }
-        parts.append(known.assign(design=design, **results))
+        found = found.rename(columns=dict(zip(SAMPLED, RESULTS)))
+        found[QUANTITIES[1]] *= 1e3
+        parts.append(pd.concat([known.assign(design=design), found], axis=1))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -297,19 +286,17 @@ def _input_table(inputs: Sequence[Input]) -> Table:
 
 def _statistics_table(samples: pd.DataFrame, used: int) -> Table:
     """Return all statistics, designs beside one another."""
-    parts = []
-    for what in QUANTITIES:
-        columns: dict[str, dict[str, float]] = {}
-        for design, own in samples.groupby("design", sort=False):
+    ends, rows = ("", "from", "to"), []
+    for design, own in samples.groupby("design", sort=False):
+        for what in QUANTITIES:
             values = own[what].to_numpy()
             found = {"nominal": (values[0], math.nan, math.nan), **stats.statistics(values[1:])}
-            for k, end in enumerate(("", ": from", ": to")):
-                columns[f"{design}{end}"] = {name: one[k] for name, one in found.items()}
-        part = pd.DataFrame(columns).rename_axis("statistic").reset_index()
-        part.insert(0, "quantity", what)
-        parts.append(part)
+            for name, one in found.items():
+                known = {"design": design, "quantity": what, "statistic": name}
+                rows.append(known | dict(zip(ends, one)))
     title = f"Designs under {used} samples, with {INTERVAL} as for independent samples."
-    return Table("statistics", title, pd.concat(parts, ignore_index=True))
+    wide = by_design(pd.DataFrame(rows), ["quantity", "statistic"], ends)
+    return Table("statistics", title, wide)
 
 
 def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input], sampling: Sampling) -> Table:

@@ -88,18 +88,16 @@ def parse_vary(text: str) -> Vary:
     Raises:
         InputError: it is neither.
     """
-    remedy = f"--vary {text}: expected key.path=start:stop:count or key.path=a,b,c with numbers"
-    key, equals, values = (part.strip() for part in text.partition("="))
-    if not key or not equals:
-        raise InputError(f"{remedy}, for example payload.mass=4:8:9")
-    if ":" not in values:
-        found = [value.strip() for value in values.split(",")]
-        if not all(map(_is_number, found)):
-            raise InputError(remedy)
-        return Vary(key, tuple(dict.fromkeys(found)), text)
-    parts = [part.strip() for part in values.split(":")]
-    if len(parts) != 3 or not all(map(_is_number, parts[:2])) or not parts[2].isdigit():
-        raise InputError(remedy)
+    key, _, values = (part.strip() for part in text.partition("="))
+    parts, is_range = [part.strip() for part in re.split("[:,]", values)], ":" in values
+    shape = len(parts) == 3 and parts[2].isdigit() and "," not in values if is_range else True
+    if not key or not shape or not all(map(_is_number, parts)):
+        raise InputError(
+            f"--vary {text}: expected key.path=start:stop:count or key.path=a,b,c with numbers, "
+            "for example payload.mass=4:8:9"
+        )
+    if not is_range:
+        return Vary(key, tuple(dict.fromkeys(parts)), text)
     if int(parts[2]) < 2 or float(parts[0]) == float(parts[1]):
         raise InputError(f"--vary {text}: expected at least two values between two ends")
     steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))

@@ -37,10 +37,9 @@ def made_up():
     reductions = [(cms, 4, 2.5, 0.008), (cms, 48, 2.5, 0.008), (modal, 4, 900.0, 1.5),
                   (modal, 48, 800.0, 1.4)]  # fmt: skip
     rows = []
-    for ends in ("", "ends "):
-        rows += [(f"{ends}objectives", *one[:2], nan, nan, *one[2:]) for one in objectives]
-        rows += [(f"{ends}reductions", f"{method} {n}", method, n, nan, c, d)
-                 for method, n, c, d in reductions]  # fmt: skip
+    rows += [("objectives", *one[:2], nan, nan, *one[2:]) for one in objectives]
+    rows += [("reductions", f"{method} {n}", method, n, nan, c, d)
+             for method, n, c, d in reductions]  # fmt: skip
     for label, method, values, deviation in (
         (before, cms, (28.0, 28.0, 28.0), 0.055),
         (before, modal, (25.0, 27.0, 27.5), 0.05),
@@ -58,22 +57,7 @@ def made_up():
     return pd.DataFrame(rows, columns=columns).assign(own=2.0, apart=0.0)
 
 
-RESULTS, SCENE = made_up(), paper.load_paper()
-
-
-# -- what the texts say of the scene ---------------------------------------------------------
-
-
-def test_texts_take_their_values_from_the_scene():
-    """Penalty and volume are those of --set, not the paper's."""
-    settings = ["interpolation.penalty=2", "design.initial=0.25", "design.volume_fraction=0.25"]
-    other = paper.load_paper(overrides=settings)
-    words, ours = (
-        {check.name: check.reason for check in check_paper(RESULTS, one)}["path, a tenth"]
-        for one in (other, SCENE)
-    )
-    assert "6.25 %" in words and "57.8 %" in words and "4 times" in words  # 1/16; 1 - 0.75^3
-    assert "12.5 %" in ours and "14.3 %" in ours  # 1/8, and 1/8 over 7/8
+RESULTS = made_up()
 
 
 # -- checks on made-up results ---------------------------------------------------------------
@@ -81,7 +65,7 @@ def test_texts_take_their_values_from_the_scene():
 
 def test_made_up_results_meet_all_demands():
     """All that `reproduce --check` demands."""
-    checks = check_paper(RESULTS, SCENE)
+    checks = check_paper(RESULTS)
     assert failed_checks(checks) == []
     assert all(check.statement and check.found and check.criterion for check in checks)
 
@@ -116,32 +100,30 @@ FLAWS = {
 @pytest.mark.parametrize("name", FLAWS)
 def test_check_finds(name):
     """Every demand fails where it should, under its name."""
-    failed = failed_checks(check_paper(FLAWS[name], SCENE))
+    failed = failed_checks(check_paper(FLAWS[name]))
     assert any(line.startswith(f"{name}: expected") for line in failed)
 
 
 def test_every_demand_can_fail():
-    assert {check.name for check in check_paper(RESULTS, SCENE) if check.demand} == set(FLAWS)
+    assert {check.name for check in check_paper(RESULTS) if check.demand} == set(FLAWS)
 
 
 def test_sentences_follow_from_the_results():
     """A check that holds says so, with the figure; one that does not gives the reason."""
-    for check in check_paper(RESULTS, SCENE):
+    for check in check_paper(RESULTS):
         start = "Holds: " if check.holds else "Does not hold: "
         assert check.sentence.startswith(start + check.found)
         assert check.holds or check.reason
     stiffer = altered("table == 'objectives' and kind == 'esl'", deviation=0.3875)
-    before, after = (check_paper(one, SCENE)[2] for one in (RESULTS, stiffer))
+    before, after = (check_paper(one)[2] for one in (RESULTS, stiffer))
     assert not before.holds and "8.00 mm" in before.sentence
     assert after.holds and "3.10 mm" in after.sentence
 
 
-@pytest.mark.parametrize("overrides", [(), ("arms.cells=[80, 4]",), ("arms.cells=[400, 24]",)])
-def test_coarse_cells_get_a_filter_of_two(overrides):
-    """Below, designs hang together by corners of cells; never finer than the paper's radius."""
-    scene = paper.load_paper(True, overrides)
-    largest = max(paper.cell_sizes(scene).values())
-    assert scene.design.radius == pytest.approx(max(2.0 * largest, 0.0075))
+def test_coarse_cells_get_a_filter_of_two():
+    """Below, designs hang together by corners of cells."""
+    scene = paper.load_paper(True)
+    assert scene.design.radius == pytest.approx(2.0 * max(paper.cell_sizes(scene).values()))
     assert filter_warnings(scene, paper.cell_sizes(scene)) == []
 
 

@@ -31,12 +31,12 @@ def test_curves_as_csv():
         ),
         Panel("q", "m [kg]", "d [mm]", (Line("a", x, x),)),
     ]
-    alone = LineFigure("", "", ((panels[0],),)).csv()
+    alone = LineFigure("", "", (panels[0],)).csv()
     rows = list(csv.reader(io.StringIO(alone)))
     assert rows[0] == ["panel", "line", "m [kg]", "c [N m]"]
     assert rows[1:] == [["p", "a", "1", "2"], ["p", "a", "2", "4"], ["p", "b", "1", "3"],
                         ["p", "b", "2", ""]]  # fmt: skip
-    both = LineFigure("", "", (tuple(panels),)).csv()
+    both = LineFigure("", "", tuple(panels)).csv()
     assert both.splitlines()[0] == "panel,line,x,y" and len(both.splitlines()) == 7
 
 
@@ -44,7 +44,7 @@ def test_files(tmp_path):
     one = Table("", "First.", pd.DataFrame({"a": [1]}))
     other = Table("more", "Second.", pd.DataFrame({"b": [2.5]}))
     line = Line("l", np.array([0.0]), np.array([1.0]))
-    figure = LineFigure("f", "", ((Panel("", "x [s]", "y [m]", (line,)),),))
+    figure = LineFigure("f", "", (Panel("", "x [s]", "y [m]", (line,)),))
     study = Study("name", (one, other), (figure,), (), 0)
     write_study(study, tmp_path)
     files = {path.name: path.read_text() for path in tmp_path.iterdir()}

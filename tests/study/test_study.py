@@ -181,7 +181,7 @@ def test_cross_evaluation(folder):
     # Those made for each scenario stand in the main table, too.
     made_for_it = [row[-2] for row in cells_of(tables[""])]
     np.testing.assert_array_equal(made_for_it, np.diag(values))
-    assert [figure.name for figure in done.figures] == ["", "cross", "designs"]
+    assert [figure.name for figure in done.figures] == ["", "cross"]
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
@@ -207,7 +207,7 @@ def test_grid_of_two(folder):
     compliance = np.array([row[2] for row in cells_of(table)]).reshape(2, 3)
     assert (compliance[1] > compliance[0]).all()  # a heavier payload
     assert (np.diff(compliance) < 0.0).all()  # more damping
-    [[left, _]] = figure.rows
+    left, _ = figure.panels
     np.testing.assert_array_equal([line.y for line in left.lines], compliance.T)
 
 
@@ -216,10 +216,7 @@ def test_three_keys_one_at_a_time(folder):
     vary = ["payload.mass=5,7", "motion.flattening=0.9,1", "material.density=2600,2800"]
     done = study.study(scene(), None, vary, [], folder, WORLD, shown=False)
     assert [table.name for table in done.tables] == ["", *(text.split("=")[0] for text in vary)]
-    tornado = done.figures[0]
-    assert tornado.kind == "tornado"
-    first = tornado.frame[: len(vary)]
-    bars = list(first.itertuples(index=False, name=None))
+    bars = cells_of(done.tables[0])[: len(vary)]
     changes = {bar[2].split()[0]: bar[3:] for bar in bars}
     assert changes["payload.mass"][0] < 0.0 < changes["payload.mass"][1]
     assert changes["motion.flattening"][1] == 0.0  # the scene's own value
@@ -324,17 +321,7 @@ def test_objective(folder):
             assert compliance[name] < compliance["initial design"]
     # One iteration from the same start: at most two objectives may agree.
     assert len({*compliance.values()}) >= len(names) - 2
-    for name in ("objective_deviation.png", "objective_designs.png"):
-        assert is_drawn(folder / name)
-    curves = rows_of(folder / "objective_deviation_curves.csv")
-    peaks = {}
-    for row in curves:
-        peak = float(row["deviation [mm]"])
-        peaks[row["line"]] = max(peak, peaks.get(row["line"], 0.0))
-    deviation = dict(zip(names, column(rows, "maximal deviation [mm]"), strict=True))
-    # Curves are of the files' samples, 0.1 % below the extremes.
-    assert peaks == pytest.approx(deviation, rel=2e-3)
-    assert all(peaks[name] <= deviation[name] * (1.0 + 1e-9) for name in peaks)
+    assert is_drawn(folder / "objective_designs.png")
 
 
 def test_what_a_comparison_and_a_study_plan():
@@ -385,7 +372,6 @@ def test_one_scene_posed_six_ways(folder):
 def test_reduction(folder, monkeypatch):
     """Craig-Bampton and Krylov do not depend on q, modal truncation is below and climbs."""
     monkeypatch.setattr(study, "SWEPT", (4, 8))
-    monkeypatch.setattr(study, "COMPARED", (4,))
     monkeypatch.setattr(variants, "REFERENCE", 8)
     run(
         TWO_ARM, "reductions", "--coordinates", 4, *SETTINGS, "--set",
@@ -399,7 +385,9 @@ def test_reduction(folder, monkeypatch):
         assert off == pytest.approx(100.0 * (float(row[own]) / float(row[again]) - 1.0), abs=1e-6)
         if method in ("craig-bampton", "krylov"):
             assert abs(off) < 0.1
-    sweep = rows_of(folder / "reduction_coordinates.csv")
+    assert not list(folder.glob("reduction_*"))  # one table
+    run(TWO_ARM, "coordinates", *SETTINGS, "--no-plots", "--out", folder)
+    sweep = rows_of(folder / "coordinates.csv")
     value = {
         (row["method"], int(row["coordinates"])): float(row["initial design: compliance [N m]"])
         for row in sweep
@@ -407,14 +395,6 @@ def test_reduction(folder, monkeypatch):
     assert value["craig-bampton", 4] == pytest.approx(value["craig-bampton", 8], rel=1e-4)
     assert value["krylov", 4] == pytest.approx(value["craig-bampton", 8], rel=1e-4)
     assert value["modal", 4] < value["modal", 8] < 0.99 * value["craig-bampton", 8]
-    bases = rows_of(folder / "reduction_bases.csv")
-    assert len(bases) == 2 * 2 * 4  # designs, arms, methods
-    for row in bases:
-        lost = float(row["moment [%]"])
-        assert lost > 2.0 if row["method"] == "modal" else lost < 0.1
-    curves = {path.name for path in folder.glob("reduction*_curves.csv")}
-    names = ("convergence", "coordinates", "deviation", "optimised_deviation")
-    assert curves == {f"reduction_{name}_curves.csv" for name in names}
 
 
 def test_balanced_where_it_is_possible():
