@@ -51,7 +51,7 @@ def test_cells_have_the_densities_of_their_partners(projection):
     scene, partition, arms = built(*REPEATED, REGIONS, f"design.projection={projection}")
     evaluator = Evaluator(scene, partition, arms, do.Profile())
     assert evaluator.variables.size == (160 if 0 in arms else 0)
-    x = evaluator.variables.join({0: waves(arms[0])} if 0 in arms else {})
+    x = evaluator.variables.join({k: waves(arms[k]) for k in arms if k == 0})
     evaluator.continuation.beta = 4.0
     for design in evaluator.physical_designs(x):
         mine = {k: by_place(scene, arms, k, one.x_phys) for k, one in design.items()}
@@ -112,7 +112,7 @@ def test_gradients_of_extremes_know_void_cells(kind):
     scene, partition, arms = built(*REPEATED, REGIONS, *exact, limit, f"objective.kind={kind}")
     evaluator = Evaluator(scene, partition, arms, do.Profile())
     variables = evaluator.variables
-    start = np.concatenate([waves(arms[k]) for k in arms if k == 0] or [np.empty(0)])
+    start = variables.join({k: waves(arms[k]) for k in arms if k == 0})
     x = np.clip(start, variables.xmin, variables.xmax)
     free = variables.xmin < variables.xmax
     direction = np.where(free, np.cos(1.7 * np.arange(x.size)), 0.0)
@@ -144,8 +144,8 @@ def test_an_arm_on_two_ranks_has_partners_on_both():
     patterns = Patterns(scene, partition, arms)
     x, y = arms[0].mesh.centroid.T
     scale = [1.0 / 0.8, 0.06 / 0.045]
-    for spread, field in ((patterns.spread({0: x + 10.0 * y}), lambda p: p[0] + 10.0 * p[1]),):
-        np.testing.assert_allclose(spread[1], field((arms[1].mesh.centroid * scale).T), rtol=1e-9)
+    spread = patterns.spread({0: x + 10.0 * y})[1]
+    np.testing.assert_allclose(spread, arms[1].mesh.centroid * scale @ [1.0, 10.0], rtol=1e-9)
     u, v = arms[1].mesh.centroid.T
     [back] = patterns.collect({1: u - v}).items()
     assert back[0] == 0

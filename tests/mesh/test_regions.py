@@ -100,22 +100,16 @@ def test_gradients_with_regions(kind, law):
         assert row.slope != 0.0 and rate > 1.9
 
 
-def test_a_run_keeps_its_regions_and_resumes(shared_tmp_path):
-    folders = [shared_tmp_path / name for name in ("whole", "parts")]
-    changes = (*SMALL, regions(HOLE, LUG), "motion.horizon=2.0", "optimizer.max_iterations=6")
-    options = ["--no-plots", *overrides(*changes)]
-    run("optimize", TWO_ARM, "--out", folders[0], *options)
-    run("optimize", TWO_ARM, "--out", folders[1], *options, "--set", "optimizer.max_iterations=3")
-    run("optimize", TWO_ARM, "--out", folders[1], *options, "--resume")
+def test_a_run_keeps_its_regions(shared_tmp_path):
+    """How it resumes: tests/arms/test_patterns.py."""
+    changes = (*SMALL, regions(HOLE, LUG), "motion.horizon=2.0", "optimizer.max_iterations=4")
+    run("optimize", TWO_ARM, "--out", shared_tmp_path / "run", "--no-plots", *overrides(*changes))
     WORLD.barrier()
-    whole, parts = (np.load(folder / "design.npz") for folder in folders)
-    for key in whole:
-        assert np.array_equal(whole[key], parts[key]), key
-    x, y = whole["arm1/centroid"].T
-    density = whole["arm1/density"]
+    design = np.load(shared_tmp_path / "run" / "design.npz")
+    (x, y), density = design["arm1/centroid"].T, design["arm1/density"]
     assert (density[(x - 0.5) ** 2 + y**2 < 0.021**2] == 0.0).all()
     assert (density[(x > 0.2) & (x < 0.3) & (y > 0.01)] == 1.0).all()
-    summary = json.loads((folders[0] / "summary.json").read_text())
+    summary = json.loads((shared_tmp_path / "run" / "summary.json").read_text())
     assert summary["constraints"]["volume_fraction_arm1"]["value"] == pytest.approx(density.mean())
     assert summary["volume_fraction"]["arm1"] <= 0.5005
     assert len(summary["scene"]["arms"][0]["regions"]) == 2
@@ -179,13 +173,6 @@ def test_regions_belong_to_an_arm_with_cells_and_are_set_as_a_whole():
     assert do.scene_from_dict(data).arms[1].regions == ()
     words = "unknown key arms.0.regions.0.kind (arm1)", "as a whole", "an array of tables"
     refused(words, "arms.arm1.regions.0.kind=void")
-
-
-@pytest.mark.serial
-def test_nothing_is_written_where_a_region_is_refused(tmp_path):
-    words = overrides(*SMALL, regions('{kind="void", box=[0.4,-0.03,0.5,0.03]}'))
-    refusal(lambda: run("optimize", TWO_ARM, "--out", tmp_path / "run", *words))
-    assert not (tmp_path / "run").exists()
 
 
 def test_an_arm_takes_the_regions_of_the_arm_before():
