@@ -12,6 +12,7 @@ from runs import demo, refused, scene
 
 import dolfinopt as do
 from dolfinopt import Model
+from dolfinopt.paths.time_laws import quintic
 from dolfinopt.responses.constraints import constraint_label, limits_by_column, limits_of
 
 WORLD = MPI.COMM_WORLD
@@ -20,37 +21,20 @@ KEPT = "constraints.compliance=1e6"  # N m; far away
 SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
 
 
-def quintic(t: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return 10 u^3 - 15 u^4 + 6 u^5, u = t / duration at most 1, and its derivatives by t."""
-    u = np.minimum(t / duration, 1.0)
-    s = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
-    sd = (30.0 * u**2 - 60.0 * u**3 + 30.0 * u**4) / duration
-    sdd = (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / duration**2
-    return s, sd, sdd
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a_x b_y - a_y b_x (n,)."""
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
 def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
     """Return the forces (n, 3) of cart, shoulder and elbow that move a point mass on the arc.
 
     Newton's law of the payload alone: arms of 1 m without mass hand its force on.
     """
     s, sd, sdd = quintic(t, 1.9)
-    angle, rate, second = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
-    radial = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    around = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
-    acceleration = second[:, None] * around - (rate**2)[:, None] * radial
-    force = mass * (acceleration + np.array([0.0, gravity]))
-    shoulder = np.stack([0.5 * radial[:, 0], np.full(len(t), -0.5)], axis=1)
-    chord = radial - shoulder
-    length = np.hypot(*chord.T)[:, None]
-    left = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length
-    elbow = shoulder + 0.5 * chord + np.sqrt(1.0 - 0.25 * length**2) * left  # beta < 0
-    return np.stack([force[:, 0], cross(chord, force), cross(radial - elbow, force)], axis=1)
+    place = np.exp(1j * np.pi * (1.0 - s))  # x + i y
+    force = mass * ((-1j * np.pi * sdd - (np.pi * sd) ** 2) * place + 1j * gravity)
+    shoulder = 0.5 * place.real - 0.5j
+    chord = place - shoulder
+    length = np.abs(chord)
+    elbow = shoulder + 0.5 * chord + np.sqrt(1.0 - 0.25 * length**2) * 1j * chord / length
+    moments = [(np.conj(place - joint) * force).imag for joint in (shoulder, elbow)]
+    return np.stack([force.real, *moments], axis=1)
 
 
 @pytest.mark.serial

@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.collocation import Solution, radau_iia, response_instants
 from dolfinopt.multibody.end_effector import deviation
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
+from dolfinopt.multibody.shape_integrals import rigid_bar
 from dolfinopt.responses.constraints import load_cases, objective
 from dolfinopt.responses.evaluation import constraint_gradients, evaluate, evaluate_batch
 
@@ -194,20 +194,21 @@ def test_gradient_by_the_variables_through_a_projection(kind: str, designs: int)
     """Symmetry, filter, projection and solid ends: remainders of every design x stands for."""
     keys = "design.filter_radius=0.05", "arms.passive=0.1", "arms.symmetric=true"
     built = build("objective.kind=static", f"design.projection={kind}", *keys, cells=(24, 4))
-    x, d = built.fields(wave), built.fields(uneven)
+    x, d, arms = built.fields(wave), built.fields(uneven), built.arms
+
+    def realised(h: float, variant: int):
+        moved = {k: arm.physical_designs(x[k] + h * d[k], 4.0, 0.45) for k, arm in arms.items()}
+        return {k: found[variant] for k, found in moved.items()}
+
     values = []
     for variant in range(designs):
 
-        def realised(h: float, v: int = variant):
-            moved = {k: a.physical_designs(x[k] + h * d[k], 4.0, 0.45) for k, a in arms.items()}
-            return {k: found[v] for k, found in moved.items()}
+        def value(h: float, variant: int = variant) -> float:
+            x_phys = {k: one.x_phys for k, one in realised(h, variant).items()}
+            return built.evaluate(x_phys)[0].objective
 
-        def value(h: float, realised=realised) -> float:
-            return built.evaluate({k: one.x_phys for k, one in realised(h).items()})[0].objective
-
-        arms = built.arms
         values.append(value(0.0))
-        slopes, here = built.gradient(), realised(0.0)
+        slopes, here = built.gradient(), realised(0.0, variant)
         by_x = {k: arm.backward(slopes[k], here[k]) for k, arm in arms.items()}
         rate = rates(value, built.dot(by_x, d), (1e-3, 2.5e-4))
         assert rate == pytest.approx(2.0, abs=0.1)

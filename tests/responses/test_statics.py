@@ -64,8 +64,6 @@ def test_an_arm_cut_in_two() -> None:
     np.testing.assert_allclose(shared, alone, rtol=1e-9, atol=1e-12 * np.abs(alone).max())
 
 
-# -- deflection ------------------------------------------------------------------------------
-
 # Floats from 1e-9 m to 1 m and both signs; a case that moves nothing may stand beside others.
 LENGTHS = st.floats(1e-9, 1.0).flatmap(lambda a: st.sampled_from([a, -a, 0.0]))
 
@@ -90,26 +88,6 @@ def test_deflection_bounds_the_largest(rows: list[tuple[float, ...]], exponent: 
     assert not slope[2].any()
 
 
-@pytest.mark.parametrize("exponent", [2.0, 3.0, 20.0, 200.0])
-def test_deflection_gradient(exponent: float) -> None:
-    """Every entry against central differences; their error is (p h)^2."""
-    rng = np.random.default_rng(1)
-    u = rng.normal(size=(3, 4))
-    u[:2, 3] = u[:2, 0] * [1.0, -1.0]  # two cases equally large
-    slope = StaticResponse(np.ones((3, 4)), u).deflection_gradient(exponent)
-    h = 1e-6
-    for index in np.ndindex(u.shape):
-        step = np.zeros_like(u)
-        step[index] = h
-        there, back = (
-            StaticResponse(np.ones((3, 4)), u + s * step).deflection(exponent) for s in (1, -1)
-        )
-        assert slope[index] == pytest.approx((there - back) / (2.0 * h), abs=1e-7)
-
-
-# -- gradients -------------------------------------------------------------------------------
-
-
 def test_gradients_of_the_deflections() -> None:
     """Both arms' by all physical densities: those of the p-norm over the smooth limit, held."""
     built = build("objective.kind=static", "constraints.tip_deflection=1e-6", "arms.height=0.1")
@@ -130,8 +108,6 @@ def test_gradients_of_the_deflections() -> None:
             2.0, abs=0.1
         )
 
-
-# -- solids: a solve for every load -----------------------------------------------------------
 
 SIDE = (Interface(name="side", point=(0.27, 0.02, 0.0), radius=0.012),)
 ACROSS, TWIST = (0.0, 1.0, 0.3, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)

@@ -48,9 +48,6 @@ class Analysed:
         return row
 
 
-# -- displacements and stress against the full model -------------------------------------------
-
-
 def all_loads(arm, body, rates_at, outboard, n):
     """Return all loads of an instant on nodes and outboard interface, from the frame's motion.
 
@@ -227,9 +224,6 @@ def test_void_has_no_stress() -> None:
     assert all(np.isfinite(g).all() for g in one.gradient().values())
 
 
-# -- gradients ---------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "keys",
@@ -304,9 +298,6 @@ def cell_stress_of_fields(arm) -> CellStress:
     state = arm.current
     empty = np.zeros((3, len(state.x_phys), 0))
     return CellStress(state, empty, arm.mesh.area, np.sqrt(state.x_phys))
-
-
-# -- as limit and objective ---------------------------------------------------------------------
 
 
 def test_work_is_done_once() -> None:
