@@ -178,8 +178,6 @@ def test_ranks_agree_on_floating_solids() -> None:
     np.testing.assert_allclose(found[1] / scale, found[0] / scale, atol=1e-4)
 
 
-# -- crossing modes --------------------------------------------------------------------------
-
 STUBBY = ("arms.length=0.3", "arms.height=0.9")
 MASS = 20.0  # kg
 
@@ -282,8 +280,6 @@ def test_following_a_mode_through_a_crossing() -> None:
     assert period == pytest.approx(4.0 * np.pi**2 / values[0], rel=1e-9)
     assert np.flatnonzero(by_values).tolist() == [2]
 
-
-# -- the arm by itself -----------------------------------------------------------------------
 
 # Cells, overrides, and by how much three static modes are too stiff: measured.
 CASES = {

@@ -84,9 +84,6 @@ def distance(problem: ElasticSystem, one: Solution, other: Solution) -> float:
     return relative_error(problem.mechanism, here - there, there)
 
 
-# -- many mechanisms in one ------------------------------------------------------------------
-
-
 def test_scales_are_those_of_scaled_bodies():
     """Instant by instant other payloads, gravity and materials: as each mechanism by itself."""
     rng = np.random.default_rng(3)
@@ -138,9 +135,6 @@ def test_related_bodies():
     np.testing.assert_allclose(other, [[1.5, 0.5, 1.5 * DAMPING]] * 2, rtol=1e-12)
     np.testing.assert_allclose(undamped, [[1.0, 1.0, 0.0]] * 2, rtol=1e-12)
     assert stiffer is None and rigid is None
-
-
-# -- the whole -------------------------------------------------------------------------------
 
 
 def test_batch_is_each_of_them_alone(alone):

@@ -44,9 +44,6 @@ def small(joints: Tree | None = None, **changes: Any) -> Tree:
     return with_keys(tree, changes)
 
 
-# -- exact beams -----------------------------------------------------------------------------
-
-
 def test_deviation_and_forces_of_exact_beams() -> None:
     """Exudyn's beams with the same controller, and a second code: `reference/README.md`."""
     tree = two_arm("arms.cells=[100,6]", "reduction.coordinates=6", control=GAINS)
@@ -85,9 +82,6 @@ def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: fl
     assert least < off < most
 
 
-# -- energy ----------------------------------------------------------------------------------
-
-
 def arms(stiffening: bool, **changes: object) -> Tree:
     """Return the machine with motors at its joints under gravity, without control unless told."""
     simulation = {"stiffening": stiffening, "tolerance": 1e-6}
@@ -121,9 +115,6 @@ def test_work_under_gravity_is_energy(kind: str) -> None:
     parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
     assert min(parts) > 1e-4 * max(parts)  # each of them counts
     assert imbalance(result) < 1e-8  # measured 2e-11 at most
-
-
-# -- limits ----------------------------------------------------------------------------------
 
 
 def test_rigid_limit() -> None:
@@ -186,9 +177,6 @@ def test_angles_of_motors_are_written(tmp_path) -> None:
     np.testing.assert_allclose(1e5 * twist, found["joint_forces"][0, 1:], rtol=1e-9)
     header = (tmp_path / "run" / "trajectory.csv").read_text().splitlines()[0]
     assert "q_motor_arm1,q_motor_arm2" in header
-
-
-# -- saturation ------------------------------------------------------------------------------
 
 
 def test_saturation_is_linear_to_95_percent_and_smooth() -> None:

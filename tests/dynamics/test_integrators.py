@@ -318,9 +318,7 @@ def test_radau_meets_the_tolerance(stages: int, damping: float) -> None:
     ("bending", "damping", "tolerance"),
     [(10.0, 1e-3, 1e-2), (10.0, 0.0, 1e-3), (100.0, 2e-4, 1e-2)],
 )
-def test_generalized_alpha_meets_the_tolerance(
-    bending: float, damping: float, tolerance: float, rho_inf: float
-) -> None:
+def test_generalized_alpha_meets_the_tolerance(bending, damping, tolerance, rho_inf) -> None:
     """The estimate is up to three times too large as long as it counts on first order."""
     problem, _ = two_arms(bending=bending, axial=30.0 * bending, damping=damping)
     reference = radau.integrate(problem, 1e-6, 4, Profile())
@@ -579,9 +577,7 @@ def arms_of_a_scene(*changes: str, cells: tuple[int, int] = (20, 2)) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stages", [2, 4])  # 3 takes ten times as long
-def test_motion_that_every_grid_finds_otherwise_is_given_up(
-    monkeypatch: pytest.MonkeyPatch, on_grids, stages: int
-) -> None:
+def test_motion_that_every_grid_finds_otherwise_is_given_up(monkeypatch, on_grids, stages) -> None:
     """Undamped vibrations that feed on themselves: two grids are enough to tell, and few sweeps."""
     work, told, newton = [], [], radau.newton
     grids = on_grids(lambda number, true, grid: true())
@@ -742,9 +738,7 @@ def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
-def test_fast_coordinates_change_nothing(
-    monkeypatch: pytest.MonkeyPatch, damping: float, tolerance: float
-) -> None:
+def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> None:
     """The same motion and estimate as with the exact matrix."""
     problem = fine_arms(5, 1, damping)
     edges = even_steps(problem, 60)
@@ -760,9 +754,7 @@ def test_fast_coordinates_change_nothing(
 @pytest.mark.parametrize("bending", [10.0, 1000.0])
 @pytest.mark.parametrize("stages", [3, 4])
 @pytest.mark.parametrize("steps", [8, 20])
-def test_estimate_of_vibrations_that_are_not_resolved(
-    bending: float, stages: int, steps: int
-) -> None:
+def test_estimate_of_vibrations_that_are_not_resolved(bending, stages, steps) -> None:
     """Undamped arms, steps from a fifth of the slowest period to five of them.
 
     Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
@@ -788,9 +780,7 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
     assert_close(found, found[:1] * 3, 0.2)  # other steps
 
 
-def test_poor_contraction_makes_the_matrix_denser(
-    monkeypatch: pytest.MonkeyPatch, matrices: list[tuple[int, int]]
-) -> None:
+def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices) -> None:
     """With one slow coordinate where eight are: widened, and solved all the same."""
     problem = fine_arms()
     plain = radau.integrate(problem, 1e-6, 3, Profile())
@@ -802,9 +792,7 @@ def test_poor_contraction_makes_the_matrix_denser(
     assert forced.error == pytest.approx(plain.error, rel=0.3)  # other steps
 
 
-def test_dense_matrices_are_kept_small(
-    monkeypatch: pytest.MonkeyPatch, matrices: list[tuple[int, int]]
-) -> None:
+def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
     """Steps whose blocks take too much memory are solved a few at a time, forth and back."""
     problem = fine_arms(5, 1)
     edges = even_steps(problem, 60)
@@ -827,9 +815,7 @@ def test_dense_matrices_are_kept_small(
 
 
 @pytest.mark.parametrize("limits", [(20.0, np.inf), (1e-3, np.inf)])
-def test_adjoint_is_exact_with_fast_coordinates(
-    monkeypatch: pytest.MonkeyPatch, matrices: list[tuple[int, int]], limits: tuple[float, ...]
-) -> None:
+def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limits) -> None:
     """Corrected until it is; of an undamped chain too, and where the matrix must be widened."""
     problem = fine_arms(damping=0.0)
     solution = radau.on_grid(problem, even_steps(problem, 60), 1e-8, 3)

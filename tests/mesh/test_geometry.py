@@ -65,8 +65,7 @@ def radius_error(mesh, facets, x, radius):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(
-    ("passive", "ring"),
-    [(0.012, 0.012), pytest.param(0.0, HEIGHT / 8.0, marks=pytest.mark.serial)],
+    ("passive", "ring"), [(0.012, 0.012), pytest.param(0.0, HEIGHT / 8.0, marks=pytest.mark.serial)]
 )
 def test_bores_are_interfaces_in_solid_rings(shape, passive, ring):
     mesh = bores(mesh_size=0.006, cell_shape=shape, passive=passive)

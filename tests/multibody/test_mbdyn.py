@@ -151,8 +151,6 @@ def test_interfaces_are_the_first_nodes(parts, elements):
     np.testing.assert_allclose(element.modes[2:][edge, 0], expected, atol=1e-9)
 
 
-# -- bodies in space -------------------------------------------------------------------------
-
 ROUNDING = 1e-12
 
 
@@ -221,9 +219,6 @@ def test_several_interfaces(stiff):
     assert np.array_equal(np.concatenate(element.modes[1:]), body.outboard)
     assert list(element.loads) == list(range(1, 25 if stiff else 1))
     assert np.array_equal(element.stiffening[12:], body.K0_outboard)
-
-
-# -- lumped nodes of the plane -----------------------------------------------------------------
 
 
 def invariants(element):
@@ -297,8 +292,6 @@ def test_nodes_of_an_arm_on_several_ranks(parts):
     # Eigenvectors are right to 1e-10.
     np.testing.assert_allclose(nodes.modes, alone.modes, atol=1e-8 * np.abs(alone.modes).max())
 
-
-# -- the command -----------------------------------------------------------------------------
 
 SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]
 

@@ -303,9 +303,6 @@ def test_few_instants_do_not_depend_on_memory() -> None:
         assert len(found) == 1
 
 
-# -- of the plane ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", CHAINS)
 def test_interface_and_its_variation(kind: str) -> None:
     """Jacobian and Hessian by all coordinates; both by outboard modes and their stiffness."""

@@ -153,8 +153,6 @@ def test_line_is_straight(law: str) -> None:
         assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
 
 
-# -- any number of arms ----------------------------------------------------------------------
-
 LENGTHS = {1: (1.0,), 2: (1.1, 0.9), 3: (0.8, 0.7, 0.5), 4: (0.6, 0.5, 0.5, 0.4)}  # m
 POINTS = np.array([[-0.7, 0.0], [-0.5, 0.3], [0.0, 0.2], [0.4, 0.35], [0.6, 0.1]])  # m
 TIMES = np.array([0.0, 0.5, 0.9, 1.3, DURATION])  # s
@@ -335,9 +333,6 @@ def test_path_within_reach_is_accepted() -> None:
     check_motion(scene(joint_height=-0.999))
 
 
-# -- tables ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
 def test_points_of_a_straight_line_are_the_line(tmp_path: Path, law: str) -> None:
     """Whatever their distances; without times the law of the scene holds until the last instant.
@@ -427,8 +422,6 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
     with refused(f"'{name}'", "another name"):
         check_motion(of.model_copy(update={"arms": arms}))
 
-
-# -- scenes of one and three arms, end to end -------------------------------------------------
 
 HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `scene`'s arms
 

@@ -97,9 +97,6 @@ def at_depth(cloud: Cloud, depth: float) -> Cloud:
     )
 
 
-# -- round trips -----------------------------------------------------------------------------
-
-
 def same(found: ShapeIntegrals, body: ShapeIntegrals) -> None:
     """Assert that a plane body is back in every bit, one in space to rounding."""
     for one in TABLE:
@@ -197,9 +194,6 @@ def test_names_hold_frequencies():
     expected = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
     assert found == pytest.approx(expected, abs=5e-4)  # three decimals
     assert data.names[0].startswith("Eigen Mode    1 : ")
-
-
-# -- forces ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -321,9 +315,6 @@ def test_stiffened_body_of_a_file_moves_the_same(tmp_path):
     assert np.abs(linear - written).max() > 0.1 * np.abs(written).max()
 
 
-# -- a plane arm's moments in space ------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def arm():
     arm = substructure((1.2, 0.3, THICKNESS), (10, 3))
@@ -350,9 +341,6 @@ def test_moments_of_an_arm_agree_with_its_planar_integrals(tmp_path, arm, known)
     assert np.array_equal(lifted.M, lifted.M.T)
     depth = body.mass * THICKNESS**2 / 12.0 if known else 0.0
     assert lifted.W[8, 0, 0] == pytest.approx(depth, rel=1e-14)
-
-
-# -- data of other programs ------------------------------------------------------------------
 
 
 def swap(data, name, which="M0", **entries):
@@ -417,9 +405,6 @@ def test_nodes_that_are_not_there(arguments, words):
     _, data = foreign(np.random.default_rng(5))
     with refused(*words):
         from_sid(data, 2, *arguments)
-
-
-# -- what is no body ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

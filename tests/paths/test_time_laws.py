@@ -153,9 +153,6 @@ def test_fastest(name: str, limits: dict[str, float], expected: float) -> None:
     assert_close(law_of(name, 0.25, 2.0, **limits).least, expected, 1e-14)
 
 
-# -- in scenes --------------------------------------------------------------------------------
-
-
 def posed(**motion: Any) -> Scene:
     """Return the example with another motion."""
     data = load_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()

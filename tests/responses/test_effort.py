@@ -40,9 +40,7 @@ def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
 @pytest.mark.serial
 @pytest.mark.parametrize("weights", [None, (0.01, 0.02, 0.05), (0.0, 0.0, 1.0)])
 @pytest.mark.parametrize("gravity", [0.0, 9.81])
-def test_rigid_limit_is_newtons_law(
-    gravity: float, weights: tuple[float, float, float] | None
-) -> None:
+def test_rigid_limit_is_newtons_law(gravity, weights) -> None:
     """Stiff arms of hardly any mass: the payload's inertia is all that the drives feel."""
     changes = [f"motion.gravity=[0.0, {-gravity}]", "material.density=1e-3"]
     changes += ["material.young_modulus=1e14", "simulation.stiffening=false"]

@@ -49,8 +49,6 @@ def test_stiffening_is_decided_for_every_scene_by_itself() -> None:
             assert trajectory.max_deviation[0] == pytest.approx(expected[1], rel=5e-4)
 
 
-# -- one design of two arms ------------------------------------------------------------------
-
 SHARED = "arms.arm2.design=arm1"
 CASES = [
     ["reduction.coordinates=5"],
@@ -347,8 +345,6 @@ def test_solves_of_geometric_stiffness(gradient, more):
     for name in ("assemblies", "factorisations", "reductions", "eigenproblems", "simulations"):
         assert spent["true"][name] == spent["false"][name], name
 
-
-# -- instants --------------------------------------------------------------------------------
 
 SPACE = TWO_ARM.parent / "spatial_arm.toml"
 MOTIONS = {

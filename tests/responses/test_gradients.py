@@ -48,7 +48,8 @@ SPATIAL_STROKES += "0.5,1,1,-1\n"
 SKEW = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
 Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
-Transfinite Curve {1} = 25 Using Progression 1.05; Transfinite Curve {3} = 25; Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
+Transfinite Curve {1} = 25 Using Progression 1.05; Transfinite Curve {3} = 25;
+Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
 
