@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
 from remainders import build
-from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import generalized_alpha, measured, radau
 from dolfinopt.dynamics import newton as factors
@@ -32,7 +31,6 @@ from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
-from dolfinopt.multibody.tangent import linearise
 from dolfinopt.paths.time_laws import Limits, law_for, quintic
 from dolfinopt.profiling import Profile
 
@@ -265,18 +263,6 @@ def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None
     assert order == pytest.approx(2 * stages - 1, abs=0.2 if name == "smooth" else 0.4)
 
 
-@BOTH
-def test_jumps_of_acceleration_meet_the_tolerance(integrator: str) -> None:
-    """Against finer steps of one stage more; every jump is at the end of a step."""
-    problem, _ = two_arms(*profile("trapezoidal"))
-    exact = radau.integrate(problem, 1e-8, 5, Profile())
-    tolerance = 1e-5 if integrator == "radau" else 1e-3
-    found = solve(integrator, problem, tolerance)
-    assert np.isin(problem.breakpoints, found.time_grid).all()
-    assert (np.diff(found.time_grid) > 0.0).all()
-    assert distance(problem, found, exact) <= tolerance
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("rho_inf", [0.0, 0.5, 0.8, 1.0])
 def test_order_of_generalized_alpha(rho_inf: float) -> None:
@@ -343,43 +329,6 @@ def test_relative_error_is_of_the_worst_arm() -> None:
     assert relative_error(mechanism, error, q) == pytest.approx(1e-3 / 4e-3, rel=1e-14)
     nothing = relative_error(mechanism, error, 0.0 * q)  # to compare with: the error itself
     assert nothing == pytest.approx(0.2 * np.sqrt(K), rel=1e-14)
-
-
-# -- agreement -------------------------------------------------------------------------------
-
-
-def scipy_solution(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
-    """Return q (n, N) from SciPy's own Radau, adaptive, of the first-order system."""
-    size = problem.mechanism.num_coordinates
-
-    def rates(instant: float, y: np.ndarray) -> np.ndarray:
-        motion = problem.motion(np.array([instant]))
-        q, qd, zero = y[None, :size], y[None, size:], np.zeros((1, size))
-        mass = linearise(problem.mechanism, motion, q, qd, zero).dense()[0, :, 2 * size :]
-        rows = inverse_dynamics(problem.mechanism, motion, q, qd, zero)[0]
-        return np.concatenate([y[size:], -np.linalg.solve(mass, rows[0])])
-
-    y = np.append(problem.initial_state()[0][0], np.zeros(size))
-    pieces = []
-    for first, last in zip(problem.breakpoints[:-1], problem.breakpoints[1:], strict=True):
-        inside = t[(t >= first) & (t < last)]
-        run = solve_ivp(
-            rates, (first, last), y, "Radau", np.append(inside, last), rtol=1e-4, atol=1e-7
-        )
-        pieces.append(run.y[:size, :-1].T)
-        y = run.y[:, -1]
-    return np.concatenate([*pieces, y[None, :size]])
-
-
-def test_agrees_with_scipy() -> None:
-    """Three implementations, one motion."""
-    problem, _ = two_arms(breakpoints=(0.0, 0.3), gravity=(0.0, -9.81))
-    t = np.linspace(0.0, 0.3, 31)
-    expected = scipy_solution(problem, t)
-    for integrator, tolerance in (("radau", 1e-5), ("generalized-alpha", 1e-3)):
-        q = solve(integrator, problem, tolerance).sample(t)
-        # SciPy's own error is 2e-6 here, measured against rtol = 1e-7.
-        assert relative_error(problem.mechanism, q - expected, expected) <= tolerance
 
 
 # -- robustness ------------------------------------------------------------------------------
@@ -472,22 +421,6 @@ def test_what_cannot_be_solved_is_a_named_error(integrator, problem, tolerance, 
             radau.integrate(problem(), tolerance, stages, Profile())
         else:
             solve(integrator, problem(), tolerance)
-
-
-@pytest.mark.parametrize("failing", [0, 1, 3])
-def test_failures_on_any_grid_are_a_named_error(monkeypatch, on_grids, failing: int) -> None:
-    """A grid fails, then the march along the motion: its error names the remedy."""
-    problem, _ = two_arms()
-    plain = radau.on_grid(problem, even_steps(problem, 20), 1e-2, 3)
-
-    def poor(number: int, *_: object) -> Solution:
-        return stuck() if number > failing else replace(plain, error=0.3**failing)
-
-    grids = on_grids(poor)
-    monkeypatch.setattr(radau, "graded", stuck)
-    with pytest.raises(ConvergenceError, match="stiffen the arms"):
-        solve("radau", problem, 1e-2)
-    assert len(grids) == failing + 1
 
 
 def test_marches_once(monkeypatch: pytest.MonkeyPatch, on_grids) -> None:

@@ -100,25 +100,6 @@ def test_round_trip_is_exact(tmp_path, elements, kind, loads):
             assert np.array_equal(groups[group], expected), group
 
 
-def test_mbdyn_stiffens_it_alike(stiff_parts, elements):
-    """Any motion in the plane, force and moment outboard: rows lose sum_p p K0_p q."""
-    body = stiff_parts[0]
-    rng = np.random.default_rng(0)
-    a, force = np.append(rng.normal(size=(2, 2)), [[0.0], [0.0]], axis=1)
-    w, wd, moment = np.zeros((3, 3))
-    w[2], wd[2], moment[2] = rng.normal(size=3)
-    p = np.array([a[0], a[1], wd[2], -(w[2] ** 2), force[0], force[1], moment[2]])
-    K0 = np.concatenate([body.K0, body.K0_outboard])
-    groups = read_as_mbdyn_does(fem_text(elements["stiff plane"]))
-    found = mbdyn_stiffening(groups, a, w, wd, force, moment)
-    np.testing.assert_allclose(found, -np.tensordot(p, K0, 1), atol=1e-12 * np.abs(found).max())
-    # Rotation stiffens a slender beam, and so does a pull at its end: the joint gives -pull.
-    still = np.zeros(3)
-    for load in ({"w": w}, {"force": np.array([-1.0, 0.0, 0.0])}):
-        all_loads = {"a": still, "w": still, "wd": still, "force": still, "moment": still, **load}
-        assert mbdyn_stiffening(groups, **all_loads)[1, 1] > 0.0
-
-
 def test_mbdyn_reads_it(elements):
     element = elements["plane"]
     groups = read_as_mbdyn_does(fem_text(element))
@@ -267,17 +248,6 @@ def test_second_moments_converge():
     # Measured: 1.93 to 2.03.
     assert rates[-1].min() > 1.8 and rates[-1].max() < 2.2, rates
     assert np.max(errors[-1]) < 0.01
-
-
-def test_global_inertia_of_a_uniform_plate():
-    """Group 12 is the consistent one: of a cuboid, about its centre."""
-    _, lifted, nodes = reduced((4, 2))
-    element = modal_element(lifted, nodes)
-    mass, (a, b, c) = 2700.0 * LENGTH * HEIGHT * THICKNESS, (LENGTH, HEIGHT, THICKNESS)
-    expected = mass / 12.0 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
-    assert element.mass == pytest.approx(mass, rel=PLACING)
-    np.testing.assert_allclose(element.centre, [0.5 * LENGTH, 0.0, 0.0], atol=PLACING)
-    np.testing.assert_allclose(element.inertia, expected, atol=PLACING * mass)
 
 
 def test_nodes_of_an_arm_on_several_ranks(parts):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Chain, assert_close, bar, derivative
+from bodies import assert_close, derivative
 from mpi4py import MPI
 from remainders import built_of
 from runs import refused
@@ -21,7 +21,6 @@ from scipy.optimize import brentq
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.multibody.motion import (
     Bend,
@@ -88,15 +87,6 @@ def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
     angles = np.cumsum(motion.q[:, 1:], axis=1)
     x = motion.q[:, 0] + np.cos(angles) @ lengths
     return np.stack([x, of.motion.joint_height + np.sin(angles) @ lengths], axis=1)
-
-
-def test_peaks_of_the_laws() -> None:
-    """Speed 15/8 and acceleration 10 / sqrt(3) of the quintic, speed 35/16 of the septic."""
-    peak = DURATION * (0.5 - np.sqrt(3.0) / 6.0)  # where the jerk is zero
-    _, sd, sdd = quintic(np.array([DURATION / 2.0, peak]), DURATION)
-    assert_close(sd[0], 15.0 / 8.0 / DURATION, 1e-14)
-    assert_close(sdd, [0.0, 10.0 / np.sqrt(3.0) / DURATION**2], 1e-14)
-    assert_close(septic(np.array([DURATION / 2.0]), DURATION)[1], [35.0 / 16.0 / DURATION], 1e-14)
 
 
 @pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
@@ -233,28 +223,6 @@ def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str)
     assert_close(ends.q[3:], ends.q[[2, 2]], 1e-12)
 
 
-@pytest.mark.parametrize("elbow", [-1, 1])
-def test_one_arm_leans_to_its_side(elbow: int) -> None:
-    """The cosine has the sign of elbow; the cart is on the other side of the end-effector."""
-    of = scene((1.0,), elbow=elbow, **PATHS["line"])
-    motion = rigid_motion(DENSE, of)
-    assert (np.sign(np.cos(motion.q[:, 1])) == elbow).all()
-    height = desired_path(DENSE, of.motion).p[:, 1] + 0.5
-    assert_close(np.sin(motion.q[:, 1]), height, 1e-15)
-
-
-def test_two_arms_by_the_cosine_rule() -> None:
-    """Angles of the triangle of shoulder, elbow and end-effector."""
-    of = scene((1.1, 0.9), **PATHS["line"], **BASES["fixed"])
-    motion = rigid_motion(DENSE, of)
-    way = desired_path(DENSE, of.motion).p - [0.1, -0.5]
-    distance = np.hypot(*way.T)
-    inner = np.arccos((1.1**2 + 0.9**2 - distance**2) / (2.0 * 1.1 * 0.9))
-    at_shoulder = np.arccos((1.1**2 + distance**2 - 0.9**2) / (2.0 * 1.1 * distance))
-    assert_close(motion.q[:, 2], -(np.pi - inner), 1e-14)
-    assert_close(motion.q[:, 1], np.arctan2(way[:, 1], way[:, 0]) + at_shoulder, 1e-14)
-
-
 @pytest.mark.parametrize("arms", [2, 3, 4, 7])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_bend_is_the_first_from_stretched(arms: int, seed: int) -> None:
@@ -326,11 +294,6 @@ def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) 
     assert found and words in said and key in said and "\n" not in said
     assert time is None or float(found[1]) == pytest.approx(time, abs=5e-3)
     assert float(found[2]) == pytest.approx(distance, rel=1e-3, abs=5e-6)
-
-
-def test_path_within_reach_is_accepted() -> None:
-    """Close to the stretched position, no message."""
-    check_motion(scene(joint_height=-0.999))
 
 
 @pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
@@ -455,26 +418,3 @@ def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> Non
     assert_close(deviation.imag, -across / bending * acceleration, 0.02)
     # Pulling needs no fine mesh; the ends, held against contraction, make it 0.3 % shorter.
     assert_close(deviation.real, along * speed**2, 0.01)
-
-
-@pytest.mark.parametrize("base", ["cart", "fixed"])
-@pytest.mark.parametrize("arms", [1, 3])
-def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
-    """Of the rigid mechanism to differences, and of the flexible one in all but vibration."""
-    path, lengths = "joints in time" if arms == 1 else "points", (0.7,) * arms
-    file = tmp_path / "table.csv"
-    file.write_text(table_text(path, arms, base))
-    gravity = (0.5, -9.81)
-    motion = {**PATHS[path], **BASES[base], "file": str(file), "gravity": list(gravity)}
-    of = scene(lengths, {"payload": {"mass": 2.0, "inertia": 0.1}}, **motion)
-    trajectory, at = simulated(of), slice(100, 1900, 300)
-    rigid = trajectory.motion[at]
-    clouds = tuple(bar(one, HEIGHT, STEEL[1] * one * HEIGHT * THICKNESS) for one in lengths)
-    chain = Chain(clouds, 2.0, 0.1, gravity, of.motion.joint_height)
-    rows = zip(rigid.q, rigid.qd, rigid.qdd, strict=True)
-    expected = np.array([chain.forces(*row) for row in rows])
-    still = np.zeros((len(rigid.q), trajectory.mechanism.num_coordinates))
-    found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
-    assert_close(found, expected, 1e-10)  # differences of a function of size ten
-    # The arms bend by some thousandths of their length, and a vibration of 11 % goes on.
-    assert_close(trajectory.joint_forces[at], expected, 0.12)

@@ -13,8 +13,6 @@ from readers import State, forces_of_sid, random_state
 from remainders import substructure
 from runs import refused
 
-from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.exchange.sid import (
     StandardInputData,
     Taylor,
@@ -27,18 +25,15 @@ from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body_motion import BodyMotion, Constants
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import Interface
-from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     TABLE,
     ShapeIntegrals,
     in_space,
-    linear_part,
     plate_moments,
     shape_integrals,
 )
 from dolfinopt.multibody.standard_input import from_sid, load_body, to_sid
-from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Options, craig_bampton
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
@@ -241,36 +236,6 @@ def test_forces_of_the_file(tmp_path, dimension, stiff, seed):
     assert_close(rows + data.Ke.M0 @ s.q + data.De.M0 @ s.qd, expected.rows({})[:, 0], size=size)
 
 
-@pytest.mark.parametrize("known", [True, False])
-@STIFF
-def test_plane_forces_are_the_planar_ones(known, stiff):
-    """Against the plane's machine of one arm, also where what stands out of the plane is a guess.
-
-    Of a stiffened body force and moment lack -qd'K0 qd and -1/2 q'K0 q, for which the format has no
-    place: they vanish in a body that moves about q = 0 with qd = 0.
-    """
-    rng = np.random.default_rng(7)
-    cloud, s = random_cloud(rng, 3), random_state(rng, 3, plane=True)
-    body = body_of(2, 7, 3)
-    body = stiffened(body, 5) if stiff else body
-    data = to_sid(in_space(body, at_depth(cloud, 0.3).body().W if known else None))
-    for state in (s, replace(s, q=1e-7 * s.q, qd=np.zeros(3))):
-        force, moment, rows = forces_of_sid(data, state)
-        assert force[2] == 0.0
-        assert_close(moment[:2], [0.0, 0.0])
-        # One arm on a fixed cart, at angle zero, gravity instead of the frame's acceleration.
-        none = np.zeros((1, 2))
-        motion = RigidMotion(none, np.array([[0.0, s.w[2]]]), np.array([[0.0, s.g[2]]]))
-        machine = Mechanism((from_sid(data, 2),), 0.0, 0.0, (-s.a[0], -s.a[1]), 0.0)
-        rates = state.q[None], state.qd[None], state.qdd[None]
-        elastic, drives = inverse_dynamics(machine, motion, *rates)
-        springs = body.K @ state.q + body.D @ state.qd
-        size = max(float(np.abs(springs).max()), 10.0 * float(np.abs(rows).max()))
-        assert_close(elastic[0] - springs, rows, size=size)
-        if state is not s or not stiff:  # 1e-11: squares of the small coordinates
-            assert_close(drives[0], [force[0], moment[2]], 1e-11 if stiff else ROUNDING)
-
-
 @STIFF
 @PLANE_AND_SPACE
 def test_outboard_node(dimension, stiff):
@@ -288,31 +253,6 @@ def test_outboard_node(dimension, stiff):
     small = 1e-7 * s.q
     turned = Interface(moving(body, replace(s, q=small))).turning.R[:, :, 0]
     assert np.abs(tip.AP.at(small) - turned).max() < 1e-13
-
-
-def test_stiffened_body_of_a_file_moves_the_same(tmp_path):
-    """A beam that is spun up, from its file: the motion of the body that was written."""
-    arm = substructure((1.0, 0.01, 0.01), (40, 2), poisson_ratio=0.0)
-    one = np.ones(arm.mesh.num_cells)
-    elastic = arm.at(70e9 * one, 2700.0 * one)
-    basis = craig_bampton(elastic, Options(4))
-    body = shape_integrals(elastic, basis, 1e-3, unit_loads(elastic))
-    write_sid(tmp_path / "beam.sid", sid_of(body))
-
-    def deflection(body):
-        def motion(t):
-            zero = np.zeros_like(t)
-            columns = [np.stack([zero, 20.0 * t**k / k], axis=1) for k in (2, 1)]
-            return RigidMotion(columns[0], columns[1], np.stack([zero, 20.0 + zero], axis=1))
-
-        machine = Mechanism((body,), 0.1, 0.0, (0.0, 0.0), 0.0)
-        system = ElasticSystem(machine, motion, (0.0, 1.0))
-        return radau.integrate(system, 1e-6, 4, Profile()).sample(np.linspace(0.0, 1.0, 101), 0)
-
-    written = deflection(body)
-    assert_close(deflection(load_body(tmp_path / "beam.sid", 2)), written, 1e-9, size=0.0)
-    linear = deflection(linear_part(body))
-    assert np.abs(linear - written).max() > 0.1 * np.abs(written).max()
 
 
 @pytest.fixture(scope="module")
