@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bodies import beam, random_cloud
+from machines import distance
 
 from dolfinopt.dynamics import batch, radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, Scale
@@ -75,13 +75,6 @@ def alone(monkeypatch) -> list[ElasticSystem]:
 
     monkeypatch.setattr(batch, "attempted", counted)
     return left
-
-
-def distance(problem: ElasticSystem, one: Solution, other: Solution) -> float:
-    """Return the relative difference in energy over the horizon."""
-    t = np.linspace(0.0, problem.breakpoints[-1], 500)
-    here, there = one.sample(t), other.sample(t)
-    return relative_error(problem.mechanism, here - there, there)
 
 
 def test_scales_are_those_of_scaled_bodies():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
+from machines import distance
 from remainders import build
 
 from dolfinopt.dynamics import generalized_alpha, measured, radau
@@ -117,13 +118,6 @@ def solve(
     if integrator == "radau":
         return radau.integrate(problem, tolerance, 3, profile)
     return generalized_alpha.integrate(problem, tolerance, 0.8, profile)
-
-
-def distance(problem: ElasticSystem, one: Solution, other: Solution, count: int = 1000) -> float:
-    """Return the relative distance in the norm of `tolerance` over many instants."""
-    t = np.linspace(0.0, problem.breakpoints[-1], count + 1)
-    q = other.sample(t)
-    return relative_error(problem.mechanism, one.sample(t) - q, q)
 
 
 # -- coefficients ----------------------------------------------------------------------------
