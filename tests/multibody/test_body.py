@@ -15,8 +15,6 @@ LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.01  # m
 YOUNG, DENSITY = 70e9, 2700.0  # Pa, kg/m3
 DAMPING = 2e-4  # s
 REDUCTORS = {"craig-bampton": craig_bampton, "modal": modal}
-# Gmsh places points to 2e-12 of the length.
-PLACING = 1e-10
 # Sums over some dozens of cells; measured: 1e-15.
 ROUNDING = 1e-12
 

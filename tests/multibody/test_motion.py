@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import assert_close, derivative
-from mpi4py import MPI
 from remainders import built_of
 from runs import refused
 from scipy.optimize import brentq
@@ -35,8 +34,6 @@ from dolfinopt.paths.time_laws import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
-
-WORLD = MPI.COMM_WORLD
 
 DURATION = 1.9  # s
 INSIDE = np.linspace(0.1, 1.8, 18)  # s, where the path is smooth

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from bodies import assert_close
 from mpi4py import MPI
 from remainders import taylor, wave
-from runs import TWO_ARM, demo, environment, overrides, refused, run, scene
+from runs import TWO_ARM, demo, refused, scene
 from scipy.optimize import brentq
 
 import dolfinopt as do
@@ -126,40 +123,6 @@ def test_repeated_frequencies(apart: float) -> None:
     test = taylor(scene(*QUICK, *changes), lambda k, x, y: np.full_like(x, 0.5), FINER)
     assert test.passed, rates(test)
     assert np.isfinite([row.slope for row in test.rows]).all()
-
-
-# The command with even small arms cut in pieces where there are more ranks than arms.
-SPLIT = """
-from dolfinopt import parallel
-parallel.SPLIT_CELLS = 1
-from dolfinopt.cli import main
-main()
-"""
-
-
-@pytest.mark.serial
-@pytest.mark.slow
-@pytest.mark.parametrize(("method", "ranks"), [("craig-bampton", 2), ("modal", 3)])
-def test_same_gradient_on_any_number_of_ranks(tmp_path, method: str, ranks: int) -> None:
-    """Whole arms dealt out to two ranks; an arm cut in two on three."""
-    found = []
-    for count in (1, ranks):
-        out = tmp_path / f"{count}.npz"
-        line = ["gradient", str(TWO_ARM), "--kind", "exact", "--out", str(out)]
-        line += overrides("arms.cells=[20,4]", "motion.horizon=2.0", f"reduction.method={method}")
-        if count == 1:
-            run(*line)
-        else:
-            line = ["mpirun", "-n", str(count), sys.executable, "-c", SPLIT, *line]
-            subprocess.run(line, env=environment(), check=True, capture_output=True, timeout=120)
-        with np.load(out) as data:
-            found.append({key: data[key] for key in data.files})
-    assert found[1].keys() == found[0].keys()
-    for key, values in found[0].items():
-        if values.dtype.kind == "U":  # names of the scene and of the objective
-            assert np.array_equal(found[1][key], values)
-        else:
-            assert_close(found[1][key], values, 1e-8)
 
 
 @pytest.mark.slow
