@@ -91,30 +91,6 @@ def test_carried(arms: int, kind: str) -> None:
         np.testing.assert_allclose(load.matrix(), expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("arms", [1, 2, 3, 4])
-@pytest.mark.parametrize("kind", ["rigid-body", "point-mass", "none"])
-def test_cotangents_are_the_transpose(arms: int, kind: str) -> None:
-    """<W, carried(bodies)> is linear in the bodies, and <slopes(W), bodies> the same number."""
-    rng = np.random.default_rng(arms)
-    (chain, _), (other, _) = chain_of_points(rng, arms), chain_of_points(rng, arms)
-    weights = list(rng.normal(size=(arms, 3, 3)))
-
-    def product(bodies: list[RigidIntegrals]) -> float:
-        moved = Chain(bodies, chain.outboard_points, chain.angles, chain.loads, kind).carried()
-        return sum(np.sum(w * load.matrix()) for w, load in zip(weights, moved, strict=True))
-
-    one = Chain(chain.bodies, chain.outboard_points, chain.angles, chain.loads, kind)
-    slopes = one.cotangents(weights)
-    found = sum(
-        s.mass * d.mass + (np.conj(s.moment) * d.moment).real + s.inertia * d.inertia
-        for s, d in zip(slopes, other.bodies, strict=True)
-    )
-    both = [a + b for a, b in zip(chain.bodies, other.bodies, strict=True)]
-    expected = product(both) - product(list(chain.bodies))
-    assert found == pytest.approx(expected, rel=1e-11, abs=1e-11)
-    assert (expected == 0.0) == (arms == 1 or kind == "none")
-
-
 def test_rigid_integrals_of_a_bar() -> None:
     """Solid, and with the outer half empty: m, m L / 2, m (L^2 / 3 + h^2 / 12).
 

@@ -112,24 +112,6 @@ def test_scales_are_those_of_scaled_bodies():
             np.testing.assert_allclose(found[n], expected, rtol=1e-10, atol=1e-10)
 
 
-def test_related_bodies():
-    """Scaled bodies are found, with their factors; others are not."""
-    problems = [
-        two_arms(),
-        two_arms(factors=(1.5, 0.5, 3.0 * DAMPING)),
-        two_arms(factors=(1.0, 1.0, 0.0)),
-        two_arms(bending=11.0),
-    ]
-    bar = rigid_bar(0.5, 0.05, 0.675)
-    last = replace(problems[0].mechanism, bodies=(problems[0].mechanism.bodies[0], bar))
-    problems.append(replace(problems[0], mechanism=last))
-    first, other, undamped, stiffer, rigid = batch.related(problems)
-    np.testing.assert_allclose(first, [[1.0, 1.0, DAMPING]] * 2, rtol=1e-12)
-    np.testing.assert_allclose(other, [[1.5, 0.5, 1.5 * DAMPING]] * 2, rtol=1e-12)
-    np.testing.assert_allclose(undamped, [[1.0, 1.0, 0.0]] * 2, rtol=1e-12)
-    assert stiffer is None and rigid is None
-
-
 def test_batch_is_each_of_them_alone(alone):
     """To the tolerance with steps of its own, and to Newton's remainder on the same steps."""
     problems = various()

@@ -23,7 +23,6 @@ from machines import (
 from runs import TWO_ARM, overrides, run
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.measured import LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.mechanism import saturated
 
@@ -115,17 +114,6 @@ def test_work_under_gravity_is_energy(kind: str) -> None:
     parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
     assert min(parts) > 1e-4 * max(parts)  # each of them counts
     assert imbalance(result) < 1e-8  # measured 2e-11 at most
-
-
-def test_rigid_limit() -> None:
-    """Arms a thousand times as stiff need the forces of rigid ones, and follow the path."""
-    result = simulated(small(material={"young_modulus": 70e12}))
-    trajectory, system = machine(result)
-    none = np.zeros((len(trajectory.t), 0))
-    forces = inverse_dynamics(system.rigid, trajectory.desired, none, none, none)[1]
-    for k in range(3):
-        assert apart(trajectory.joint_forces[:, k], forces[:, k]) < 2e-3  # measured 6e-4
-    assert result.max_deviation < 1e-4  # m; 3.6e-5
 
 
 def test_stiff_springs_are_rigid_drives() -> None:

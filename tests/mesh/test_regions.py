@@ -9,8 +9,6 @@ from mpi4py import MPI
 from runs import ROOT, STATED, TWO_ARM, overrides, refusal, run
 
 import dolfinopt as do
-from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.optimization.measured import STEP_RATIO
 from dolfinopt.optimization.problem import Evaluator
 from dolfinopt.output.views import gather_views
 from dolfinopt.plots.design import REGION, design_figure
@@ -75,29 +73,6 @@ def test_regions_stay_in_every_design(projection, symmetric):
             assert (by_x[mesh.fixed] == 0.0).all() and (by_x[~mesh.fixed] > 0.0).any()
     fixed = variables.xmin == variables.xmax
     assert fixed.sum() == sum(arm.mesh.fixed.sum() for arm in arms.values())
-
-
-@pytest.mark.parametrize(
-    ("kind", "law"),
-    [
-        ("esl", "simp"),
-        pytest.param("eigenfrequency", "ramp", marks=pytest.mark.serial),  # ranks: the other one
-    ],
-)
-@pytest.mark.usefixtures("three_steps")
-def test_gradients_with_regions(kind, law):
-    """Void cells keep the stiffness regular with every law; remainders fall by their square."""
-    scene, partition, arms = built(
-        regions(HOLE, LUG),
-        f"objective.kind={kind}",
-        f"interpolation.law={law}",
-        *("motion.horizon=2.0", "simulation.tolerance=1e-6"),
-    )
-    x = {k: 0.5 + 0.4 * np.sin(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
-    for row in taylor_test(scene, partition, arms, x, do.Profile()).rows:
-        # Not the finest one: "simp" has a void of 1e-12, and rounding to suit.
-        rate = np.log(row.remainders[1] / row.remainders[2]) / np.log(STEP_RATIO)
-        assert row.slope != 0.0 and rate > 1.9
 
 
 def test_a_run_keeps_its_regions(shared_tmp_path):

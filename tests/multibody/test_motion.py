@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import assert_close, derivative
-from remainders import built_of
 from runs import refused
 from scipy.optimize import brentq
 
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.multibody.motion import (
@@ -384,34 +382,3 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
 
 
 HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `scene`'s arms
-
-
-def simulated(of: Scene) -> Trajectory:
-    """Return the trajectory of solid arms."""
-    built = built_of(of)
-    _, trajectory = built.evaluate({k: arm.uniform(1.0) for k, arm in built.arms.items()})
-    assert trajectory is not None
-    return trajectory
-
-
-def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> None:
-    """Slowly: tangential and centrifugal loads of arm and payload on Bernoulli's beam and bar."""
-    file = tmp_path / "joints.csv"
-    file.write_text("t,arm0\n0,0.2\n1.9,2.7\n")  # two rows in time: the quintic law
-    length, mass = 0.7, 0.5  # m, kg
-    of = scene(
-        (length,), {"payload": {"mass": mass}}, (70, 6), path="joints", file=str(file), base="fixed"
-    )
-    trajectory = simulated(of)
-    s, sd, sdd = quintic(trajectory.t, DURATION)
-    alpha, speed, acceleration = 0.2 + 2.5 * s, 2.5 * sd, 2.5 * sdd
-    assert_close(trajectory.q_r[:, 1], alpha, 1e-13)
-    deviation = (trajectory.deviation @ [1.0, 1j]) * np.exp(-1j * alpha)
-    area, bending = HEIGHT * THICKNESS, STEEL[0] * THICKNESS * HEIGHT**3 / 12.0
-    line = STEEL[1] * area
-    across = 11.0 * line * length**5 / 120.0 + mass * length**4 / 3.0
-    along = (line * length**3 / 3.0 + mass * length**2) / (STEEL[0] * area)
-    # Six cells across bend too little and shear adds some: 1.5 % together.
-    assert_close(deviation.imag, -across / bending * acceleration, 0.02)
-    # Pulling needs no fine mesh; the ends, held against contraction, make it 0.3 % shorter.
-    assert_close(deviation.real, along * speed**2, 0.01)

@@ -453,21 +453,6 @@ def test_more_coordinates_bring_the_full_arm(shared_arm):
     assert (np.abs(missing["balanced"]).max(axis=1) < [1e-3, 1e-3, 1e-5, 1e-7]).all()
 
 
-@pytest.mark.parametrize("method", sorted(SUBSPACES))
-def test_subspaces_repeat_themselves_and_ignore_the_start(own_arm, method):
-    """To the last bit, on every rank."""
-    arm = own_arm
-    arm = with_densities(arm, hollow(arm.mesh.centroid))
-    first = SUBSPACES[method](arm, Options(8))
-    arm = with_densities(arm, graded(arm.mesh.centroid))
-    SUBSPACES[method](arm, Options(5))
-    arm = with_densities(arm, hollow(arm.mesh.centroid))
-    again = SUBSPACES[method](arm, Options(8), first.V[arm.interior_nodes, 0])
-    for ours, theirs in zip(dataclasses.astuple(again), dataclasses.astuple(first)):
-        assert np.array_equal(ours, theirs)
-        assert np.array_equal(COMM.bcast(ours), ours)
-
-
 FIRST = 49.0  # Hz; replaced by the arm's first frequency
 
 

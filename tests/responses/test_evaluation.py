@@ -17,7 +17,7 @@ from dolfinopt.dynamics.collocation import Solution, radau_iia, response_instant
 from dolfinopt.multibody.end_effector import deviation
 from dolfinopt.multibody.shape_integrals import rigid_bar
 from dolfinopt.responses.constraints import load_cases, objective
-from dolfinopt.responses.evaluation import constraint_gradients, evaluate, evaluate_batch
+from dolfinopt.responses.evaluation import constraint_gradients, evaluate_batch
 
 WORLD = MPI.COMM_WORLD
 
@@ -299,25 +299,6 @@ def test_densities_that_are_none_are_refused(change, words) -> None:
         built.evaluate(x)
     with refused(*words):
         evaluate_batch([built.scene] * 2, built.partition, built.arms, x, do.Profile())
-
-
-def test_arms_under_another_scene_keep_their_own_design() -> None:
-    """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
-    built = build("objective.kind=static", "constraints.first_frequency=4.0")
-    stiff, weak = built.fields(same), {k: 0.8 * v for k, v in built.fields(same).items()}
-    place = built.scene, built.partition
-    expected = [evaluate(*place, built.arms, x, do.Profile())[0] for x in (weak, stiff)]
-    slopes = built.gradient()
-    other = {k: arm.under(built.scene) for k, arm in built.arms.items()}
-    for _ in range(2):
-        for arms, x, want in ((other, weak, expected[0]), (built.arms, stiff, expected[1])):
-            found = evaluate(*place, arms, x, do.Profile())[0]
-            assert found.objective == pytest.approx(want.objective, rel=1e-9)
-            assert found.compliance == pytest.approx(want.compliance, rel=1e-6)
-            assert found.constraints == pytest.approx(want.constraints, rel=1e-7)
-    evaluate(*place, other, weak, do.Profile())
-    for k, slope in built.gradient().items():
-        np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())
 
 
 @pytest.mark.serial  # ranks have no part in it

@@ -196,6 +196,7 @@ CASES = [
     # Two arms of one design, by the densities of one; of the same size, or scaled.
     *(case("two_arm", *REPEATED, kind, ranks=kind == STATIC)
       for kind in ("objective.kind=esl", STATIC, FREQUENCY, DEVIATION)),
+    case("two_arm", *REPEATED, STATIC, "interpolation.law=simp"),
     # Other numbers of arms.
     case("one_arm", COMPLIANCE, "motion.law=trapezoidal"),
     case("three_arm", "motion.law=s-curve", "objective.load_cases=5", slow=True),

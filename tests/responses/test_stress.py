@@ -292,22 +292,6 @@ def cell_stress_of_fields(arm) -> CellStress:
     return CellStress(state, empty, arm.mesh.area, np.sqrt(state.x_phys))
 
 
-def test_work_is_done_once() -> None:
-    """Value and gradient share fields and search."""
-    built = build(*QUICK, "simulation.stiffening=false", "reduction.coordinates=4",
-                  "constraints.stress=1e8")  # fmt: skip
-    x = built.fields(wave)
-    one = Analysed(built, x)
-    one.measure()
-    before = built.profile.counts.solves
-    one.measure()
-    assert built.profile.counts.solves == before
-    one.gradient()
-    adjoint = 4 + 2 * 4  # unit loads' inertia, elastic inertia
-    modes = 3  # and the constraint modes; normal modes iterate
-    assert built.profile.counts.solves - before >= 2 * (adjoint + modes)
-
-
 def test_stress_in_python() -> None:
     """Asked for, a simulation knows it and draws it; an optimisation knows it anyway."""
     model = do.Model(do.load_scene(TWO_ARM, ["arms.cells=[20,3]", "simulation.sample=0.01"]))
