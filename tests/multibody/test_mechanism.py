@@ -150,15 +150,6 @@ def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
         assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
 
 
-def test_mass_matrix(machine: Machine) -> None:
-    """Symmetric and positive definite over rigid and elastic coordinates together."""
-    size = machine.states.shape[2]
-    mass = machine.tangent(None, np.arange(machine.rigid)).dense()[:, :, 2 * size :]
-    assert_close(mass, mass.swapaxes(1, 2), ROUNDING)
-    if isinstance(machine.model, Chain) and not machine.model.K0:  # large ones bend too far
-        assert np.linalg.eigvalsh(mass).min() > 0.0
-
-
 @pytest.mark.parametrize("name", CONSTANTS)
 def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
     """Virtual work of rows and drives by every integral of every body."""

@@ -379,6 +379,3 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
     arms = (of.arms[0].model_copy(update={"name": name}), of.arms[1])
     with refused(f"'{name}'", "another name"):
         check_motion(of.model_copy(update={"arms": arms}))
-
-
-HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `scene`'s arms
