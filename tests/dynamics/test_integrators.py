@@ -12,7 +12,7 @@ from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
 from machines import distance
 from remainders import build
 
-from dolfinopt.dynamics import generalized_alpha, measured, radau
+from dolfinopt.dynamics import adjoint, generalized_alpha, measured, radau
 from dolfinopt.dynamics import newton as factors
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
@@ -46,22 +46,16 @@ ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 # -- problems --------------------------------------------------------------------------------
 
 
-def still(t: np.ndarray) -> RigidMotion:
-    """Return no motion."""
-    rest = np.zeros((len(t), 3))
-    return RigidMotion(rest + HOMES[:3], rest, rest)
-
-
-def swing(t: np.ndarray) -> RigidMotion:
+def swing(t: np.ndarray, size: tuple[float, ...] = (0.1, 0.5, -0.4)) -> RigidMotion:
     """Return harmonic motions that start without speed, smooth for ever."""
     w = np.array([3.0, 4.0, 5.0])  # rad/s
-    size = np.array([0.1, 0.5, -0.4])
-    t = t[:, None]
-    return RigidMotion(
-        HOMES[:3] + size * (1.0 - np.cos(w * t)),
-        size * w * np.sin(w * t),
-        size * w**2 * np.cos(w * t),
-    )
+    s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
+    return RigidMotion(HOMES[:3] + size * (1.0 - c), size * w * s, size * w**2 * c)
+
+
+def still(t: np.ndarray) -> RigidMotion:
+    """Return no motion."""
+    return swing(t, (0.0, 0.0, 0.0))
 
 
 def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMotion:
@@ -140,22 +134,10 @@ def test_radau_coefficients(stages: int) -> None:
 def test_generalized_alpha_weights(rho_inf: float) -> None:
     """The spectral radius of an oscillator is at most one, and rho_inf where h -> infinity."""
     w = generalized_alpha.parameters(rho_inf)
-    for frequency in np.logspace(-2, 6, 33):  # rad/s, at h = 1 s
+    for square in np.logspace(-4, 12, 33):  # of the frequency, rad2/s2, at h = 1 s
         # Unknowns (q, qd, a) at the end: Newmark's two formulas and the row at the midpoint.
-        left = np.array(
-            [
-                [1.0, 0.0, -w.beta],
-                [0.0, 1.0, -w.gamma],
-                [(1 - w.alpha_f) * frequency**2, 0.0, 1 - w.alpha_m],
-            ]
-        )
-        right = np.array(
-            [
-                [1.0, 1.0, 0.5 - w.beta],
-                [0.0, 1.0, 1.0 - w.gamma],
-                [-w.alpha_f * frequency**2, 0.0, -w.alpha_m],
-            ]
-        )
+        left = [[1, 0, -w.beta], [0, 1, -w.gamma], [(1 - w.alpha_f) * square, 0, 1 - w.alpha_m]]
+        right = [[1, 1, 0.5 - w.beta], [0, 1, 1 - w.gamma], [-w.alpha_f * square, 0, -w.alpha_m]]
         radius = np.abs(np.linalg.eigvals(np.linalg.solve(left, right))).max()
         assert radius <= 1.0 + 1e-7  # coinciding eigenvalues move by the root of rounding
     # The limit's triple eigenvalue (rho_inf = 0) is off by the cube root of 1 / frequency^2.
@@ -214,12 +196,8 @@ def fitted_order(
     """Return log(error ratio) / log(ratio of the steps) at instants of both grids."""
     t = np.linspace(0.0, 0.5, 11)[1:]
     exact = reference.sample(t, rate)
-    errors = [
-        relative_error(
-            problem.mechanism, on_grid(even_steps(problem, count)).sample(t, rate) - exact, exact
-        )
-        for count in counts
-    ]
+    found = [on_grid(even_steps(problem, count)).sample(t, rate) for count in counts]
+    errors = [relative_error(problem.mechanism, one - exact, exact) for one in found]
     return float(np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0]))
 
 
@@ -250,9 +228,8 @@ def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None
     problem, _ = two_arms(*profile(name), axial=100.0, damping=2e-3)
     # One stage more on the finest steps: far below the errors that are measured, 1e-9 at the least.
     reference = radau.on_grid(problem, even_steps(problem, max(counts)), 1e-12, stages + 1)
-    order = fitted_order(
-        problem, lambda edges: radau.on_grid(problem, edges, 1e-12, stages), counts, reference
-    )
+    on_grid = lambda edges: radau.on_grid(problem, edges, 1e-12, stages)  # noqa: E731
+    order = fitted_order(problem, on_grid, counts, reference)
     # Shaken by the fastest vibration, 43 Hz, of which the longest steps see one period.
     assert order == pytest.approx(2 * stages - 1, abs=0.2 if name == "smooth" else 0.4)
 
@@ -263,14 +240,9 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
     """Order two of coordinates and accelerations, against Radau."""
     problem, _ = two_arms(swing, (0.0, 0.5), axial=100.0, damping=2e-3)
     reference = radau.on_grid(problem, even_steps(problem, 160), 1e-12, 4)
+    on_grid = lambda edges: generalized_alpha.on_grid(problem, edges, 1e-6, rho_inf)  # noqa: E731
     for rate in (0, 2):
-        order = fitted_order(
-            problem,
-            lambda edges: generalized_alpha.on_grid(problem, edges, 1e-6, rho_inf),
-            (200, 400),
-            reference,
-            rate,
-        )
+        order = fitted_order(problem, on_grid, (200, 400), reference, rate)
         assert order == pytest.approx(2.0, abs=0.1)
 
 
@@ -608,19 +580,17 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Return steps and slow coordinates of every matrix that the test will make."""
     made: list[tuple[int, int]] = []
 
-    def spy(stages: Stages, *at_and_slow: np.ndarray) -> NewtonMatrix:
-        made.append((len(stages.h), len(at_and_slow[-1])))
-        return factorise(stages, *at_and_slow)
+    def spy_on(function: Callable[..., NewtonMatrix]) -> Callable[..., NewtonMatrix]:
+        def spy(stages: Stages, *others: np.ndarray) -> NewtonMatrix:
+            made.append((len(stages.h), len(others[-1])))
+            return function(stages, *others)
 
-    def simplified_spy(stages, begin, a, slow):  # type: ignore[no-untyped-def]
-        made.append((len(stages.h), len(slow)))
-        return simplified_newton_matrix(stages, begin, a, slow)
+        return spy
 
-    for module in ("newton", "radau", "adjoint"):
-        monkeypatch.setattr(f"dolfinopt.dynamics.{module}.factorise", spy)
-    for module in ("newton", "radau"):
-        name = f"dolfinopt.dynamics.{module}.simplified_newton_matrix"
-        monkeypatch.setattr(name, simplified_spy)
+    for module in (factors, radau, adjoint):
+        for function in (factorise, simplified_newton_matrix):
+            if hasattr(module, function.__name__):
+                monkeypatch.setattr(module, function.__name__, spy_on(function))
     return made
 
 
@@ -803,9 +773,8 @@ def test_sample_of_known_polynomials() -> None:
         return np.stack([p.deriv(order)(t) if order else p(t) for p in motion], axis=-1)
 
     stages = edges[:-1, None] + np.diff(edges)[:, None] * nodes
-    solution = Solution(
-        edges, nodes, values(edges[:-1], 0), values(edges[:-1], 1), values(stages, 2), 0.0, 0
-    )
+    begin = values(edges[:-1], 0), values(edges[:-1], 1)
+    solution = Solution(edges, nodes, *begin, values(stages, 2), 0.0, 0)
     t = np.array([0.0, 0.1, 0.3, 0.31, 0.9, 1.0])
     for order in range(3):
         assert_close(solution.sample(t, order), values(t, order), 1e-14)
