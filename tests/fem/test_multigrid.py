@@ -85,6 +85,25 @@ def test_warm_start(iterative):
 
 
 @pytest.mark.serial
+def test_contrast(direct, iterative):
+    """Void of 1e-3 to 1e-9 around a beam and an island: the same stiffness, few steps more."""
+    x, y, z = direct.mesh.centroid.T
+    core = (np.abs(y) < 0.015) & (np.abs(z) < 0.005)
+    solid = (~core & (np.abs(z) < 0.015)) | (core & (np.abs(x - 0.25) < 0.03))
+    solver, steps = iterative.substructure.interior, []
+    for void in (1e-3, 1e-6, 1e-9):
+        young, density = (value * np.where(solid, 1.0, void) for value in (70e9, 2700.0))
+        solver._solutions.clear()
+        right, found = (
+            arm.substructure.at(young, density).constraint_modes().stiffness
+            for arm in (direct, iterative)
+        )
+        assert np.abs(found / right - 1.0).diagonal().max() < 1e-9
+        steps.append(solver._iterative.steps)
+    assert max(steps) < 1.3 * steps[0]
+
+
+@pytest.mark.serial
 def test_smaller_aggregates(iterative, monkeypatch):
     """Where steps are many, the next design's hierarchy coarsens more gradually and takes fewer."""
     solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
