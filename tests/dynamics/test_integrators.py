@@ -389,6 +389,18 @@ def test_what_cannot_be_solved_is_a_named_error(integrator, problem, tolerance, 
             solve(integrator, problem(), tolerance)
 
 
+@pytest.mark.parametrize("failing", [0, 1, 3])
+def test_failures_on_any_grid_are_a_named_error(monkeypatch, on_grids, failing: int) -> None:
+    """A grid fails, then the march along the motion: its error names the remedy."""
+    problem, _ = two_arms()
+    plain = replace(radau.on_grid(problem, even_steps(problem, 20), 1e-2, 3), error=0.3**failing)
+    grids = on_grids(lambda number, *_: stuck() if number > failing else plain)
+    monkeypatch.setattr(radau, "graded", stuck)
+    with pytest.raises(ConvergenceError, match="stiffen the arms"):
+        solve("radau", problem, 1e-2)
+    assert len(grids) == failing + 1
+
+
 def test_marches_once(monkeypatch: pytest.MonkeyPatch, on_grids) -> None:
     """Where its steps fail, too, nothing else is tried."""
     marches, graded, estimated = [], radau.graded, radau.estimated_errors

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from mpi4py import MPI
-from runs import ROOT, STATED, TWO_ARM, overrides, refusal, run
+from runs import ROOT, STATED, TWO_ARM, refusal
 
 import dolfinopt as do
 from dolfinopt.optimization.problem import Evaluator
@@ -73,21 +73,6 @@ def test_regions_stay_in_every_design(projection, symmetric):
             assert (by_x[mesh.fixed] == 0.0).all() and (by_x[~mesh.fixed] > 0.0).any()
     fixed = variables.xmin == variables.xmax
     assert fixed.sum() == sum(arm.mesh.fixed.sum() for arm in arms.values())
-
-
-def test_a_run_keeps_its_regions(shared_tmp_path):
-    """How it resumes: tests/arms/test_patterns.py."""
-    changes = (*SMALL, regions(HOLE, LUG), "motion.horizon=2.0", "optimizer.max_iterations=4")
-    run("optimize", TWO_ARM, "--out", shared_tmp_path / "run", "--no-plots", *overrides(*changes))
-    WORLD.barrier()
-    design = np.load(shared_tmp_path / "run" / "design.npz")
-    (x, y), density = design["arm1/centroid"].T, design["arm1/density"]
-    assert (density[(x - 0.5) ** 2 + y**2 < 0.021**2] == 0.0).all()
-    assert (density[(x > 0.2) & (x < 0.3) & (y > 0.01)] == 1.0).all()
-    summary = json.loads((shared_tmp_path / "run" / "summary.json").read_text())
-    assert summary["constraints"]["volume_fraction_arm1"]["value"] == pytest.approx(density.mean())
-    assert summary["volume_fraction"]["arm1"] <= 0.5005
-    assert len(summary["scene"]["arms"][0]["regions"]) == 2
 
 
 def test_regions_are_drawn():

@@ -278,6 +278,25 @@ def test_densities_that_are_none_are_refused(change, words) -> None:
 
 
 @pytest.mark.serial  # ranks have no part in it
+def test_arms_under_another_scene_keep_their_own_design() -> None:
+    """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
+    built = build("objective.kind=static", "constraints.first_frequency=4.0")
+    other = replace(built, arms={k: arm.under(built.scene) for k, arm in built.arms.items()})
+    stiff = built.fields(same)
+    weak = {k: 0.8 * x for k, x in stiff.items()}
+    expected = [built.evaluate(x)[0] for x in (weak, stiff)]
+    slopes = built.gradient()
+    for _ in range(2):
+        for one, x, want in ((other, weak, expected[0]), (built, stiff, expected[1])):
+            found = one.evaluate(x)[0]
+            assert found.objective == pytest.approx(want.objective, rel=1e-9)
+            assert found.constraints == pytest.approx(want.constraints, rel=1e-7)
+    other.evaluate(weak)
+    for k, slope in built.gradient().items():
+        np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())
+
+
+@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("gradient", "more"), [("esl", 7), ("exact", 14)])
 def test_solves_of_geometric_stiffness(gradient, more):
     """Seven static solves an arm and design, seven more for the exact gradient; none without it.
