@@ -51,7 +51,7 @@ def test_cells_have_the_densities_of_their_partners(projection):
     scene, partition, arms = built(*REPEATED, REGIONS, f"design.projection={projection}")
     evaluator = Evaluator(scene, partition, arms, do.Profile())
     assert evaluator.variables.size == (160 if 0 in arms else 0)
-    x = evaluator.variables.join({0: waves(arms[0])} if 0 in arms else {})
+    x = evaluator.variables.join({k: waves(arms[k]) for k in arms if k == 0})
     evaluator.continuation.beta = 4.0
     for design in evaluator.physical_designs(x):
         mine = {k: by_place(scene, arms, k, one.x_phys) for k, one in design.items()}
@@ -76,55 +76,45 @@ def test_the_same_arm_again_is_the_shared_design():
     np.testing.assert_allclose(same[:, 3], ended[:, 3], rtol=1e-3)
 
 
-def test_constraints_of_both_arms_bind_one_design():
-    """Every arm's own limits, one volume; their gradients by x against central differences."""
-    scene, partition, arms = built(
-        *SCALED,
-        "objective.kind=static",
-        "constraints.tip_deflection=1e-4",
-        "constraints.first_frequency=50.0",
-    )
-    evaluator = Evaluator(scene, partition, arms, do.Profile())
-    x = evaluator.variables.join({k: waves(arms[k]) for k in arms if k == 0})
-    [here] = evaluator.evaluate(x)
-    names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
-    assert names == [
-        ("volume_fraction", ("arm1",)),
-        ("first_frequency", ("arm1", "arm2")),
-        ("tip_deflection", ("arm1", "arm2")),
-    ]
-    free = evaluator.variables.xmin < evaluator.variables.xmax
-    direction = np.where(free, np.cos(np.arange(x.size)), 0.0)
-    h = 1e-5
-    ahead, behind = (
-        evaluator.evaluate(np.clip(x + sign * h * direction, 0.0, 1.0))[0] for sign in (1.0, -1.0)
-    )
-    differences = np.subtract(ahead.evaluation.constraints, behind.evaluation.constraints) / (2 * h)
-    slopes = WORLD.allreduce(here.constraints @ direction)
-    np.testing.assert_allclose(slopes, differences, rtol=1e-6)
+LIMITED = "constraints.tip_deflection=1e-4", "constraints.first_frequency=50.0"
+MOVED = "objective.gradient=exact", "simulation.tolerance=1e-7", "motion.horizon=2.2"
 
 
-@pytest.mark.parametrize("kind", [pytest.param("stress", marks=pytest.mark.serial), "peak_force"])
-def test_gradients_of_extremes_know_void_cells(kind):
-    """A void cell has no stress and no say; central differences by the design of both arms."""
-    exact = ("objective.gradient=exact", "simulation.tolerance=1e-7", "motion.horizon=2.2")
-    limit = "constraints.deviation=0.02"
-    scene, partition, arms = built(*REPEATED, REGIONS, *exact, limit, f"objective.kind={kind}")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        (*SCALED, *LIMITED, "objective.kind=static"),
+        (*REPEATED, REGIONS, *MOVED, "constraints.deviation=0.02", "objective.kind=peak_force"),
+        pytest.param(
+            (*REPEATED, REGIONS, *MOVED, "constraints.deviation=0.02", "objective.kind=stress"),
+            marks=pytest.mark.serial,
+        ),
+    ],
+)
+def test_gradients_by_the_design_of_both_arms(changes):
+    """Every arm's own limits, one volume; a void cell has no say: by central differences."""
+    scene, partition, arms = built(*changes)
     evaluator = Evaluator(scene, partition, arms, do.Profile())
     variables = evaluator.variables
-    start = np.concatenate([waves(arms[k]) for k in arms if k == 0] or [np.empty(0)])
-    x = np.clip(start, variables.xmin, variables.xmax)
+    x = variables.join({k: waves(arms[k]) for k in arms if k == 0})
+    x = np.clip(x, variables.xmin, variables.xmax)
     free = variables.xmin < variables.xmax
     direction = np.where(free, np.cos(1.7 * np.arange(x.size)), 0.0)
     [here] = evaluator.evaluate(x)
     assert np.isfinite(here.objective).all() and np.isfinite(here.constraints).all()
-    # The p-mean jumps by 1e-4 where an instant falls below its limit: here 7e-5 away.
+    # p-means jump by 1e-4 where an instant falls below their limit: here 7e-5 away.
     h = 1e-5
-    ahead, behind = (
-        evaluator.evaluate(x + sign * h * direction)[0].evaluation.objective for sign in (1, -1)
-    )
-    slope = WORLD.allreduce(float(here.objective @ direction))
-    assert slope == pytest.approx((ahead - behind) / (2.0 * h), rel=1e-5)
+    pairs = [evaluator.evaluate(x + sign * h * direction)[0].evaluation for sign in (1, -1)]
+    ahead, behind = (np.array([one.objective, *one.constraints]) for one in pairs)
+    slopes = WORLD.allreduce(np.vstack([here.objective, here.constraints]) @ direction)
+    counted = slice(None) if "objective.kind=static" in changes else slice(1)
+    differences = (ahead - behind) / (2.0 * h)
+    np.testing.assert_allclose(slopes[counted], differences[counted], rtol=1e-5)
+    if counted == slice(None):
+        names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
+        both = ("arm1", "arm2")
+        limits = [("first_frequency", both), ("tip_deflection", both)]
+        assert names == [("volume_fraction", ("arm1",)), *limits]
 
 
 def test_any_number_of_ranks_ends_in_the_same_design():
@@ -144,8 +134,8 @@ def test_an_arm_on_two_ranks_has_partners_on_both():
     patterns = Patterns(scene, partition, arms)
     x, y = arms[0].mesh.centroid.T
     scale = [1.0 / 0.8, 0.06 / 0.045]
-    for spread, field in ((patterns.spread({0: x + 10.0 * y}), lambda p: p[0] + 10.0 * p[1]),):
-        np.testing.assert_allclose(spread[1], field((arms[1].mesh.centroid * scale).T), rtol=1e-9)
+    spread = patterns.spread({0: x + 10.0 * y})[1]
+    np.testing.assert_allclose(spread, arms[1].mesh.centroid * scale @ [1.0, 10.0], rtol=1e-9)
     u, v = arms[1].mesh.centroid.T
     [back] = patterns.collect({1: u - v}).items()
     assert back[0] == 0

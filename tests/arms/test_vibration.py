@@ -35,9 +35,6 @@ def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
     return field(0, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0]))
 
 
-# -- what an arm carries ---------------------------------------------------------------------
-
-
 def chain_of_points(
     rng: np.random.Generator, arms: int
 ) -> tuple[Chain, list[tuple[np.ndarray, np.ndarray]]]:
@@ -94,30 +91,6 @@ def test_carried(arms: int, kind: str) -> None:
         np.testing.assert_allclose(load.matrix(), expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("arms", [1, 2, 3, 4])
-@pytest.mark.parametrize("kind", ["rigid-body", "point-mass", "none"])
-def test_cotangents_are_the_transpose(arms: int, kind: str) -> None:
-    """<W, carried(bodies)> is linear in the bodies, and <slopes(W), bodies> the same number."""
-    rng = np.random.default_rng(arms)
-    (chain, _), (other, _) = chain_of_points(rng, arms), chain_of_points(rng, arms)
-    weights = list(rng.normal(size=(arms, 3, 3)))
-
-    def product(bodies: list[RigidIntegrals]) -> float:
-        moved = Chain(bodies, chain.outboard_points, chain.angles, chain.loads, kind).carried()
-        return sum(np.sum(w * load.matrix()) for w, load in zip(weights, moved, strict=True))
-
-    one = Chain(chain.bodies, chain.outboard_points, chain.angles, chain.loads, kind)
-    slopes = one.cotangents(weights)
-    found = sum(
-        s.mass * d.mass + (np.conj(s.moment) * d.moment).real + s.inertia * d.inertia
-        for s, d in zip(slopes, other.bodies, strict=True)
-    )
-    both = [a + b for a, b in zip(chain.bodies, other.bodies, strict=True)]
-    expected = product(both) - product(list(chain.bodies))
-    assert found == pytest.approx(expected, rel=1e-11, abs=1e-11)
-    assert (expected == 0.0) == (arms == 1 or kind == "none")
-
-
 def test_rigid_integrals_of_a_bar() -> None:
     """Solid, and with the outer half empty: m, m L / 2, m (L^2 / 3 + h^2 / 12).
 
@@ -131,9 +104,6 @@ def test_rigid_integrals_of_a_bar() -> None:
         assert found.mass == pytest.approx(m, rel=1e-11)
         assert found.moment == pytest.approx(0.5 * m * share, rel=1e-11)
         assert found.inertia == pytest.approx(m * (share**2 / 3.0 + 0.06**2 / 12.0), rel=1e-11)
-
-
-# -- frequencies -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -183,68 +153,6 @@ def test_ranks_agree_on_floating_solids() -> None:
     scale = np.sqrt(np.outer(np.diag(found[0]), np.diag(found[0])))
     np.testing.assert_allclose(found[1] / scale, found[0] / scale, atol=1e-4)
 
-
-def euler_values(carried: RigidIntegrals, height: float, count: int) -> np.ndarray:
-    """Return squared frequencies of the scene's arm as an Euler-Bernoulli beam with a tip body.
-
-    w = A (cosh bx - cos bx) + B (sinh bx - sin bx), b^4 = s^2 mu / EI at the frequency s, with
-    EI w_xx = s^2 (J w_x + c w) and EI w_xxx = -s^2 (m w + c w_x) at the tip; c is the first
-    moment along the arm, which is 1 m long.
-    """
-    m, c, J = carried.mass, carried.moment.real, carried.inertia
-    bending, line = 70e9 * 0.01 * height**3 / 12.0, 2700.0 * 0.01 * height  # N m2, kg/m
-
-    def determinant(b: float) -> float:
-        ch, sh, co, si = np.cosh(b), np.sinh(b), np.cos(b), np.sin(b)
-        w, w1 = np.array([ch - co, sh - si]), b * np.array([sh + si, ch - co])
-        w2, w3 = b**2 * np.array([ch + co, sh + si]), b**3 * np.array([sh - si, ch + co])
-        load = b**4 / line
-        rows = np.array([w2 - load * (J * w1 + c * w), w3 + load * (m * w + c * w1)])
-        return float(np.linalg.det(rows)) / ch  # grows like it
-
-    grid = np.linspace(0.05, 12.0, 2000)
-    signs = np.array([determinant(b) for b in grid])
-    ends = np.flatnonzero(signs[:-1] * signs[1:] < 0.0)[:count]
-    roots = np.array([brentq(determinant, grid[i], grid[i + 1], xtol=1e-14) for i in ends])
-    return roots**4 * bending / line
-
-
-@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
-@pytest.mark.parametrize(
-    "carried",
-    [
-        NOTHING,
-        RigidIntegrals(2.0, 0j, 0.0),
-        RigidIntegrals(2.0, 0j, 0.3),
-        RigidIntegrals(2.0, 0.6 + 0j, 0.5),
-    ],
-    ids=["nothing", "mass", "inertia", "ahead of the tip"],
-)
-def test_beam_with_a_tip_body(carried: RigidIntegrals) -> None:
-    """Two bending frequencies: the elements' shear falls with their length squared.
-
-    What is left on the extrapolated mesh is the beam's own shear and rotary inertia, which fall
-    with its height squared.
-    """
-    left = []
-    for height in (0.04, 0.02):
-        expected = euler_values(carried, height, 2)
-        if carried == NOTHING:  # the table's roots of cosh cos = -1
-            b = (expected * 12.0 * 2700.0 / 70e9 / height**2) ** 0.25
-            np.testing.assert_allclose(b, [1.8751040687, 4.6940911330], rtol=1e-9)
-        values = []
-        for cells in (2.0 / height, 4.0 / height, 8.0 / height):
-            arm = arm_of((round(cells), 1), f"arms.height={height}", "material.poisson_ratio=0.0")
-            values.append(loaded_modes(arm.elastic, carried, 2, None).values)
-        coarse, middle, fine = np.array(values)
-        np.testing.assert_allclose(np.log2((coarse - middle) / (middle - fine)), 2.0, atol=0.1)
-        left.append(((4.0 * fine - middle) / 3.0) / expected - 1.0)
-    # A tip mass' first mode feels so little of them that the meshes' error shows beside it.
-    np.testing.assert_allclose(np.log2(np.divide(*left)), 2.0, atol=0.2)
-    assert (np.abs(left[-1]) < 10.0 * 0.02**2).all()
-
-
-# -- crossing modes --------------------------------------------------------------------------
 
 STUBBY = ("arms.length=0.3", "arms.height=0.9")
 MASS = 20.0  # kg
@@ -327,26 +235,6 @@ def test_p_mean_where_modes_coincide(direction: Field, exponent: float) -> None:
     assert orders[1] == pytest.approx(1.0, abs=0.25)
 
 
-def test_p_mean_bounds_the_longest() -> None:
-    """Between the largest squared period and k^(1/p) times it; its slope by differences."""
-    rng = np.random.default_rng(2)
-    for exponent in (2.0, 20.0, 200.0):
-        values = rng.uniform(1.0, 2.0, 4)
-        modes = LoadedModes(values, np.empty(0), np.empty(0), np.empty(0), 0)
-        value, slope = squared_period(modes, exponent, False)
-        longest = 4.0 * np.pi**2 / values.min()
-        assert longest <= value <= longest * 4.0 ** (1.0 / exponent)
-        for k in range(4):
-            h = 1e-6 * np.eye(4)[k]
-            there, back = (
-                squared_period(
-                    LoadedModes(v, np.empty(0), np.empty(0), np.empty(0), 0), exponent, False
-                )[0]
-                for v in (values + h, values - h)
-            )
-            assert slope[k] == pytest.approx((there - back) / 2e-6, abs=1e-6 * longest)
-
-
 def test_following_a_mode_through_a_crossing() -> None:
     """Rotary inertia lowers bending below the axial mode, which it does not touch: MAC keeps it."""
     arm, seen = stubby(), []
@@ -368,8 +256,6 @@ def test_following_a_mode_through_a_crossing() -> None:
     assert period == pytest.approx(4.0 * np.pi**2 / values[0], rel=1e-9)
     assert np.flatnonzero(by_values).tolist() == [2]
 
-
-# -- the arm by itself -----------------------------------------------------------------------
 
 # Cells, overrides, and by how much three static modes are too stiff: measured.
 CASES = {
@@ -405,7 +291,25 @@ def test_first_frequency_of_a_solid_arm() -> None:
     assert arm.current.first_frequency == pytest.approx(expected, rel=1e-6)
 
 
-# -- motors and bearings at the joints -------------------------------------------------------
+def euler_value(mass: float, inertia: float, height: float) -> float:
+    """Return the lowest squared frequency of the scene's arm as Euler's beam with a tip body.
+
+    w = A (cosh bx - cos bx) + B (sinh bx - sin bx), b^4 = s^2 mu / EI at the frequency s, with
+    EI w_xx = s^2 J w_x and EI w_xxx = -s^2 m w at the tip; the arm is 1 m long.
+    """
+    bending, line = 70e9 * 0.01 * height**3 / 12.0, 2700.0 * 0.01 * height  # N m2, kg/m
+
+    def determinant(b: float) -> float:
+        ch, sh, co, si = np.cosh(b), np.sinh(b), np.cos(b), np.sin(b)
+        w, w1 = np.array([ch - co, sh - si]), b * np.array([sh + si, ch - co])
+        w2, w3 = b**2 * np.array([ch + co, sh + si]), b**3 * np.array([sh - si, ch + co])
+        load = b**4 / line
+        return float(np.linalg.det([w2 - load * inertia * w1, w3 + load * mass * w]))
+
+    grid = np.linspace(0.05, 2.0, 40)
+    first = np.flatnonzero(np.diff(np.sign([determinant(b) for b in grid])))[0]
+    root = brentq(determinant, grid[first], grid[first + 1], xtol=1e-14)
+    return root**4 * bending / line
 
 
 @pytest.mark.parametrize("key", ["eigenfrequency", "first_frequency"])
@@ -418,11 +322,11 @@ def test_a_motor_at_the_elbow_lowers_the_frequency(key: str, mass: float, inerti
     if key == "first_frequency":
         asked = "constraints.first_frequency=1.0"
     none = "arms.arm2.joint_mass=0.0", "arms.arm2.joint_inertia=0.0", "payload.mass=0.0"
-    overrides = ["arms.arm1.height=0.02", *light, *motor, *none, asked]
-    built = build(*overrides, "simulation.stiffening=false", cells=(100, 2))
+    linear = "arms.arm1.height=0.02", "simulation.stiffening=false"
+    built = build(*light, *motor, *none, asked, *linear, cells=(100, 2))
     solid = {k: np.ones(arm.mesh.num_cells) for k, arm in built.arms.items()}
     evaluation, _ = built.evaluate(solid)
     (found,) = evaluation.values_of(key)
-    expected = euler_values(RigidIntegrals(mass, 0j, inertia), 0.02, 1)[0]
+    expected = euler_value(mass, inertia, 0.02)
     # Shear, the beam's own and that of its elements: measured 2.4e-4.
     assert found == pytest.approx(np.sqrt(expected) / (2.0 * np.pi), rel=5e-4)

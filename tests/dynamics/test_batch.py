@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bodies import beam, random_cloud
+from machines import distance
 
 from dolfinopt.dynamics import batch, radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, Scale
@@ -77,16 +77,6 @@ def alone(monkeypatch) -> list[ElasticSystem]:
     return left
 
 
-def distance(problem: ElasticSystem, one: Solution, other: Solution) -> float:
-    """Return the relative difference in energy over the horizon."""
-    t = np.linspace(0.0, problem.breakpoints[-1], 500)
-    here, there = one.sample(t), other.sample(t)
-    return relative_error(problem.mechanism, here - there, there)
-
-
-# -- many mechanisms in one ------------------------------------------------------------------
-
-
 def test_scales_are_those_of_scaled_bodies():
     """Instant by instant other payloads, gravity and materials: as each mechanism by itself."""
     rng = np.random.default_rng(3)
@@ -120,27 +110,6 @@ def test_scales_are_those_of_scaled_bodies():
         pairs = (rows, alone[0][0]), (drives, alone[1][0]), (slopes.dense(), matrix), (felt, moved)
         for found, expected in pairs:
             np.testing.assert_allclose(found[n], expected, rtol=1e-10, atol=1e-10)
-
-
-def test_related_bodies():
-    """Scaled bodies are found, with their factors; others are not."""
-    problems = [
-        two_arms(),
-        two_arms(factors=(1.5, 0.5, 3.0 * DAMPING)),
-        two_arms(factors=(1.0, 1.0, 0.0)),
-        two_arms(bending=11.0),
-    ]
-    bar = rigid_bar(0.5, 0.05, 0.675)
-    last = replace(problems[0].mechanism, bodies=(problems[0].mechanism.bodies[0], bar))
-    problems.append(replace(problems[0], mechanism=last))
-    first, other, undamped, stiffer, rigid = batch.related(problems)
-    np.testing.assert_allclose(first, [[1.0, 1.0, DAMPING]] * 2, rtol=1e-12)
-    np.testing.assert_allclose(other, [[1.5, 0.5, 1.5 * DAMPING]] * 2, rtol=1e-12)
-    np.testing.assert_allclose(undamped, [[1.0, 1.0, 0.0]] * 2, rtol=1e-12)
-    assert stiffer is None and rigid is None
-
-
-# -- the whole -------------------------------------------------------------------------------
 
 
 def test_batch_is_each_of_them_alone(alone):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bodies import Chain, bar
 from machines import (
     apart,
     four_bar,
@@ -94,37 +93,6 @@ def test_loops_do_not_drift(kind: str) -> None:
     assert np.abs(gaps(result)).max() < 1e-10  # m; measured 2e-14
     assert result.trajectory is not None
     assert result.trajectory.solution.iterations <= 15  # from one guess for all of it 30
-
-
-@pytest.mark.parametrize("kind", ["slider", pytest.param("pin", marks=pytest.mark.slow)])
-def test_closure_forces_of_rigid_loops(kind: str) -> None:
-    """Bars a thousand times as stiff need the ground's force of rigid ones, under gravity.
-
-    By Lagrange's equations of the open chain of bars: its passive joints need what the force does.
-    """
-    tree = slider_crank(0.012, (20, 3)) if kind == "slider" else four_bar((20, 3))
-    tree["material"]["young_modulus"] *= 1e3
-    tree["reduction"]["coordinates"] = 3
-    tree["motion"] |= {"horizon": 1.3 * tree["motion"]["duration"], "gravity": [0.0, -9.81]}
-    trajectory, system = machine(simulated(tree))
-    part, density = slice(10, -1, 60), tree["material"]["density"]
-    arms = [(a["length"], a["height"], a["thickness"], a.get("mass")) for a in tree["arms"]]
-    clouds = [bar(L, h, density * L * h * b if m is None else m) for L, h, b, m in arms]
-    unit = 1.0 / 150.0  # s, of time: differences are for motions of scale one
-    carried = tree["payload"]["mass"], 0.0, (0.0, -9.81 * unit**2), 0.0, system.mechanism.joints
-    chain, motion = Chain(tuple(clouds), *carried), system.motion(trajectory.t[part])
-    force, torque = [], []
-    for row in zip(motion.q, motion.qd, motion.qdd, strict=True):
-        rates = (x * unit**k for k, x in enumerate(row))
-        Q, places = chain.forces(*rates)[1:] / unit**2, chain.frames(row[0])[0] @ [1.0, 1.0j]
-        lever = 1j * (places[-1] - places[:-1])  # of the end by every joint's angle
-        ways = [1.0j] if kind == "slider" else [1.0, 1.0j]
-        G = np.array([(np.conj(lever) * one).real for one in ways]).T
-        found = np.linalg.solve(G[-len(ways) :], Q[-len(ways) :])
-        force.append(found)
-        torque.append(Q[0] - G[0] @ found)
-    assert apart(trajectory.closure_force[part], np.array(force)) < 1e-4  # measured 1.5e-5
-    assert apart(trajectory.joint_forces[part, 1], np.array(torque)) < 1e-4
 
 
 @pytest.mark.parametrize("kind", ["slider", "pin"])

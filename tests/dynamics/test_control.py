@@ -23,7 +23,6 @@ from machines import (
 from runs import TWO_ARM, overrides, run
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.measured import LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.mechanism import saturated
 
@@ -42,9 +41,6 @@ def small(joints: Tree | None = None, **changes: Any) -> Tree:
     for arm in tree["arms"]:
         arm |= joints or {}
     return with_keys(tree, changes)
-
-
-# -- exact beams -----------------------------------------------------------------------------
 
 
 def test_deviation_and_forces_of_exact_beams() -> None:
@@ -85,9 +81,6 @@ def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: fl
     assert least < off < most
 
 
-# -- energy ----------------------------------------------------------------------------------
-
-
 def arms(stiffening: bool, **changes: object) -> Tree:
     """Return the machine with motors at its joints under gravity, without control unless told."""
     simulation = {"stiffening": stiffening, "tolerance": 1e-6}
@@ -121,20 +114,6 @@ def test_work_under_gravity_is_energy(kind: str) -> None:
     parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
     assert min(parts) > 1e-4 * max(parts)  # each of them counts
     assert imbalance(result) < 1e-8  # measured 2e-11 at most
-
-
-# -- limits ----------------------------------------------------------------------------------
-
-
-def test_rigid_limit() -> None:
-    """Arms a thousand times as stiff need the forces of rigid ones, and follow the path."""
-    result = simulated(small(material={"young_modulus": 70e12}))
-    trajectory, system = machine(result)
-    none = np.zeros((len(trajectory.t), 0))
-    forces = inverse_dynamics(system.rigid, trajectory.desired, none, none, none)[1]
-    for k in range(3):
-        assert apart(trajectory.joint_forces[:, k], forces[:, k]) < 2e-3  # measured 6e-4
-    assert result.max_deviation < 1e-4  # m; 3.6e-5
 
 
 def test_stiff_springs_are_rigid_drives() -> None:
@@ -186,9 +165,6 @@ def test_angles_of_motors_are_written(tmp_path) -> None:
     np.testing.assert_allclose(1e5 * twist, found["joint_forces"][0, 1:], rtol=1e-9)
     header = (tmp_path / "run" / "trajectory.csv").read_text().splitlines()[0]
     assert "q_motor_arm1,q_motor_arm2" in header
-
-
-# -- saturation ------------------------------------------------------------------------------
 
 
 def test_saturation_is_linear_to_95_percent_and_smooth() -> None:

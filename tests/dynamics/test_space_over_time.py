@@ -41,10 +41,7 @@ def test_plane_machine_in_space(controlled):
         gains = np.array([2e3, 400.0, 200.0])
         limits, driven = np.full(3, np.inf), np.ones(3, dtype=bool)
         drives = Drives(np.arange(3), gains, 0.05 * gains, limits, driven, True)
-        systems = [
-            MachineSystem(plane, plane_motion, ends, drives),
-            MachineSystem(*posed, drives),
-        ]
+        systems = [MachineSystem(plane, plane_motion, ends, drives), MachineSystem(*posed, drives)]
     grid = radau.integrate(systems[0], TOLERANCE, 4, Profile()).time_grid
     expected, found = (radau.on_grid(one, grid, TOLERANCE, 4) for one in systems)
     t = np.linspace(*ends, 101)

@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse
+from machines import distance, energies
 from mpi4py import MPI
-from petsc4py import PETSc
 from remainders import Built, Field, arm_of, build, built_of, taylor, uneven, wave
-from runs import TWO_ARM, run
-from runs import overrides as options
+from runs import TWO_ARM, overrides, run, scene
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import measured, radau
-from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
@@ -29,8 +27,6 @@ from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import floats, rounding_error
 from dolfinopt.fem.measured import STIFFNESS_ROUNDING_LIMIT
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.reduction.eigenproblem import interior_pencil, lowest_eigenpairs
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -51,33 +47,14 @@ def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3)) -> Arm:
     return arm_of(cells, "simulation.stiffening=false", *overrides)
 
 
-# -- designs ---------------------------------------------------------------------------------
-
-
-def solid(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.ones_like(x)
-
-
-def checkerboard(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return solid and void by lot, in the same places on any partition."""
-    return (uneven(k, np.round(x, 6), np.round(y, 6)) > 0.0).astype(float)
-
-
-def gap(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.where(np.abs(x - 0.5) < 0.05, 0.0, 1.0)
-
-
-def islands(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return (np.floor(12.0 * x) % 2.0 == 0.0).astype(float)
-
-
 DESIGNS: dict[str, Field] = {
-    "solid": solid,
+    "solid": lambda k, x, y: np.ones_like(x),
     "void": lambda k, x, y: np.zeros_like(x),
-    "checkerboard": checkerboard,
+    # By lot, in the same places on any partition.
+    "checkerboard": lambda k, x, y: 1.0 * (uneven(k, np.round(x, 6), np.round(y, 6)) > 0.0),
     "tip cut off": lambda k, x, y: np.where(x > 0.8, 0.0, 1.0),
-    "gap": gap,
-    "islands": islands,
+    "gap": lambda k, x, y: np.where(np.abs(x - 0.5) < 0.05, 0.0, 1.0),
+    "islands": lambda k, x, y: 1.0 * (np.floor(12.0 * x) % 2.0 == 0.0),
 }
 
 
@@ -88,9 +65,6 @@ def windows(arm: Arm, count: int, density: float) -> np.ndarray:
     half = 0.5 * arm.scene.arms[0].height
     inside = (np.abs(y) < 0.55 * half) & (place > 0.15) & (place < 0.85)
     return np.where(inside, density, 1.0)
-
-
-# -- statics in extended precision -----------------------------------------------------------
 
 
 def quadrilateral(a: float, b: float, nu: float) -> np.ndarray:
@@ -248,7 +222,7 @@ def test_designs_that_hang_together_cost_nothing_more() -> None:
     arm.set_design(windows(arm, 5, 0.0))
     arm.elastic.constraint_modes()
     assert arm.profile.counts.solves == 3
-    arm.set_design(islands(0, *arm.mesh.centroid.T))
+    arm.set_design(DESIGNS["islands"](0, *arm.mesh.centroid.T))
     with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):
         arm.elastic.constraint_modes()
     assert arm.profile.counts.solves > 9
@@ -258,8 +232,8 @@ def test_designs_that_hang_together_cost_nothing_more() -> None:
 def test_a_stiffness_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, wrong: float) -> None:
     """Neither NaN nor a negative stiffness ends in an error of linear algebra."""
     arm = one_arm("interpolation.floor=1e-9")
-    for field in (solid, islands):
-        arm.set_design(field(0, *arm.mesh.centroid.T))
+    for field in ("solid", "islands"):
+        arm.set_design(DESIGNS[field](0, *arm.mesh.centroid.T))
         with monkeypatch.context() as patch:
             patch.setattr(arm.elastic, "energy_matrix", lambda u: np.full((3, 3), wrong))
             with pytest.raises(ConvergenceError, match=r"interpolation\.floor"):
@@ -287,24 +261,10 @@ def test_shapes(height: float, cells: tuple[int, int]) -> None:
     assert compliance_error(arm) < max(1e-9 / min(height, 1.0), 5e-14 / (slender * height) ** 2)
 
 
-# -- modes -----------------------------------------------------------------------------------
-
-
-def dense(mat: PETSc.Mat) -> np.ndarray:
-    indptr, columns, values = mat.getValuesCSR()
-    return scipy.sparse.csr_matrix((values, columns, indptr), mat.getSize()).toarray()
-
-
 def dense_eigenvalues(arm: ElasticArm, count: int) -> np.ndarray:
     """Return the lowest eigenvalues of the interior: the largest of L^-1 M L^-T, K = L L'."""
-    L = np.linalg.cholesky(dense(arm.interior_stiffness()))
-    half = scipy.linalg.solve_triangular(L, dense(arm.interior_mass()), lower=True)
-    whole = scipy.linalg.solve_triangular(L, half.T, lower=True)
-    size = len(whole)
-    largest = scipy.linalg.eigh(
-        whole + whole.T, eigvals_only=True, subset_by_index=(size - count, size - 1)
-    )
-    return 2.0 / largest[::-1]
+    K, M = arm.interior_stiffness()[:, :], arm.interior_mass()[:, :]
+    return 1.0 / scipy.linalg.eigh(M, K, eigvals_only=True)[: -count - 1 : -1]
 
 
 @pytest.mark.parametrize(
@@ -315,14 +275,14 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
     arm = one_arm("interpolation.law=simp", f"interpolation.floor={floor}", cells=(40, 6))
     arm.set_design(windows(arm, count, density))
     elastic = arm.elastic
-    M = elastic.interior_mass()
+    M = elastic.interior_mass()[:, :]
     exact = dense_eigenvalues(elastic, 12)
     assert exact[1] / exact[0] - 1.0 < 1e-6
     for modes in (1, 2, 3, 4, 6, 9, 12):
         values, vectors = lowest_eigenpairs(interior_pencil(elastic), modes, None)
         # Contrasts of 1e-9 to 1e-15 leave so many digits in the dense eigenvalues.
         np.testing.assert_allclose(values, exact[:modes], rtol=1e-7)
-        gram = vectors.T @ dense(M) @ vectors
+        gram = vectors.T @ M @ vectors
         np.testing.assert_allclose(gram, np.eye(modes), atol=1e-10)
         # From modes of a nearby design, too, of which there may be as many or fewer.
         for start in (vectors, vectors[:, :1], vectors[:, ::-1]):
@@ -330,22 +290,14 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
             np.testing.assert_allclose(warm, exact[:modes], rtol=1e-7)
 
 
-# -- motions ---------------------------------------------------------------------------------
-
-
-def moved(*overrides: str, field: Field = solid, cells: tuple[int, int] = (12, 2)) -> Trajectory:
+def moved(
+    *overrides: str, field: Field = DESIGNS["solid"], cells: tuple[int, int] = (12, 2)
+) -> Trajectory:
     """Simulate."""
     built = alone(*overrides, cells=cells)
     _, trajectory = built.evaluate(built.fields(field), simulated=True)
     assert trajectory is not None
     return trajectory
-
-
-def distance(trajectory: Trajectory, other: Solution) -> float:
-    """Return the relative distance of two solutions, energy norm, largest in time."""
-    t = np.linspace(0.0, trajectory.problem.breakpoints[-1], 5003)
-    q = other.sample(t)
-    return relative_error(trajectory.mechanism, trajectory.solution.sample(t) - q, q)
 
 
 @pytest.mark.slow
@@ -364,12 +316,8 @@ def distance(trajectory: Trajectory, other: Solution) -> float:
         ["damping.stiffness_proportional=1.0"],
         ["damping.stiffness_proportional=1e3"],
         ["motion.joint_height=-0.9999", "motion.horizon=1.9"],  # 1e-4 m from stretched
-        [
-            "motion.radius=1e-4",
-            "motion.joint_height=0.0",
-            "motion.cart_follow=0.0",
-            "motion.horizon=1.9",
-        ],  # folded
+        # Folded.
+        ["motion.radius=1e-4", "motion.joint_height=0", "motion.cart_follow=0", "motion.horizon=2"],
         ["motion.gravity=[0.0,-9.81]"],
     ],
     ids=" ".join,
@@ -379,7 +327,7 @@ def test_motions(overrides: list[str]) -> None:
     trajectory = moved(*overrides)
     fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
     assert np.isfinite(trajectory.deviation).all() and np.isfinite(trajectory.joint_forces).all()
-    assert distance(trajectory, fine) < 1.1e-4
+    assert distance(trajectory.problem, trajectory.solution, fine, 5000) < 1.1e-4
 
 
 @pytest.mark.parametrize(
@@ -438,123 +386,72 @@ def test_vibrations_of_megahertz() -> None:
     np.testing.assert_allclose(many.deviation / scale, few.deviation / scale, atol=1e-3)
 
 
-def mass_matrix(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return M(q) (N, N) at one instant, from unit accelerations."""
-    N = mechanism.num_coordinates
-    repeated = RigidMotion(
-        *(np.repeat(v, N + 1, axis=0) for v in (motion.q, motion.qd, motion.qdd))
-    )
-    rest, unit = np.zeros((N + 1, N)), np.vstack([np.zeros(N), np.eye(N)])
-    rows = inverse_dynamics(mechanism, repeated, np.repeat(q[None], N + 1, axis=0), rest, unit)[0]
-    return rows[1:] - rows[0]
-
-
 def test_undamped_energy_does_not_drift() -> None:
     """13 s after the motion the arms still vibrate with the energy they were left with."""
-    trajectory = moved(
-        "damping.stiffness_proportional=0.0",
-        "motion.horizon=15.0",
-        "simulation.stages=5",
-        "simulation.sample=0.01",
-        cells=(12, 2),
-    )
-    K, solution = trajectory.mechanism.stiffness(), trajectory.solution
-    energies = []
-    for t in np.linspace(2.0, 15.0, 27):
-        at = np.array([t])
-        q, qd = solution.sample(at)[0], solution.sample(at, 1)[0]
-        M = mass_matrix(trajectory.mechanism, trajectory.problem.motion(at), q)
-        energies.append(0.5 * (qd @ M @ qd + q @ K @ q))
+    undamped = "damping.stiffness_proportional=0.0"
+    trajectory = moved(undamped, "motion.horizon=15.0", "simulation.stages=5")
+    kinetic, strain, _ = energies(trajectory, np.linspace(2.0, 15.0, 27))
+    left = kinetic + strain
     # The error is relative to the largest deflection, that of the motion itself: 30 times those
     # that remain. Twice it, as energy is of second order, in the worst phase.
     largest = 0.5 * trajectory.compliance.sum(axis=1).max()
-    assert np.ptp(energies) < 4e-4 * np.sqrt(largest * energies[0])
-    assert energies[0] > 1e-6 * largest
-
-
-# -- what broke Newton -----------------------------------------------------------------------
+    assert np.ptp(left) < 4e-4 * np.sqrt(largest * left[0])
+    assert left[0] > 1e-6 * largest
 
 
 @pytest.mark.slow
 def test_designs_of_modal_truncation_with_many_coordinates() -> None:
     """Void tips that four modes do not see, undamped: arms that fold over are solved, and right."""
-    scene = do.load_scene(
-        TWO_ARM,
-        [
-            "arms.cells=[48,6]",
-            "arms.element=linear",
-            "reduction.method=modal",
-            "optimizer.max_iterations=15",
-            "design.filter_radius=0.03",
-            "simulation.tolerance=1e-3",
-        ],
-    )
-    x_phys = do.optimize(scene, world=MPI.COMM_SELF).x_phys
-    trajectory = moved(
-        "arms.element=linear",
-        "reduction.coordinates=12",
-        "damping.stiffness_proportional=0.0",
-        "motion.horizon=2.0",
-        field=lambda k, x, y: x_phys[k],
-        cells=(48, 6),
-    )
+    linear, quick = "arms.element=linear", ("arms.cells=[48,6]", "simulation.tolerance=1e-3")
+    few = "reduction.method=modal", "optimizer.max_iterations=15", "design.filter_radius=0.03"
+    x_phys = do.optimize(scene(linear, *quick, *few), world=MPI.COMM_SELF).x_phys
+    many = "reduction.coordinates=12", "damping.stiffness_proportional=0.0", "motion.horizon=2.0"
+    trajectory = moved(linear, *many, field=lambda k, x, y: x_phys[k], cells=(48, 6))
     assert trajectory.interface_rotations.max() > 0.15  # far from small
-    fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
-    assert distance(trajectory, fine) < 1e-4
+    problem, found = trajectory.problem, trajectory.solution
+    fine = radau.integrate(problem, 1e-5, 5, do.Profile())
+    assert distance(problem, found, fine, 5000) < 1e-4
     # Long steps damp vibrations out by any number of stages: the estimate must know of them.
     for stages in (3, 4, 5):
-        rough = radau.integrate(trajectory.problem, 1e-2, stages, do.Profile())
-        assert distance(trajectory, rough) < 1e-2
+        rough = radau.integrate(problem, 1e-2, stages, do.Profile())
+        assert distance(problem, rough, found, 5000) < 1e-2
 
-
-# -- units -----------------------------------------------------------------------------------
 
 MILLIMETRES = [  # mm, t, s, N
-    "material.young_modulus=70e3",
-    "material.density=2.7e-9",
-    "arms.length=1000.0",
-    "arms.height=60.0",
-    "arms.thickness=10.0",
-    "motion.radius=1000.0",
-    "motion.joint_height=-500.0",
-    "payload.mass=6e-3",
-    "design.filter_radius=7.5",
+    *("material.young_modulus=70e3", "material.density=2.7e-9", "payload.mass=6e-3"),
+    *("arms.length=1000.0", "arms.height=60.0", "arms.thickness=10.0", "design.filter_radius=7.5"),
+    *("motion.radius=1000.0", "motion.joint_height=-500.0"),
 ]
 
 
 @pytest.mark.parametrize(
-    ("overrides", "translated"),
+    ("overrides", "in_metres", "in_millimetres"),
     [
-        (["motion.gravity=[0.5,-9.81]"], ["motion.gravity=[500.0,-9810.0]"]),
-        (["objective.gradient=exact", "payload.inertia=0.01"], ["payload.inertia=10.0"]),
-        (["reduction.method=modal"], []),
-        (["reduction.method=krylov", "reduction.coordinates=8"], []),
-        (["reduction.method=balanced", "reduction.coordinates=6"], []),
-        (["objective.kind=eigenfrequency"], []),
-        (["objective.kind=deviation", "objective.gradient=exact"], []),
-        (["objective.kind=static", "objective.loads=[[0,1,0],[0,0,1]]"],) * 2,
+        ([], ["motion.gravity=[0.5,-9.81]"], ["motion.gravity=[500.0,-9810.0]"]),
+        (["objective.gradient=exact"], ["payload.inertia=0.01"], ["payload.inertia=10.0"]),
+        (["reduction.method=modal"], [], []),
+        (["reduction.method=krylov", "reduction.coordinates=8"], [], []),
+        (["reduction.method=balanced", "reduction.coordinates=6"], [], []),
+        (["objective.kind=eigenfrequency"], [], []),
+        (["objective.kind=deviation", "objective.gradient=exact"], [], []),
+        (["objective.kind=static"], *(
+            [f"objective.loads=[[0.0,1.0,0.0],[0.0,0.0,{unit}]]"] for unit in (1.0, 1000.0)
+        )),
     ],
     ids=str,
-)
-def test_millimetres_and_tonnes(overrides: list[str], translated: list[str]) -> None:
+)  # fmt: skip
+def test_millimetres_and_tonnes(overrides, in_metres, in_millimetres) -> None:
     """The same figures as in metres and kilograms, to what Newton's iteration leaves."""
-    if overrides == translated:
-        overrides = ["objective.kind=static", "objective.loads=[[0.0,1.0,0.0],[0.0,0.0,1.0]]"]
-        translated = ["objective.loads=[[0.0,1.0,0.0],[0.0,0.0,1000.0]]"]
-    kept = [one for one in overrides if one.split("=")[0] not in " ".join(translated)]
-    metres = alone(*overrides)
-    millimetres = alone(*MILLIMETRES, *kept, *translated)
     found = []
-    for built in (metres, millimetres):
+    for own in (in_metres, [*MILLIMETRES, *in_millimetres]):
+        built = alone(*overrides, *own)
         evaluation, trajectory = built.evaluate(built.fields(wave))
-        found.append((evaluation, built.gradient(trajectory)))
-    (si, si_slopes), (mm, mm_slopes) = found
+        frequencies = [arm.current.first_frequency for arm in built.arms.values()]
+        found.append((evaluation, built.gradient(trajectory), frequencies))
+    (si, si_slopes, expected), (mm, mm_slopes, frequencies) = found
     factor = 1.0 if "objective.kind=eigenfrequency" in overrides else 1e3
     assert mm.objective == pytest.approx(factor * si.objective, rel=1e-8)
-    own = [
-        [arm.current.first_frequency for arm in one.arms.values()] for one in (metres, millimetres)
-    ]
-    np.testing.assert_allclose(own[1], own[0], rtol=1e-9)
+    np.testing.assert_allclose(frequencies, expected, rtol=1e-9)
     np.testing.assert_allclose(mm.deflections, si.deflections, rtol=1e-7)
     for k, slopes in si_slopes.items():
         scale = np.abs(slopes).max()
@@ -562,14 +459,11 @@ def test_millimetres_and_tonnes(overrides: list[str], translated: list[str]) -> 
         np.testing.assert_allclose(mm_slopes[k] / factor, slopes, atol=3e-6 * scale)
 
 
-# -- a warning -------------------------------------------------------------------------------
-
-
 def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
     """A tenth of an arm's length: in summary.json and on standard error, arm by arm."""
     heavy = ["payload.mass=40", "arms.arm2.young_modulus=1e12"]
     for name, more in (("small", []), ("large", [*heavy, "simulation.stiffening=false"])):
-        changes = options("arms.cells=[12,2]", *more)
+        changes = overrides("arms.cells=[12,2]", *more)
         run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / name, *changes)
         printed = capsys.readouterr().err
         warnings = json.loads((tmp_path / name / "summary.json").read_text())["warnings"]
@@ -578,14 +472,12 @@ def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
     trajectory = moved(*heavy, field=lambda k, x, y: 0.5 * np.ones_like(x))
     body = trajectory.mechanism.bodies[0]
     tip = trajectory.q_e[:, trajectory.mechanism.slices[0]] @ body.outboard.T
-    ratio = np.linalg.norm(tip[:, :2], axis=1).max() / 1.0
+    ratio = np.linalg.norm(tip[:, :2], axis=1).max()  # of 1 m
     assert ratio > 0.1 > trajectory.deflections[1]
     deflection, stiffening = warnings
     assert f"'arm1' deflects by {100.0 * ratio:.3g} %" in deflection
     assert "simulation.stiffening = false" in stiffening
 
-
-# -- everything at once ----------------------------------------------------------------------
 
 LAWS = ["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
 METHODS = ["craig-bampton", "modal", "krylov", "balanced"]

@@ -23,9 +23,6 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 GRAVITY = 9.81  # m/s2
 
 
-# -- a pendulum in Cartesian coordinates -------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Pendulum:
     """A point mass of 1 kg on a rod of 1 m in Cartesian coordinates, let go horizontally.
@@ -104,9 +101,6 @@ def test_order_of_positions(stages: int) -> None:
         error(radau.on_grid(system, even_steps(system, count), 1e-6, stages)) for count in (20, 40)
     )
     assert np.log2(coarse / fine) == pytest.approx(2 * stages - 1, abs=0.5)
-
-
-# -- a controlled machine ----------------------------------------------------------------------
 
 
 def desired(t: np.ndarray) -> RigidMotion:

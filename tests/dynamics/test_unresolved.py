@@ -8,7 +8,6 @@ import pytest
 from dolfinopt.dynamics.collocation import (
     Stages,
     _lost,
-    lagrange_derivatives,
     radau_iia,
     unresolved,
 )
@@ -23,16 +22,6 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 def still(t: np.ndarray) -> RigidMotion:
     """Return a cart at rest."""
     return RigidMotion(*np.zeros((3, len(t), 1)))
-
-
-def test_derivatives_of_polynomials() -> None:
-    """A cubic by four nodes: its own value and derivatives, at the ends and beyond."""
-    nodes, tau = np.array([0.1, 0.4, 0.7, 1.0]), np.array([-0.2, 0.0, 0.55, 1.0])
-    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 3.0])
-    found = lagrange_derivatives(nodes, tau) @ cubic(nodes)
-    for k, row in enumerate(found):
-        # Rounding of the inverted powers' matrix, some thousand large.
-        np.testing.assert_allclose(row, cubic.deriv(k)(tau) if k else cubic(tau), atol=1e-11)
 
 
 @pytest.mark.filterwarnings("error")

@@ -73,9 +73,7 @@ def test_one_matrix_for_all_cells(element: str) -> None:
 
 @pytest.mark.parametrize("static", [True, pytest.param(False, marks=pytest.mark.serial)])
 @pytest.mark.parametrize("element", EVERY)
-def test_one_tensor_for_all_cells(
-    monkeypatch: pytest.MonkeyPatch, element: str, static: bool
-) -> None:
+def test_one_tensor_for_all_cells(monkeypatch, element, static) -> None:
     """Geometric stiffness and its derivatives, without the quadrature points, 7 cells at a time."""
     monkeypatch.setattr(assembly, "STRESS_CHUNK_ENTRIES", 1)
     monkeypatch.setattr(assembly, "STRESS_CHUNK_CELLS", 7)

@@ -95,15 +95,6 @@ def random_cloud(rng: np.random.Generator, q: int, d: int = 2, interfaces: int =
     )
 
 
-def bar(length: float, height: float, mass: float) -> Cloud:
-    """Return a rigid bar as four masses: those of Gauss' rule, exact to degree 3."""
-    g = 0.5 / np.sqrt(3.0)
-    x, y = np.meshgrid(length * np.array([0.5 - g, 0.5 + g]), height * np.array([-g, g]))
-    points, none = np.stack([x.ravel(), y.ravel()], axis=1), np.zeros((0, 0))
-    masses, ends = np.full(4, 0.25 * mass), np.array([[length, 0.0]])
-    return Cloud(points, masses, np.zeros((4, 2, 0)), none, none, np.zeros((3, 0)), ends)
-
-
 def beam(
     length: float = 0.5,  # m
     mass: float = 0.6,  # kg

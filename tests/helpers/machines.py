@@ -11,8 +11,10 @@ import numpy as np
 from runs import TWO_ARM, scene
 
 import dolfinopt as do
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.end_effector import _frames, interface_place, outboard
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
@@ -150,6 +152,13 @@ def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
     place = complex(*middle) + q @ (modes[node, 0] + 1j * modes[node, 1])
     chord = outboard(mechanism.bodies[arm], q)[0]
     return (np.conj(chord / np.abs(chord)) * place).imag
+
+
+def distance(problem: Any, one: Solution, other: Solution, count: int = 1000) -> float:
+    """Return the relative distance of two solutions in the norm of `tolerance`, largest in time."""
+    t = np.linspace(0.0, problem.breakpoints[-1], count + 1)
+    q = other.sample(t)
+    return relative_error(problem.mechanism, one.sample(t) - q, q)
 
 
 def apart(found: np.ndarray, expected: np.ndarray) -> float:

@@ -99,11 +99,21 @@ def substructure(
     comm: MPI.Comm = MPI.COMM_SELF,
     element: str = "linear",
     poisson_ratio: float = 0.33,
+    skew: bool = False,
 ) -> Substructure:
-    """Return a rectangle of length, height and thickness, m."""
+    """Return a rectangle of length, height and thickness, m; of cells that are none if `skew`."""
     mesh = structured_arm(comm, "arm", *size[:2], cells)
+    if skew:
+        mesh.mesh.geometry.x[:, :2] += bulge(mesh.mesh.geometry.x[:, :2], size[0], size[1])
     operators = ELEMENTS[element].operators(mesh, size[2], poisson_ratio)
     return Substructure(mesh, operators, do.Profile())
+
+
+def bulge(points: np.ndarray, length: float, height: float) -> np.ndarray:
+    """Return displacements (n, 2) of interior points: the rectangle stays, its cells turn skew."""
+    x, y = points.T
+    inside = np.sin(np.pi * x / length) * np.cos(np.pi * y / height)
+    return np.stack([0.04 * inside * np.cos(7.0 * x), 0.02 * inside * np.sin(9.0 * x + y)], axis=1)
 
 
 def dense_matrices(elastic, young, density) -> tuple[np.ndarray, np.ndarray]:

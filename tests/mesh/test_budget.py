@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, overrides, refusal, run
+from runs import TWO_ARM, overrides, refusal, run
 from solids import solid_scene
 
 from dolfinopt.arms.arm import build_arms
@@ -15,7 +15,7 @@ from dolfinopt.mesh import budget
 from dolfinopt.mesh.budget import check_budget, free_memory
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.load import Arm, load_scene, scene_from_dict
+from dolfinopt.scene.load import Arm, load_scene
 
 COMM = MPI.COMM_WORLD
 
@@ -61,39 +61,23 @@ def test_estimate_is_what_was_measured(monkeypatch, make, low, high, words):
 
 @pytest.mark.serial
 @pytest.mark.parametrize(
-    ("keys", "gigabytes"),
-    [  # of 16 755 cells; the estimate of their number is 19 200
-        (["simulation.stiffening=auto"], 3.25),
-        (["simulation.stiffening=false"], 1.04),
-        (["simulation.stiffening=true", "arms.0.element=linear"], 0.46),
-    ],
+    ("stiffening", "element", "gigabytes"),  # of 16 755 cells; the estimate of their number: 19 200
+    [("auto", "quadratic", 3.25), (False, "quadratic", 1.04), (True, "linear", 0.46)],
 )
-def test_cells_of_files_that_are_all_different_count_as_measured(
-    monkeypatch, tmp_path, keys, gigabytes
-):
-    """Tetrahedra of a bar 0.5 x 0.04 x 0.02 m with sides of 5 mm; the estimate is on the safe side.
+def test_cells_of_files_count_as_measured(monkeypatch, tmp_path, stiffening, element, gigabytes):
+    """All different: tetrahedra of a bar with sides of 5 mm; the estimate is on the safe side.
 
     Cells of 2 mm, 15.6 times as many: few enough of none.
     """
     (tmp_path / "bar.step").write_text("")
-    demo = load_scene(ROOT / "demos" / "spatial_arm.toml").to_tree()
-    arm = next(a for a in demo["arms"] if a["cells"] and not a["rigid"])
-    at = demo["arms"].index(arm)
-    for one in demo["arms"]:
-        one["rigid"] = one is not arm
-        one["design"] = None
-    size = {"length": 0.5, "height": 0.04, "thickness": 0.02, "cells": None, "extruded": False}
     mesh = {"mesh": str(tmp_path / "bar.step"), "mesh_size": 2e-3, "cell_shape": "tetrahedron"}
-    demo["arms"][at] = arm | size | mesh
-    scene = scene_from_dict(demo, overrides=[key.replace("arms.0", f"arms.{at}") for key in keys])
-    assert scene.cell_counts == {at: 300_000}
+    scene = solid_scene(cells=None, stiffening=stiffening, element=element, **mesh)
+    assert scene.cell_counts == {0: 300_000}
     needed = gigabytes * 1e9 / 16_755 * 300_000
-    for share, fits in ((0.95, False), (1.3, True)):
-        monkeypatch.setattr(budget, "free_memory", lambda share=share: share * needed)
-        if fits:
-            check_budget(COMM, scene)
-        else:
-            refusal(lambda: check_budget(COMM, scene), "of memory")
+    monkeypatch.setattr(budget, "free_memory", lambda: 1.3 * needed)
+    check_budget(COMM, scene)
+    monkeypatch.setattr(budget, "free_memory", lambda: 0.95 * needed)
+    refusal(lambda: check_budget(COMM, scene), "of memory")
 
 
 def test_cells_of_files_are_estimated():

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from mpi4py import MPI
-from runs import ROOT, STATED, TWO_ARM, overrides, refusal, run
+from runs import ROOT, STATED, TWO_ARM, refusal
 
 import dolfinopt as do
-from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.optimization.measured import STEP_RATIO
 from dolfinopt.optimization.problem import Evaluator
 from dolfinopt.output.views import gather_views
 from dolfinopt.plots.design import REGION, design_figure
@@ -77,50 +75,6 @@ def test_regions_stay_in_every_design(projection, symmetric):
     assert fixed.sum() == sum(arm.mesh.fixed.sum() for arm in arms.values())
 
 
-@pytest.mark.parametrize(
-    ("kind", "law"),
-    [
-        ("esl", "simp"),
-        pytest.param("eigenfrequency", "ramp", marks=pytest.mark.serial),  # ranks: the other one
-    ],
-)
-@pytest.mark.usefixtures("three_steps")
-def test_gradients_with_regions(kind, law):
-    """Void cells keep the stiffness regular with every law; remainders fall by their square."""
-    scene, partition, arms = built(
-        regions(HOLE, LUG),
-        f"objective.kind={kind}",
-        f"interpolation.law={law}",
-        *("motion.horizon=2.0", "simulation.tolerance=1e-6"),
-    )
-    x = {k: 0.5 + 0.4 * np.sin(9.0 * arm.mesh.centroid.sum(axis=1)) for k, arm in arms.items()}
-    for row in taylor_test(scene, partition, arms, x, do.Profile()).rows:
-        # Not the finest one: "simp" has a void of 1e-12, and rounding to suit.
-        rate = np.log(row.remainders[1] / row.remainders[2]) / np.log(STEP_RATIO)
-        assert row.slope != 0.0 and rate > 1.9
-
-
-def test_a_run_keeps_its_regions_and_resumes(shared_tmp_path):
-    folders = [shared_tmp_path / name for name in ("whole", "parts")]
-    changes = (*SMALL, regions(HOLE, LUG), "motion.horizon=2.0", "optimizer.max_iterations=6")
-    options = ["--no-plots", *overrides(*changes)]
-    run("optimize", TWO_ARM, "--out", folders[0], *options)
-    run("optimize", TWO_ARM, "--out", folders[1], *options, "--set", "optimizer.max_iterations=3")
-    run("optimize", TWO_ARM, "--out", folders[1], *options, "--resume")
-    WORLD.barrier()
-    whole, parts = (np.load(folder / "design.npz") for folder in folders)
-    for key in whole:
-        assert np.array_equal(whole[key], parts[key]), key
-    x, y = whole["arm1/centroid"].T
-    density = whole["arm1/density"]
-    assert (density[(x - 0.5) ** 2 + y**2 < 0.021**2] == 0.0).all()
-    assert (density[(x > 0.2) & (x < 0.3) & (y > 0.01)] == 1.0).all()
-    summary = json.loads((folders[0] / "summary.json").read_text())
-    assert summary["constraints"]["volume_fraction_arm1"]["value"] == pytest.approx(density.mean())
-    assert summary["volume_fraction"]["arm1"] <= 0.5005
-    assert len(summary["scene"]["arms"][0]["regions"]) == 2
-
-
 def test_regions_are_drawn():
     scene, partition, arms = built(regions(HOLE, LUG), "arms.symmetric=true")
     x_phys = {k: arm.uniform(0.5) for k, arm in arms.items()}
@@ -179,13 +133,6 @@ def test_regions_belong_to_an_arm_with_cells_and_are_set_as_a_whole():
     assert do.scene_from_dict(data).arms[1].regions == ()
     words = "unknown key arms.0.regions.0.kind (arm1)", "as a whole", "an array of tables"
     refused(words, "arms.arm1.regions.0.kind=void")
-
-
-@pytest.mark.serial
-def test_nothing_is_written_where_a_region_is_refused(tmp_path):
-    words = overrides(*SMALL, regions('{kind="void", box=[0.4,-0.03,0.5,0.03]}'))
-    refusal(lambda: run("optimize", TWO_ARM, "--out", tmp_path / "run", *words))
-    assert not (tmp_path / "run").exists()
 
 
 def test_an_arm_takes_the_regions_of_the_arm_before():

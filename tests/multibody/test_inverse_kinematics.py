@@ -141,19 +141,6 @@ def test_turn_on_the_spot(tmp_path):
     assert back.as_rotvec()[-1, 2] == pytest.approx(0.4, abs=EXACT)
 
 
-def test_jacobian_and_bias():
-    """Of all joints, against differences along a motion."""
-    chain = end_chain(load_scene(ROBOT))
-    qd, h = TURNED[None], 1e-4
-    here, *pair = (chain.at(JOINTS[None] + k * h * qd) for k in (0, -1, 1))
-    velocity = here.jacobian[0] @ qd[0]
-    moved = (pair[1].place - pair[0].place) / (2.0 * h)
-    turned = Rotation.from_matrix(pair[1].rotation @ pair[0].rotation.swapaxes(1, 2)).as_rotvec()
-    assert np.abs(velocity - np.hstack([moved, turned / (2.0 * h)])[0]).max() < 1e-7
-    rates = (pair[1].jacobian[0] - pair[0].jacobian[0]) @ qd[0] / (2.0 * h)
-    assert np.abs(chain.at(JOINTS[None], qd).bias[0] - rates).max() < 1e-7
-
-
 def test_joints_of_the_table(tmp_path):
     """Columns of joints are prescribed; two others follow a path in the plane that is left."""
     yaw = 0.3 + np.array([0.0, 0.0, 0.0])

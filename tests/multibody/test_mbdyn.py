@@ -92,49 +92,25 @@ def test_round_trip_is_exact(tmp_path, elements, kind, loads):
     for (_, matrix), expected in zip(found, written.stiffening, strict=True):
         assert np.array_equal(matrix, expected)
     assert np.array_equal(groups[8].transpose(1, 2, 0), written.modes)
+    for group, name in ((9, "M"), (10, "K"), (13, "D")):
+        assert np.array_equal(groups[group], getattr(written, name)), name
+    assert np.array_equal(np.column_stack([groups[k] for k in (5, 6, 7)]), written.points)
+    assert np.array_equal(groups[12], [written.mass, *written.centre, *written.inertia.ravel()])
+    if kind == "plane":
+        # MBDyn warns of matrices that are not symmetric.
+        assert all(np.array_equal(groups[group], groups[group].T) for group in (9, 10))
+        assert sorted(groups) == [1, 2, 5, 6, 7, 8, 9, 10, 11, 12, 13]
+        assert groups[1] == (9 * 4 + 2, 4)
+        assert groups[2] == [str(k) for k in range(1, 39)]
+        # MBDyn warns of masses that differ by direction.
+        assert np.array_equal(groups[11], written.lumped)
+        assert np.array_equal(groups[11][:, [0, 0]], groups[11][:, 1:3])
     if kind == "space":
         couples = written.invariants
         pairs = (14, couples.three), (15, couples.four), (17, couples.five)
         pairs += (16, couples.eight.transpose(0, 2, 1)), (18, couples.nine.transpose(0, 2, 3, 1))
         for group, expected in pairs:
             assert np.array_equal(groups[group], expected), group
-
-
-def test_mbdyn_stiffens_it_alike(stiff_parts, elements):
-    """Any motion in the plane, force and moment outboard: rows lose sum_p p K0_p q."""
-    body = stiff_parts[0]
-    rng = np.random.default_rng(0)
-    a, force = np.append(rng.normal(size=(2, 2)), [[0.0], [0.0]], axis=1)
-    w, wd, moment = np.zeros((3, 3))
-    w[2], wd[2], moment[2] = rng.normal(size=3)
-    p = np.array([a[0], a[1], wd[2], -(w[2] ** 2), force[0], force[1], moment[2]])
-    K0 = np.concatenate([body.K0, body.K0_outboard])
-    groups = read_as_mbdyn_does(fem_text(elements["stiff plane"]))
-    found = mbdyn_stiffening(groups, a, w, wd, force, moment)
-    np.testing.assert_allclose(found, -np.tensordot(p, K0, 1), atol=1e-12 * np.abs(found).max())
-    # Rotation stiffens a slender beam, and so does a pull at its end: the joint gives -pull.
-    still = np.zeros(3)
-    for load in ({"w": w}, {"force": np.array([-1.0, 0.0, 0.0])}):
-        all_loads = {"a": still, "w": still, "wd": still, "force": still, "moment": still, **load}
-        assert mbdyn_stiffening(groups, **all_loads)[1, 1] > 0.0
-
-
-def test_mbdyn_reads_it(elements):
-    element = elements["plane"]
-    groups = read_as_mbdyn_does(fem_text(element))
-    assert sorted(groups) == [1, 2, 5, 6, 7, 8, 9, 10, 11, 12, 13]
-    assert groups[1] == (9 * 4 + 2, 4)
-    assert groups[2] == [str(k) for k in range(1, 39)]
-    assert np.array_equal(np.column_stack([groups[k] for k in (5, 6, 7)]), element.points)
-    assert np.array_equal(groups[8].transpose(1, 2, 0), element.modes)
-    for group, name in ((9, "M"), (10, "K"), (11, "lumped"), (13, "D")):
-        assert np.array_equal(groups[group], getattr(element, name)), name
-    expected = [element.mass, *element.centre, *element.inertia.ravel()]
-    assert np.array_equal(groups[12], expected)
-    # MBDyn warns of masses that differ by direction, and of matrices that are not symmetric.
-    assert np.array_equal(groups[11][:, 0], groups[11][:, 1])
-    assert np.array_equal(groups[11][:, 0], groups[11][:, 2])
-    assert np.array_equal(groups[9], groups[9].T) and np.array_equal(groups[10], groups[10].T)
 
 
 def test_interfaces_are_the_first_nodes(parts, elements):
@@ -150,8 +126,6 @@ def test_interfaces_are_the_first_nodes(parts, elements):
     expected = body.outboard[0] - np.outer(levers, body.outboard[2])
     np.testing.assert_allclose(element.modes[2:][edge, 0], expected, atol=1e-9)
 
-
-# -- bodies in space -------------------------------------------------------------------------
 
 ROUNDING = 1e-12
 
@@ -223,9 +197,6 @@ def test_several_interfaces(stiff):
     assert np.array_equal(element.stiffening[12:], body.K0_outboard)
 
 
-# -- lumped nodes of the plane -----------------------------------------------------------------
-
-
 def invariants(element):
     """Return what MBDyn makes of the lumped masses (its technical manual's invariants)."""
     m, p, phi = element.lumped[:, 0], element.points, element.modes[:, :3]
@@ -274,17 +245,6 @@ def test_second_moments_converge():
     assert np.max(errors[-1]) < 0.01
 
 
-def test_global_inertia_of_a_uniform_plate():
-    """Group 12 is the consistent one: of a cuboid, about its centre."""
-    _, lifted, nodes = reduced((4, 2))
-    element = modal_element(lifted, nodes)
-    mass, (a, b, c) = 2700.0 * LENGTH * HEIGHT * THICKNESS, (LENGTH, HEIGHT, THICKNESS)
-    expected = mass / 12.0 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
-    assert element.mass == pytest.approx(mass, rel=PLACING)
-    np.testing.assert_allclose(element.centre, [0.5 * LENGTH, 0.0, 0.0], atol=PLACING)
-    np.testing.assert_allclose(element.inertia, expected, atol=PLACING * mass)
-
-
 def test_nodes_of_an_arm_on_several_ranks(parts):
     """Shared by all ranks, an arm has the same nodes and masses; the modes agree to rounding."""
     _, _, nodes = reduced((8, 3), COMM, uneven=True)
@@ -297,8 +257,6 @@ def test_nodes_of_an_arm_on_several_ranks(parts):
     # Eigenvectors are right to 1e-10.
     np.testing.assert_allclose(nodes.modes, alone.modes, atol=1e-8 * np.abs(alone.modes).max())
 
-
-# -- the command -----------------------------------------------------------------------------
 
 SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]
 

@@ -14,8 +14,6 @@ from bodies import (
     change_of,
     changed,
     derivative,
-    posed_machine,
-    posed_motion,
     random_cloud,
     random_tree,
     stiffened,
@@ -32,8 +30,6 @@ from dolfinopt.multibody.end_effector import (
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
-from dolfinopt.multibody.shape_integrals import plane_body
-from dolfinopt.multibody.spatial.mechanism import exponential
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.scene.load import load_scene
 
@@ -120,31 +116,6 @@ def test_forces_are_those_of_the_points(kind: str) -> None:
     assert_close(alone, found[:, one.rigid :], ROUNDING)
 
 
-@pytest.mark.parametrize("stiff", [False, True])
-def test_plane_machine_in_space(stiff: bool) -> None:
-    """Forces and end-effector are those of the plane's equations, in a tilted frame, too."""
-    rng = np.random.default_rng(3)
-    chain = Chain(
-        (random_cloud(rng, 3), random_cloud(rng, 2)), 2.0, 0.3, (0.5, -9.81), -0.5,
-        (JointHardware(0.4, 0.1, 0.2), JointHardware(rotor=0.3)), 1.5,
-    ).mechanism()  # fmt: skip
-    if stiff:
-        chain = replace(chain, bodies=tuple(stiffened(rng, b, 1.0) for b in chain.bodies))
-    motion, rates = RigidMotion(*rng.normal(size=(3, 5, 3))), 0.4 * rng.normal(size=(3, 5, 5))
-    expected = inverse_dynamics(chain, motion, *rates)
-    space, joints = posed_machine(chain), posed_motion(motion)
-    tilt = exponential(np.array([0.3, -1.0, 0.5]))  # the whole machine, gravity included
-    first = replace(space.joints[0], rotation=tilt)
-    tilted = replace(space, joints=(first, *space.joints[1:]), gravity=tilt @ space.gravity)
-    for one in (space, tilted):
-        for found, value in zip(inverse_dynamics(one, joints, *rates), expected, strict=True):
-            assert_close(found, value, ROUNDING)
-    e = rates[0]
-    assert np.abs(end_effector(space, joints, e)[:, 2]).max() == 0.0
-    for function in (end_effector, deviation):
-        assert_close(function(space, joints, e)[:, :2], function(chain, motion, e), ROUNDING)
-
-
 def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
     """Dense, by parts and from both sides, whatever rigid and elastic coordinates are asked for."""
     states, R = machine.states, machine.rigid
@@ -177,24 +148,6 @@ def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
         found = tangent.times(*change, wanted).reshape(expected.shape)
         assert_close(found, expected, DIFFERENCES, 10.0 * scale)
         assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
-
-
-def test_tangent_of_a_fixed_base() -> None:
-    """The cart at rest: joints alone are free."""
-    one = machine_of("3 arms")
-    one.states[1:, :, 0] = 0.0
-    found = one.tangent(None, np.arange(1, one.rigid)).dense().reshape(4, -1, 3, 9)
-    whole = one.tangent(None, np.arange(one.rigid)).dense().reshape(4, -1, 3, 10)
-    assert_close(found, whole[:, 1:, :, 1:], ROUNDING)
-
-
-def test_mass_matrix(machine: Machine) -> None:
-    """Symmetric and positive definite over rigid and elastic coordinates together."""
-    size = machine.states.shape[2]
-    mass = machine.tangent(None, np.arange(machine.rigid)).dense()[:, :, 2 * size :]
-    assert_close(mass, mass.swapaxes(1, 2), ROUNDING)
-    if isinstance(machine.model, Chain) and not machine.model.K0:  # large ones bend too far
-        assert np.linalg.eigvalsh(mass).min() > 0.0
 
 
 @pytest.mark.parametrize("name", CONSTANTS)
@@ -303,9 +256,6 @@ def test_few_instants_do_not_depend_on_memory() -> None:
         assert len(found) == 1
 
 
-# -- of the plane ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", CHAINS)
 def test_interface_and_its_variation(kind: str) -> None:
     """Jacobian and Hessian by all coordinates; both by outboard modes and their stiffness."""
@@ -334,51 +284,3 @@ def test_interface_and_its_variation(kind: str) -> None:
                 return float((np.conj(weights) * there.place + np.conj(pull) * swept).real.sum())
 
             assert_close(np.sum(gradient * change), derivative(worth), 1e-10, 10.0)
-
-
-def test_rigid_limit_is_the_two_link_arm() -> None:
-    """Elastic coordinates at rest in zero: the textbook's torques of two links on a cart.
-
-    Source: Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), section 7.4, with
-    the cart's acceleration added.
-    """
-    links = (m1, c1, J1, l1), (m2, c2, J2, l2) = (1.5, 0.4, 0.5, 1.0), (0.9, 0.3, 0.2, 0.8)
-    mp, Jp, g = 0.7, 0.05, 9.81
-    none, one = np.zeros(1), np.eye(1)  # a coordinate that moves nothing but itself
-    bodies = tuple(
-        plane_body(
-            m, np.array([m * c, 0.0]), J, np.zeros((2, 1)), none, none, one, 0.0 * one, one,
-            0.0 * one, np.zeros((3, 1)), np.array([length, 0.0]),
-        )
-        for m, c, J, length in links
-    )  # fmt: skip
-    q, qd, qdd = np.random.default_rng(3).normal(size=(3, 6, 3))
-    zero = np.zeros((6, 2))
-    mechanism = Mechanism(bodies, mp, Jp, (0.0, -g), 0.3)
-    _, drives = inverse_dynamics(mechanism, RigidMotion(q, qd, qdd), zero, zero, zero)
-    (x, a1, a2), (alpha, total) = qdd.T, (q[:, 1], q[:, 1] + q[:, 2])
-    w1, w2, wd1, wd2 = qd[:, 1], qd[:, 1] + qd[:, 2], a1, a1 + a2
-    s1 = m1 * c1 + (m2 + mp) * l1  # first moments that follow each link's direction
-    s2 = m2 * c2 + mp * l2
-    inner, outer = J1 + (m2 + mp) * l1**2, J2 + mp * l2**2 + Jp
-    cos, sin = np.cos(q[:, 2]), np.sin(q[:, 2])
-    elbow = outer * wd2 + s2 * l1 * (cos * wd1 + sin * w1**2)
-    elbow += s2 * (g * np.cos(total) - x * np.sin(total))
-    shoulder = elbow + inner * wd1 + s2 * l1 * (cos * wd2 - sin * w2**2)
-    shoulder += s1 * (g * np.cos(alpha) - x * np.sin(alpha))
-    cart = (m1 + m2 + mp) * x - s1 * (np.sin(alpha) * wd1 + np.cos(alpha) * w1**2)
-    cart -= s2 * (np.sin(total) * wd2 + np.cos(total) * w2**2)
-    assert_close(drives, np.stack([cart, shoulder, elbow], axis=1), 1e-13)
-
-
-def test_compliance_is_twice_the_elastic_energy() -> None:
-    """Arm by arm, from the block-diagonal stiffness."""
-    mechanism = machine_of("3 arms").mechanism
-    q = np.random.default_rng(4).normal(size=(4, mechanism.num_coordinates))
-    found = mechanism.compliance(q)
-    assert_close(found.sum(axis=1), np.einsum("nk,kl,nl->n", q, mechanism.stiffness(), q), 1e-13)
-    alone = np.zeros_like(q)
-    alone[:, mechanism.slices[1]] = q[:, mechanism.slices[1]]
-    parts = mechanism.compliance(alone)
-    assert not parts[:, [0, 2]].any()
-    assert_close(parts[:, 1], found[:, 1], 1e-14)

@@ -12,16 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Chain, assert_close, bar, derivative
-from mpi4py import MPI
-from remainders import built_of
+from bodies import assert_close, derivative
 from runs import refused
 from scipy.optimize import brentq
 
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.multibody.motion import (
     Bend,
@@ -36,8 +32,6 @@ from dolfinopt.paths.time_laws import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
-
-WORLD = MPI.COMM_WORLD
 
 DURATION = 1.9  # s
 INSIDE = np.linspace(0.1, 1.8, 18)  # s, where the path is smooth
@@ -88,15 +82,6 @@ def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
     angles = np.cumsum(motion.q[:, 1:], axis=1)
     x = motion.q[:, 0] + np.cos(angles) @ lengths
     return np.stack([x, of.motion.joint_height + np.sin(angles) @ lengths], axis=1)
-
-
-def test_peaks_of_the_laws() -> None:
-    """Speed 15/8 and acceleration 10 / sqrt(3) of the quintic, speed 35/16 of the septic."""
-    peak = DURATION * (0.5 - np.sqrt(3.0) / 6.0)  # where the jerk is zero
-    _, sd, sdd = quintic(np.array([DURATION / 2.0, peak]), DURATION)
-    assert_close(sd[0], 15.0 / 8.0 / DURATION, 1e-14)
-    assert_close(sdd, [0.0, 10.0 / np.sqrt(3.0) / DURATION**2], 1e-14)
-    assert_close(septic(np.array([DURATION / 2.0]), DURATION)[1], [35.0 / 16.0 / DURATION], 1e-14)
 
 
 @pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
@@ -152,8 +137,6 @@ def test_line_is_straight(law: str) -> None:
     for found, expected in zip((path.p - [-0.4, 0.1], path.pd, path.pdd), s, strict=True):
         assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
 
-
-# -- any number of arms ----------------------------------------------------------------------
 
 LENGTHS = {1: (1.0,), 2: (1.1, 0.9), 3: (0.8, 0.7, 0.5), 4: (0.6, 0.5, 0.5, 0.4)}  # m
 POINTS = np.array([[-0.7, 0.0], [-0.5, 0.3], [0.0, 0.2], [0.4, 0.35], [0.6, 0.1]])  # m
@@ -235,28 +218,6 @@ def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str)
     assert_close(ends.q[3:], ends.q[[2, 2]], 1e-12)
 
 
-@pytest.mark.parametrize("elbow", [-1, 1])
-def test_one_arm_leans_to_its_side(elbow: int) -> None:
-    """The cosine has the sign of elbow; the cart is on the other side of the end-effector."""
-    of = scene((1.0,), elbow=elbow, **PATHS["line"])
-    motion = rigid_motion(DENSE, of)
-    assert (np.sign(np.cos(motion.q[:, 1])) == elbow).all()
-    height = desired_path(DENSE, of.motion).p[:, 1] + 0.5
-    assert_close(np.sin(motion.q[:, 1]), height, 1e-15)
-
-
-def test_two_arms_by_the_cosine_rule() -> None:
-    """Angles of the triangle of shoulder, elbow and end-effector."""
-    of = scene((1.1, 0.9), **PATHS["line"], **BASES["fixed"])
-    motion = rigid_motion(DENSE, of)
-    way = desired_path(DENSE, of.motion).p - [0.1, -0.5]
-    distance = np.hypot(*way.T)
-    inner = np.arccos((1.1**2 + 0.9**2 - distance**2) / (2.0 * 1.1 * 0.9))
-    at_shoulder = np.arccos((1.1**2 + distance**2 - 0.9**2) / (2.0 * 1.1 * distance))
-    assert_close(motion.q[:, 2], -(np.pi - inner), 1e-14)
-    assert_close(motion.q[:, 1], np.arctan2(way[:, 1], way[:, 0]) + at_shoulder, 1e-14)
-
-
 @pytest.mark.parametrize("arms", [2, 3, 4, 7])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_bend_is_the_first_from_stretched(arms: int, seed: int) -> None:
@@ -328,14 +289,6 @@ def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) 
     assert found and words in said and key in said and "\n" not in said
     assert time is None or float(found[1]) == pytest.approx(time, abs=5e-3)
     assert float(found[2]) == pytest.approx(distance, rel=1e-3, abs=5e-6)
-
-
-def test_path_within_reach_is_accepted() -> None:
-    """Close to the stretched position, no message."""
-    check_motion(scene(joint_height=-0.999))
-
-
-# -- tables ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
@@ -426,62 +379,3 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
     arms = (of.arms[0].model_copy(update={"name": name}), of.arms[1])
     with refused(f"'{name}'", "another name"):
         check_motion(of.model_copy(update={"arms": arms}))
-
-
-# -- scenes of one and three arms, end to end -------------------------------------------------
-
-HEIGHT, THICKNESS, STEEL = 0.06, 0.01, (70e9, 2700.0)  # m, m, (Pa, kg/m3): `scene`'s arms
-
-
-def simulated(of: Scene) -> Trajectory:
-    """Return the trajectory of solid arms."""
-    built = built_of(of)
-    _, trajectory = built.evaluate({k: arm.uniform(1.0) for k, arm in built.arms.items()})
-    assert trajectory is not None
-    return trajectory
-
-
-def test_one_arm_turned_by_a_table_is_a_loaded_cantilever(tmp_path: Path) -> None:
-    """Slowly: tangential and centrifugal loads of arm and payload on Bernoulli's beam and bar."""
-    file = tmp_path / "joints.csv"
-    file.write_text("t,arm0\n0,0.2\n1.9,2.7\n")  # two rows in time: the quintic law
-    length, mass = 0.7, 0.5  # m, kg
-    of = scene(
-        (length,), {"payload": {"mass": mass}}, (70, 6), path="joints", file=str(file), base="fixed"
-    )
-    trajectory = simulated(of)
-    s, sd, sdd = quintic(trajectory.t, DURATION)
-    alpha, speed, acceleration = 0.2 + 2.5 * s, 2.5 * sd, 2.5 * sdd
-    assert_close(trajectory.q_r[:, 1], alpha, 1e-13)
-    deviation = (trajectory.deviation @ [1.0, 1j]) * np.exp(-1j * alpha)
-    area, bending = HEIGHT * THICKNESS, STEEL[0] * THICKNESS * HEIGHT**3 / 12.0
-    line = STEEL[1] * area
-    across = 11.0 * line * length**5 / 120.0 + mass * length**4 / 3.0
-    along = (line * length**3 / 3.0 + mass * length**2) / (STEEL[0] * area)
-    # Six cells across bend too little and shear adds some: 1.5 % together.
-    assert_close(deviation.imag, -across / bending * acceleration, 0.02)
-    # Pulling needs no fine mesh; the ends, held against contraction, make it 0.3 % shorter.
-    assert_close(deviation.real, along * speed**2, 0.01)
-
-
-@pytest.mark.parametrize("base", ["cart", "fixed"])
-@pytest.mark.parametrize("arms", [1, 3])
-def test_joint_forces_by_lagrange(tmp_path: Path, arms: int, base: str) -> None:
-    """Of the rigid mechanism to differences, and of the flexible one in all but vibration."""
-    path, lengths = "joints in time" if arms == 1 else "points", (0.7,) * arms
-    file = tmp_path / "table.csv"
-    file.write_text(table_text(path, arms, base))
-    gravity = (0.5, -9.81)
-    motion = {**PATHS[path], **BASES[base], "file": str(file), "gravity": list(gravity)}
-    of = scene(lengths, {"payload": {"mass": 2.0, "inertia": 0.1}}, **motion)
-    trajectory, at = simulated(of), slice(100, 1900, 300)
-    rigid = trajectory.motion[at]
-    clouds = tuple(bar(one, HEIGHT, STEEL[1] * one * HEIGHT * THICKNESS) for one in lengths)
-    chain = Chain(clouds, 2.0, 0.1, gravity, of.motion.joint_height)
-    rows = zip(rigid.q, rigid.qd, rigid.qdd, strict=True)
-    expected = np.array([chain.forces(*row) for row in rows])
-    still = np.zeros((len(rigid.q), trajectory.mechanism.num_coordinates))
-    found = inverse_dynamics(trajectory.mechanism, rigid, still, still, still)[1]
-    assert_close(found, expected, 1e-10)  # differences of a function of size ten
-    # The arms bend by some thousandths of their length, and a vibration of 11 % goes on.
-    assert_close(trajectory.joint_forces[at], expected, 0.12)

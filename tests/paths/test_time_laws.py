@@ -99,13 +99,16 @@ def test_continuity_is_what_the_law_promises(name: str, share: float) -> None:
         assert_close(left, both[0][2][1:], 1e-12)
 
 
-def test_trapezoid_and_s_curve_in_closed_form() -> None:
-    """The default profiles' largest speed 4/3, acceleration 16/3 and 64/9 of their units."""
-    trapezoid, curve = law_of("trapezoidal"), law_of("s-curve")
-    assert_close(peaks(trapezoid, 2.0, 1.0)[:2], [4 / 3 / 2, 16 / 3 / 4], 1e-12)
-    assert_close(peaks(curve, 2.0, 1.0), [4 / 3 / 2, 64 / 9 / 4, 64 / 9 * 16 / 8], 1e-9)
-    assert_close(trapezoid.knots, [0.25, 0.75], 1e-15)
-    assert_close(curve.knots, np.array([1, 3, 4, 12, 13, 15]) / 16, 1e-15)
+def test_peaks_in_closed_form() -> None:
+    """Largest speed and acceleration of a move of 1 m in 1 s."""
+    for name, speed, acceleration in (
+        ("quintic", 15 / 8, 10 / np.sqrt(3)), ("septic", 35 / 16, 84 * np.sqrt(5) / 25),
+        ("trapezoidal", 4 / 3, 16 / 3), ("s-curve", 4 / 3, 64 / 9),
+    ):  # fmt: skip
+        assert_close(peaks(law_of(name), 1.0, 1.0)[:2], [speed, acceleration], 1e-5)
+    assert_close(peaks(law_of("s-curve"), 2.0, 1.0)[2], 64 / 9 * 16 / 8, 1e-9)
+    assert_close(law_of("trapezoidal").knots, [0.25, 0.75], 1e-15)
+    assert_close(law_of("s-curve").knots, np.array([1, 3, 4, 12, 13, 15]) / 16, 1e-15)
 
 
 @EVERY
@@ -151,9 +154,6 @@ def test_limits_are_met_exactly(name: str) -> None:
 def test_fastest(name: str, limits: dict[str, float], expected: float) -> None:
     """Two metres, in closed form."""
     assert_close(law_of(name, 0.25, 2.0, **limits).least, expected, 1e-14)
-
-
-# -- in scenes --------------------------------------------------------------------------------
 
 
 def posed(**motion: Any) -> Scene:

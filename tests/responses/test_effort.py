@@ -7,31 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from runs import demo, refused, scene
 
 import dolfinopt as do
 from dolfinopt import Model
+from dolfinopt.paths.time_laws import quintic
 from dolfinopt.responses.constraints import constraint_label, limits_by_column, limits_of
 
-WORLD = MPI.COMM_WORLD
+# Ranks: limits of effort and peak force in test_every_option_gives_the_same_bits_on_any_number...
+pytestmark = pytest.mark.serial
 EFFORT = "objective.kind=effort"
 KEPT = "constraints.compliance=1e6"  # N m; far away
 SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
-
-
-def quintic(t: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return 10 u^3 - 15 u^4 + 6 u^5, u = t / duration at most 1, and its derivatives by t."""
-    u = np.minimum(t / duration, 1.0)
-    s = 10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5
-    sd = (30.0 * u**2 - 60.0 * u**3 + 30.0 * u**4) / duration
-    sdd = (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / duration**2
-    return s, sd, sdd
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a_x b_y - a_y b_x (n,)."""
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
@@ -40,25 +27,19 @@ def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
     Newton's law of the payload alone: arms of 1 m without mass hand its force on.
     """
     s, sd, sdd = quintic(t, 1.9)
-    angle, rate, second = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
-    radial = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    around = np.stack([-radial[:, 1], radial[:, 0]], axis=1)
-    acceleration = second[:, None] * around - (rate**2)[:, None] * radial
-    force = mass * (acceleration + np.array([0.0, gravity]))
-    shoulder = np.stack([0.5 * radial[:, 0], np.full(len(t), -0.5)], axis=1)
-    chord = radial - shoulder
-    length = np.hypot(*chord.T)[:, None]
-    left = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length
-    elbow = shoulder + 0.5 * chord + np.sqrt(1.0 - 0.25 * length**2) * left  # beta < 0
-    return np.stack([force[:, 0], cross(chord, force), cross(radial - elbow, force)], axis=1)
+    place = np.exp(1j * np.pi * (1.0 - s))  # x + i y
+    force = mass * ((-1j * np.pi * sdd - (np.pi * sd) ** 2) * place + 1j * gravity)
+    shoulder = 0.5 * place.real - 0.5j
+    chord = place - shoulder
+    length = np.abs(chord)
+    elbow = shoulder + 0.5 * chord + np.sqrt(1.0 - 0.25 * length**2) * 1j * chord / length
+    moments = [(np.conj(place - joint) * force).imag for joint in (shoulder, elbow)]
+    return np.stack([force.real, *moments], axis=1)
 
 
-@pytest.mark.serial
 @pytest.mark.parametrize("weights", [None, (0.01, 0.02, 0.05), (0.0, 0.0, 1.0)])
 @pytest.mark.parametrize("gravity", [0.0, 9.81])
-def test_rigid_limit_is_newtons_law(
-    gravity: float, weights: tuple[float, float, float] | None
-) -> None:
+def test_rigid_limit_is_newtons_law(gravity, weights) -> None:
     """Stiff arms of hardly any mass: the payload's inertia is all that the drives feel."""
     changes = [f"motion.gravity=[0.0, {-gravity}]", "material.density=1e-3"]
     changes += ["material.young_modulus=1e14", "simulation.stiffening=false"]
@@ -76,18 +57,15 @@ def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
     for changes in ((), ("motion.base=fixed", "motion.radius=0.6")):
         made = scene(*SMALL, *changes)
         result = Model(made).simulate()
-        if WORLD.rank == 0:
-            assert result.trajectory is not None
-            rms = result.trajectory.drives[1][made.driven_columns]
-            assert len(rms) == len(made.driven)
-            assert result.objective == pytest.approx(np.linalg.norm(rms), rel=1e-12)
+        rms = result.trajectory.drives[1][made.driven_columns]
+        assert len(rms) == len(made.driven)
+        assert result.objective == pytest.approx(np.linalg.norm(rms), rel=1e-12)
         assert result.unit == "-"
 
 
 BALANCED, ALPHA = "reduction.method=balanced", "simulation.integrator=generalized-alpha"
 
 
-@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -125,15 +103,13 @@ def test_peak_forces_are_limited_drive_by_drive() -> None:
     # As the optimiser has them, the true ones over their limits.
     relative = [one.value / one.limit - 1.0 for one in found]
     assert result.evaluation.constraints[-3:] == pytest.approx(relative, rel=1e-12)
-    if WORLD.rank == 0:
-        assert result.trajectory is not None
-        peaks = np.abs(result.trajectory.joint_forces).max(axis=0)
-        assert [one.value for one in found] == pytest.approx(list(peaks), rel=1e-12)
-        smooth = np.array(result.evaluation.responses[-1].smooth)
-        assert (smooth < peaks).all() and (smooth > 0.7 * peaks).all()
+    peaks = np.abs(result.trajectory.joint_forces).max(axis=0)
+    assert [one.value for one in found] == pytest.approx(list(peaks), rel=1e-12)
+    smooth = np.array(result.evaluation.responses[-1].smooth)
+    assert (smooth < peaks).all() and (smooth > 0.7 * peaks).all()
 
 
-def test_a_drive_may_have_no_limit(shared_tmp_path: Path) -> None:
+def test_a_drive_may_have_no_limit() -> None:
     """As inf in a scene, and null in a summary's, which is read back."""
     made = scene("arms.cells=[20,3]", "constraints.peak_force=[inf,30.0,inf]")
     result = Model(made).simulate()
@@ -150,14 +126,11 @@ def test_weighted_sum_of_peak_forces_as_objective() -> None:
     weights = np.array([0.0, 2.0, 1.0])
     options = ["objective.effort_weights=[0.0,2.0,1.0]", "objective.exponent=200", KEPT]
     result = Model(scene("arms.cells=[20,3]", "objective.kind=peak_force", *options)).simulate()
-    if WORLD.rank == 0:
-        assert result.trajectory is not None
-        expected = float(weights @ np.abs(result.trajectory.joint_forces).max(axis=0))
-        assert result.objective == pytest.approx(expected, rel=0.03)
+    expected = float(weights @ np.abs(result.trajectory.joint_forces).max(axis=0))
+    assert result.objective == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.slow
-@pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(
     "limit", ["effort=7.4", "peak_force=[100.0,15.0,7.0]"], ids=["effort", "peak force"]
 )
@@ -172,15 +145,13 @@ def test_a_limit_of_the_drives_is_met(limit: str) -> None:
     assert -5e-3 < max(one.excess for one in asked) <= 1e-3
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_effort_demo(shared_tmp_path: Path) -> None:
+def test_effort_demo(tmp_path: Path) -> None:
     """Runs, tables and draws on few cells."""
-    rows = demo("demo_effort").main(shared_tmp_path, (20, 2), 3)
-    if WORLD.rank == 0:
-        assert [row["design"] for row in rows] == ["least compliance", "least effort"]
-        lines = (shared_tmp_path / "effort.csv").read_text(encoding="utf-8").splitlines()
-        assert len(lines) == 3 and lines[0].startswith("design,effort,deviation [mm]")
-        assert (shared_tmp_path / "effort.png").read_bytes().startswith(b"\x89PNG")
+    rows = demo("demo_effort").main(tmp_path, (20, 2), 3)
+    assert [row["design"] for row in rows] == ["least compliance", "least effort"]
+    lines = (tmp_path / "effort.csv").read_text(encoding="utf-8").splitlines()
+    assert len(lines) == 3 and lines[0].startswith("design,effort,deviation [mm]")
+    assert (tmp_path / "effort.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_gradient_is_exact_whatever_is_asked_for() -> None:
@@ -191,6 +162,4 @@ def test_the_gradient_is_exact_whatever_is_asked_for() -> None:
         np.testing.assert_array_equal(values, frozen[name])
         assert values.any()
     # Material at the end of the last arm is carried by every drive.
-    if WORLD.rank == 0:
-        x = model.centroids["arm2"][:, 0]
-        assert exact["arm2"][x > 0.9].sum() > 0.0
+    assert exact["arm2"][model.centroids["arm2"][:, 0] > 0.9].sum() > 0.0

@@ -48,7 +48,8 @@ SPATIAL_STROKES += "0.5,1,1,-1\n"
 SKEW = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
 Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
-Transfinite Curve {1, 3} = 25; Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
+Transfinite Curve {1} = 25 Using Progression 1.05; Transfinite Curve {3} = 25;
+Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
 
@@ -149,7 +150,7 @@ CASES = [
     case("two_arm", *EFFORT, MODAL, BENT, *LOADED),
     case("two_arm", *EFFORT, BENT, GRAVITY),
     case("two_arm", DEVIATION, BENT),
-    case("two_arm", "arms.mesh='FOLDER/skew.geo'", "design.filter_radius=0.02", COMPLIANCE),
+    case("two_arm", "arms.mesh='FOLDER/skew.geo'", "design.filter_radius=0.02", COMPLIANCE, BENT),
     *(case("two_arm", COMPLIANCE, f"arms.element={name}", bent, "arms.cells=[12,2]")
       for name in ELEMENTS for bent in (LINEAR, BENT)),
     *(case("two_arm", COMPLIANCE, "reduction.method=krylov", f"reduction.coordinates={q}",
@@ -195,6 +196,7 @@ CASES = [
     # Two arms of one design, by the densities of one; of the same size, or scaled.
     *(case("two_arm", *REPEATED, kind, ranks=kind == STATIC)
       for kind in ("objective.kind=esl", STATIC, FREQUENCY, DEVIATION)),
+    case("two_arm", *REPEATED, STATIC, "interpolation.law=simp"),
     # Other numbers of arms.
     case("one_arm", COMPLIANCE, "motion.law=trapezoidal"),
     case("three_arm", "motion.law=s-curve", "objective.load_cases=5", slow=True),
@@ -210,7 +212,9 @@ CASES = [
          "arms.rotor_inertia=2e-5", "arms.gear_ratio=100.0"),
     case("two_arm", DEVIATION, *JOINT, *SOFT),
     case("controlled", *EFFORT, GRAVITY),
-    case("two_arm", *EFFORT, *JOINT, *SOFT, slow=True),
+    case("controlled", *EFFORT, GRAVITY, "control.limits=[150.0,200.0,150.0]",
+         "control.forces='FOLDER/drives.csv'", *SOFT),
+    case("two_arm", *EFFORT, *JOINT, *SOFT),
     case("controlled", *PEAK, BENT),
     case("slider"),
     case("slider", DEVIATION, GRAVITY),
@@ -219,6 +223,7 @@ CASES = [
     case("slider", CRANK, "control.stiffness=[0.0]", GRAVITY),
     case("slider", *EFFORT, GRAVITY),
     case("slider", *EFFORT, CRANK),
+    case("slider", *EFFORT, CRANK, "control.limits=[40.0]"),
     case("slider", *PEAK, GRAVITY),
     case("pin", slow=True),
     case("pin", *EFFORT, slow=True),

@@ -14,7 +14,7 @@ import dolfinopt as do
 from dolfinopt.multibody.shape_integrals import TABLE, of_material
 from dolfinopt.parallel import on_root
 from dolfinopt.responses.response import bodies_in, combined
-from dolfinopt.scene.load import pose_scenarios, scene_from_dict
+from dolfinopt.scene.load import pose_scenarios
 
 WORLD = MPI.COMM_WORLD
 MATERIAL = ("material.density=3100.0", "material.young_modulus=50e9")
@@ -25,13 +25,10 @@ PATH = ("motion.flattening=0.5", "motion.horizon=2.5", "payload.mass=8")
 SIMULATED = 2e-4
 
 
-def scenarios(*changes, weights=None):
+def scenarios(*changes, weights=(1.0,) * 9):
     """Return the override that poses scenarios."""
-    weights = weights or [1.0] * len(changes)
-    rows = [
-        f"{{changes={json.dumps(list(one))}, weight={weight:g}}}"
-        for one, weight in zip(changes, weights, strict=True)
-    ]
+    pairs = zip(changes, weights)
+    rows = [f"{{changes={json.dumps(list(one))}, weight={weight:g}}}" for one, weight in pairs]
     return f"scenarios=[{', '.join(rows)}]"
 
 
@@ -55,18 +52,13 @@ def test_scaled_bodies_are_those_reduced_anew(method):
         anew = there.arms[k].reduce(x[k])
         # Modes are normalised to the mass: another density is another length of theirs.
         size = np.sqrt(np.diag(anew.K) / np.diag(body.K))
-        assert body.mass == pytest.approx(anew.mass, rel=1e-12)
-        np.testing.assert_allclose(body.moment, anew.moment, rtol=1e-12, atol=1e-14)
-        assert body.inertia == pytest.approx(anew.inertia, rel=1e-12)
-        for name in ("C", "outboard", "j", "r"):
-            scaled_rows = getattr(body, name) * size
+        rows, square = dict.fromkeys(("C", "outboard", "j", "r"), size), np.outer(size, size)
+        factors = dict.fromkeys(("mass", "moment", "inertia"), 1.0) | rows
+        for name, factor in (factors | dict.fromkeys("MKDG", square)).items():
             expected = getattr(anew, name)
             # Eigenvectors are right to 1e-10, see reduction.basis.
-            np.testing.assert_allclose(scaled_rows, expected, atol=1e-8 * np.abs(expected).max())
-        for name in ("M", "K", "D", "G"):
-            expected = getattr(anew, name)
-            got = getattr(body, name) * np.outer(size, size)
-            np.testing.assert_allclose(got, expected, atol=1e-8 * np.abs(expected).max())
+            close = 1e-8 * np.abs(expected).max()
+            np.testing.assert_allclose(getattr(body, name) * factor, expected, atol=close)
 
 
 @pytest.mark.serial  # ranks have no part in it
@@ -131,10 +123,8 @@ def test_frozen_gradient_adds_up():
 
 @pytest.mark.serial  # ranks have no part in it
 def test_weights_scale_the_worst_case():
-    data = build(
-        scenarios(PATH, MATERIAL, weights=[2.0, 1.0]), "objective.scenarios=worst"
-    ).scene.to_dict()
-    scene = scene_from_dict(data)
+    uses = scenarios(PATH, MATERIAL, weights=[2.0, 1.0])
+    scene = do.load_scene(TWO_ARM, [uses, "objective.scenarios=worst"])
     value, slopes = combined(scene, [1.0, 1e-3])
     assert value == pytest.approx(2.0, rel=1e-12) and slopes[0] == pytest.approx(2.0, rel=1e-12)
 
@@ -144,9 +134,7 @@ def test_weights_scale_the_worst_case():
 def test_robust_against_two_payloads():
     """The worst case of a light and a heavy payload is better than that of the nominal design."""
     fast = ["optimizer.max_iterations=25", "arms.cells=[30,4]", "simulation.tolerance=1e-3"]
-    uses = scenarios(
-        ("payload.mass=2", "motion.flattening=1.0"), ("payload.mass=8",), weights=[8, 1]
-    )
+    uses = scenarios(("payload.mass=2",), ("payload.mass=8",), weights=[8, 1])
     scene = do.load_scene(TWO_ARM, [*fast, uses, "objective.scenarios=worst"])
     robust = do.optimize(scene)
     nominal = do.optimize(do.load_scene(TWO_ARM, fast))

@@ -51,17 +51,6 @@ def test_no_maximum_is_missed(seed: int) -> None:
     assert found.looked_at <= n
 
 
-def test_few_instants_are_looked_at() -> None:
-    """Of a smooth motion little more than the first pass."""
-    t = np.linspace(0.0, 3.0, 3001)
-    a = np.stack([np.sin(5.0 * t), np.exp(-t) * np.cos(40.0 * t), 0.1 * np.cos(9.0 * t)], axis=1)
-    A = np.random.default_rng(1).normal(size=(3, 50, 3))
-    found = screen(MPI.COMM_SELF, A, a, every(len(t)))
-    truth = lengths(A, a)
-    assert found.largest == pytest.approx(truth.max(), rel=1e-12)
-    assert found.looked_at < 300
-
-
 def test_nothing_is_loaded() -> None:
     found = screen(MPI.COMM_SELF, np.zeros((3, 4, 2)), np.zeros((7, 2)), every(7))
     assert found.largest == 0.0
