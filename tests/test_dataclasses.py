@@ -1,7 +1,5 @@
 """Dataclasses all over the package compare without asking arrays for a truth value."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil

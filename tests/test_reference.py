@@ -1,7 +1,5 @@
 """The whole chain against independent programs (tests/reference), and against differences."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -7,8 +7,6 @@ of one design in test_scenarios and test_cases, time steps that start warm in te
 test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os

@@ -1,13 +1,13 @@
 """Pieces that share faces, contacts that do not, and designs rated without these."""
 
-from __future__ import annotations
-
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import built_of, dense_matrices
 from runs import TWO_ARM, overrides, run
 from solids import solid_arm
 
@@ -146,11 +146,9 @@ QUICK = ("arms.cells=[24,6]", "arms.arm2.rigid=true", "arms.passive=0", "objecti
 @pytest.mark.serial
 def test_the_crisp_design_is_rated_without_contacts():
     """A strut that hangs by a corner changes nothing; a chain alone is no crisp design."""
-    scene = do.load_scene(TWO_ARM, QUICK)
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, do.Profile())
-    evaluator = Evaluator(scene, partition, arms, do.Profile())
-    i, j = (arms[0].mesh.centroid * [24.0, 100.0] + [0.0, 3.0]).astype(int).T
+    built = built_of(do.load_scene(TWO_ARM, QUICK), MPI.COMM_SELF)
+    evaluator = Evaluator(built.scene, built.partition, built.arms, built.profile)
+    i, j = (built.arms[0].mesh.centroid * [24.0, 100.0] + [0.0, 3.0]).astype(int).T
 
     def crisp(solid):
         return _crisp(evaluator, {0: np.where(solid, 1.0, 0.0)})
@@ -222,25 +220,15 @@ def compliance(arm, solid, split):
     """Return f'u of unit loads at the outboard end, cells at contacts with nodes of their own."""
     operators, T = arm.substructure.operators, arm.substructure.T
     cells, points = operators.cells.copy(), list(operators.points)
-    rigid = T.inboard | T.outboard
-    for node in np.flatnonzero(~rigid) if split else ():
+    for node in np.flatnonzero(~(T.inboard | T.outboard)) if split else ():
         at = np.flatnonzero(solid & (cells == node).any(axis=1))
         if len(at) == 2 and len(np.intersect1d(*cells[at])) == 1:
             cells[at[1]] = np.where(cells[at[1]] == node, len(points), cells[at[1]])
             points.append(points[node])
-    young = arm.state(solid * 1.0).elastic.young
-    blocks = np.broadcast_to(operators.stiffness, (len(cells), 8, 8)) * young[:, None, None]
-    K = np.zeros((2 * len(points), 2 * len(points)))
-    for cell, block in zip(cells, blocks, strict=True):
-        dofs = (2 * cell[:, None] + [0, 1]).ravel()
-        K[np.ix_(dofs, dofs)] += block
-    x, y = np.array(points).T[:2]
-    inner = np.flatnonzero((x > 1e-9) & (x < x.max() - 1e-9))
-    basis = np.zeros((len(K), 2 * len(inner) + 3))
-    basis[(2 * inner[:, None] + [0, 1]).ravel(), np.arange(2 * len(inner))] = 1.0
-    end = np.flatnonzero(x > x.max() - 1e-9)
-    basis[2 * end, -3], basis[2 * end + 1, -2], basis[2 * end, -1] = 1.0, 1.0, -y[end]
-    inverse = np.linalg.inv(basis.T @ K @ basis)
+    elastic = arm.state(solid * 1.0).elastic
+    own = replace(operators, cells=cells, points=np.array(points))
+    K, _ = dense_matrices(SimpleNamespace(operators=own, mesh=arm.mesh), elastic.young, solid)
+    inverse = np.linalg.inv(K)
     return inverse[-2, -2] + inverse[-1, -1]  # a force across, a moment
 
 

@@ -1,7 +1,5 @@
 """Robots from URDF: kinematics and inertia of the scene; solids."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 

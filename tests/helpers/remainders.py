@@ -1,7 +1,5 @@
 """Arms of small scenes, dense and built, and Taylor remainders of functions of their densities."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

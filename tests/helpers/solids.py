@@ -1,7 +1,5 @@
 """One solid arm of a scene, 0.5 x 0.04 x 0.02 m of aluminium."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,16 +1,15 @@
 """Limits of the motion, of mass and frequencies: met by true values, or said to conflict."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.optimization.acceptance import Promise, judge_step, leaps, learnt, promise
 from dolfinopt.optimization.mma import initial_state, mma_step
-from dolfinopt.optimization.problem import Problem, Stage, limits_at, problem_of
+from dolfinopt.optimization.problem import Evaluator, Problem, Stage, limits_at, problem_of
 from dolfinopt.responses.constraints import EXCESS, limits_by_column, tightest
 from dolfinopt.responses.response import constraints_of
 
@@ -124,7 +123,8 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
     changes = ["objective.kind=mass", "constraints.deviation=0.012", "design.projection=robust"]
     changes += [f"design.limits_on={bound}"]
     built = scene(*changes, "design.erosion=0.2", iterations=1)
-    evaluator = evaluator_of(built)
+    arms = built_of(built)
+    evaluator = Evaluator(built, arms.partition, arms.arms, arms.profile)
     x = np.full(evaluator.variables.size, 0.6)
     x[::7] = 0.3
     designs = evaluator.evaluate(x)
@@ -154,14 +154,6 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
     # What a stage holds, later designs are measured by.
     held = [2.0 * one for one in limits_at(built, designs)]
     assert problem_of(built, designs, held).f == pytest.approx(0.5 * (1.0 + problem.f) - 1.0)
-
-
-def evaluator_of(built):
-    from dolfinopt.optimization.problem import Evaluator
-
-    partition = do.partition_arms(WORLD, built.cell_counts)
-    profile = do.Profile()
-    return Evaluator(built, partition, do.build_arms(built, partition, profile), profile)
 
 
 @pytest.mark.serial  # ranks have no part in it
@@ -265,14 +257,6 @@ def test_the_best_design_is_returned():
         # Evaluated again, from another first guess of the motion.
         assert result.evaluation.objective == pytest.approx(best.objective, rel=1e-9)
     assert not result.violated
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_asymptotes_begin_no_wider_than_they_may_become():
-    x = np.full(4, 0.5)
-    given = x, np.ones(4), np.zeros(1), np.ones((1, 4)), 0.0, 1.0, initial_state(x)
-    with pytest.raises(ValueError, match=r"widest is 0\.1, expected at least 0\.5"):
-        mma_step(*given, widest=0.1)
 
 
 # -- conservative steps ------------------------------------------------------------------------

@@ -1,14 +1,13 @@
 """Optimised machines: the demos' results, and all that goes with control and closed loops."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import Built, wave
-from runs import ROOT, overrides, run
+from remainders import built_of, wave
+from runs import ROOT, assert_same_bits, overrides, run
 
 import dolfinopt as do
 from dolfinopt.optimization.gradient_check import taylor_test
@@ -62,10 +61,7 @@ def test_resumes_in_the_same_bits(path, shared_tmp_path):
     whole = do.optimize(coarse(path, ROUGHLY))
     do.optimize(coarse(path, ROUGHLY, iterations=1), shared_tmp_path)
     resumed = do.optimize(coarse(path, ROUGHLY), shared_tmp_path, resume=True)
-    for k in whole.x_phys:
-        np.testing.assert_array_equal(resumed.x_phys[k], whole.x_phys[k])
-    rows = [replace(row, seconds=0.0) for row in resumed.history]
-    assert rows == [replace(row, seconds=0.0) for row in whole.history]
+    assert_same_bits(resumed, whole)
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
@@ -136,10 +132,8 @@ def test_gradient_of_scenarios(path, changes):
     cells = "arms.cells=[12,3]" if path == CONTROLLED else "arms.rod.cells=[12,3]"
     settings = [cells, "simulation.tolerance=1e-3", "reduction.coordinates=3", changes]
     scene = do.load_scene(path, [*COARSE[path], *settings])
-    profile = do.Profile()
-    partition = do.partition_arms(WORLD, scene.cell_counts)
-    built = Built(scene, partition, do.build_arms(scene, partition, profile), profile)
-    test = taylor_test(scene, partition, built.arms, built.fields(wave), profile)
+    built = built_of(scene)
+    test = taylor_test(scene, built.partition, built.arms, built.fields(wave), built.profile)
     assert test.passed, [row.rate for row in test.rows]
 
 

@@ -1,7 +1,5 @@
 """Lines, arcs and splines, the shapes behind polygons, and splines through points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

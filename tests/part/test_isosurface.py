@@ -1,7 +1,5 @@
 """Surfaces of solid designs."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

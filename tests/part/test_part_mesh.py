@@ -1,7 +1,5 @@
 """Meshes along the curves of parts, and the stress on their outline."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -74,16 +72,9 @@ def test_mesh_follows_curves_that_move():
 
     def bar(sag):
         bottom = Spline(knots, np.array([[0, -0.01], [0.03, -sag], [0.07, -sag], [0.1, -0.01]]))
-        return Shape(
-            (
-                (
-                    Piece(bottom, free=True),
-                    Piece(Line(points[1], points[2]), "outboard"),
-                    Piece(Line(points[2], points[3])),
-                    Piece(Line(points[3], points[0]), "inboard"),
-                ),
-            )
-        )
+        lines = [Line(points[k], points[(k + 1) % 4]) for k in (1, 2, 3)]
+        sides = map(Piece, lines, ("outboard", "", "inboard"))
+        return Shape(((Piece(bottom, free=True), *sides),))
 
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
         mesh = body_mesh(gmsh, bar(0.01), 0.004)

@@ -1,7 +1,5 @@
 """Parts of solid arms: closed, of the design's volume, exact at the arm's own faces."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -12,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from mpi4py import MPI
+from parts import write_run
 from runs import ROOT, run, shell
 from scipy.ndimage import gaussian_filter
 from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
@@ -23,6 +22,7 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.density.members import narrowest
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.part.domain import read_domains
 from dolfinopt.part.isosurface import Surface, cut, eighths, halved, nodal_densities, outside
 from dolfinopt.part.smooth_surface import crossings, distance_to_faces
 from dolfinopt.part.solid import MM, triangle_bytes
@@ -106,11 +106,15 @@ def test_part_of_a_solid(domain_with, density):
         assert area_in(part.surface, 0, side) == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
 
 
+def area_of(corners):
+    """Return the area of triangles (n, 3, 3)."""
+    a, b, c = corners.swapaxes(0, 1)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
 def area_in(surface, axis, place):
     """Return the area of the triangles in a plane across an axis, m2."""
-    flat = (np.abs(surface.corners[..., axis] - place) < 1e-9).all(axis=1)
-    a, b, c = surface.corners[flat].swapaxes(0, 1)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    return area_of(surface.corners[(np.abs(surface.corners[..., axis] - place) < 1e-9).all(axis=1)])
 
 
 @pytest.mark.parametrize("plate", [False, True])
@@ -124,9 +128,7 @@ def test_mesh_of_a_part(domain_with, plate):
     for facets, x in ((mesh.inboard, 0.0), (mesh.outboard, LENGTH)):
         corners = mesh.points[facets]
         assert np.abs(corners[..., 0] - x).max() < 1e-9
-        a, b, c = corners.swapaxes(0, 1)
-        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-        assert area == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
+        assert area_of(corners) == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
     boundary = trimesh.Trimesh(mesh.points, mesh.boundary, process=False)
     assert boundary.is_watertight and boundary.volume == pytest.approx(part.volume, rel=1e-6)
 
@@ -275,11 +277,7 @@ def test_bores_are_interfaces_of_parts(tmp_path):
     found = solid_mesh(part, 1.5 * mesh_size(part))
     assert found.quality.min() > 1e-3
     for faces, facets in ((domain.inboard, found.inboard), (domain.outboard, found.outboard)):
-        areas = []
-        for corners in (faces, found.points[facets]):
-            a, b, c = corners.swapaxes(0, 1)
-            areas.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-        assert areas[1] == pytest.approx(areas[0], rel=0.02)
+        assert area_of(found.points[facets]) == pytest.approx(area_of(faces), rel=0.02)
         assert distance_to_faces(found.points[np.unique(facets)], faces).max() < 1e-9
     with pytest.raises(InputError, match="several outboard interfaces"):
         solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
@@ -366,17 +364,8 @@ def test_no_part_can_be_made(domain_with, density, words):
 
 
 def finished(path, densities, *changes):
-    """Write what `dolfinopt part` reads of a run of the machine in space; return the folder."""
-    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", list(changes))
-    arrays = {}
-    for arm, density in zip(scene.arms[1:], densities):
-        mesh = arm_mesh(MPI.COMM_SELF, arm)
-        arrays[f"{arm.name}/centroid"] = mesh.centroid
-        arrays[f"{arm.name}/density"] = density(*mesh.centroid.T).astype(float)
-    path.mkdir()
-    np.savez(path / "design.npz", **arrays)
-    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
-    return path
+    """Write a run of the machine in space; return its folder."""
+    return write_run(path, do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes), *densities)
 
 
 @pytest.mark.slow
@@ -407,14 +396,9 @@ def test_two_ranks_write_the_same_solids(tmp_path, capfd):
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory):
     """The folder of a run in which one link has a part and the other is rigid; its part."""
-    folder = finished(
-        tmp_path_factory.mktemp("solids") / "run",
-        (windows,),
-        "arms.link1.cells=[16,4,2]",
-        "arms.link2.rigid=true",
-        "simulation.sample=0.01",
-        "constraints.deviation=0.001",
-    )
+    changes = ("arms.link1.cells=[16,4,2]", "arms.link2.rigid=true", "simulation.sample=0.01",
+               "constraints.deviation=0.001")  # fmt: skip
+    folder = finished(tmp_path_factory.mktemp("solids") / "run", (windows,), *changes)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dolfinopt.part.solid_mesh.ACROSS", 1.0)  # large cells take little time
         run("part", folder)
@@ -444,11 +428,8 @@ def test_scene_of_parts_is_the_machine_of_the_table(checked, tmp_path):
     found = do.Model(scene, comm=MPI.COMM_SELF).simulate().evaluation
     for value, name in ((found.compliance, "compliance"), (found.max_deviation, "deviation")):
         assert value == pytest.approx(figures["table"][name]["part"], rel=1e-6)
-
-
-def test_pictures_of_parts(checked):
     for name in ("part.png", "deviation.png", "stress.png"):
-        assert (checked[0] / "part" / name).stat().st_size > 5000
+        assert (folder / "part" / name).stat().st_size > 5000
 
 
 def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
@@ -464,7 +445,9 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
     assert model.check_parts(design) == "check" and told["given"][2].keys() == {1}
 
 
-def test_options_of_outlines_are_refused(tmp_path):
+def test_outlines_of_solids_are_refused(tmp_path):
+    with pytest.raises(InputError, match="arm 'arm1' is a solid"):
+        read_domains(solid_scene(), tmp_path, MPI.COMM_SELF)  # before anything is meshed
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
     for option, words in (("--polish=2", "--polish"), ("--curves=arcs", "varies over the thick")):
         with pytest.raises(InputError, match=words):

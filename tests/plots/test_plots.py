@@ -1,7 +1,5 @@
 """Pictures of the plane and of curves: the arrays that are drawn, and that something is seen."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from types import SimpleNamespace
