@@ -56,25 +56,6 @@ def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     assert (out / "drives.png").stat().st_size > 5000
 
 
-@pytest.mark.slow
-@pytest.mark.serial  # ranks: the same in test_optimization
-@pytest.mark.parametrize("kind", SCENES)
-def test_optimisation_goes_on_to_the_same_bits(kind, shared_tmp_path):
-    path = write_scene(SCENES[kind](), shared_tmp_path)
-    whole, parts = shared_tmp_path / "whole", shared_tmp_path / "parts"
-    options = [*QUICK, "--no-plots", "--set"]
-    run("optimize", path, *options, "optimizer.max_iterations=3", "--out", whole)
-    run("optimize", path, *options, "optimizer.max_iterations=1", "--out", parts)
-    run("optimize", path, *options, "optimizer.max_iterations=3", "--out", parts, "--resume")
-    WORLD.barrier()
-    for name in ("design.npz", "trajectory.npz"):
-        with np.load(whole / name) as one, np.load(parts / name) as other:
-            assert set(one.files) == set(other.files)
-            for key in one.files:
-                np.testing.assert_array_equal(one[key], other[key], err_msg=key)
-    WORLD.barrier()
-
-
 def test_bodies_of_a_loop_are_exported(shared_tmp_path):
     path = write_scene(loop("pin"), shared_tmp_path)
     run("export", path, "--out", shared_tmp_path / "bodies")
