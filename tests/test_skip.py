@@ -13,7 +13,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -24,15 +23,9 @@ from remainders import build, wave
 from runs import ROOT, TWO_ARM
 from runs import overrides as set_keys
 
-from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
-from dolfinopt.dynamics.build import build_mechanism
 from dolfinopt.fem import interior
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.motion import rigid_motion
-from dolfinopt.multibody.tangent import linearise
 from dolfinopt.output import run_folder as results
-from dolfinopt.parallel import gather_arms
 
 WORLD = MPI.COMM_WORLD
 # Coarse in space and time: what is counted depends on neither.
@@ -197,39 +190,6 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
     assert few == many
     if gradient == "esl":
         assert few["energy_fields"] == 3 * EACH
-
-
-# -- damping ---------------------------------------------------------------------------------
-
-
-class Watched(np.ndarray):
-    """A matrix that counts its products."""
-
-    products = 0
-
-    def __array_ufunc__(self, ufunc, method, *inputs, **options):
-        Watched.products += ufunc in (np.matmul, np.multiply)
-        plain = [x.view(np.ndarray) if isinstance(x, Watched) else x for x in inputs]
-        return getattr(ufunc, method)(*plain, **options)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("damping", [0.0, 2e-4])
-def test_undamped_rows_have_no_damping_terms(damping: float) -> None:
-    built = build(f"damping.stiffness_proportional={damping}")
-    x = built.fields(wave)
-    owned = gather_arms(built.partition, {k: a.reduce(x[k]) for k, a in built.arms.items()})
-    bodies = [replace(b, D=b.D.view(Watched)) for b in chain_of(built.scene, owned)]
-    mechanism = build_mechanism(built.scene, bodies)
-    t = np.linspace(0.1, 1.0, 3)
-    motion, q = rigid_motion(t, built.scene), np.full((3, mechanism.num_coordinates), 1e-6)
-    before = Watched.products
-    inverse_dynamics(mechanism, motion, q, q, q)
-    tangent = linearise(mechanism, motion, q, q, q)
-    tangent.dense()
-    tangent.times(q, q, q, np.arange(mechanism.num_coordinates))
-    tangent.transposed(q)
-    assert (Watched.products > before) == (damping > 0.0)
 
 
 # -- warm starts -----------------------------------------------------------------------------

@@ -261,24 +261,13 @@ def test_folder_without_a_run_says_what_to_name(tmp_path, name, reason):
         run("part", tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (lambda arrays: None, r"no readable \.npz file"),
-        (lambda arrays: {"arm1/centroid": arrays["arm1/centroid"]}, "missing key 'arm1/density'"),
-        (lambda arrays: arrays | {"arm1/density": np.full(2400, np.nan)}, "nan at cell 0"),
-        (lambda arrays: arrays | {"arm1/filtered": np.full(2400, np.nan)}, "2400 finite numbers"),
-    ],
-)
-def test_damaged_design_is_refused(tmp_path, content, reason):
+def test_damaged_design_is_refused(tmp_path):
+    """What other commands read of designs is tested with them; parts ask for more."""
     folder = folder_with(tmp_path / "run", frame)
     with np.load(folder / "design.npz") as data:
-        arrays = content(dict(data))
-    if arrays is None:
-        (folder / "design.npz").write_bytes(b"PK\3\4 and no more")
-    else:
-        np.savez(folder / "design.npz", **arrays)
-    with pytest.raises(InputError, match=reason):
+        arrays = dict(data) | {"arm1/filtered": np.full(2400, np.nan)}
+    np.savez(folder / "design.npz", **arrays)
+    with pytest.raises(InputError, match="2400 finite numbers"):
         run("part", folder)
     assert not (folder / "part").exists()
 
