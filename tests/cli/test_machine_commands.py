@@ -8,6 +8,8 @@ from machines import controlled, loop
 from mpi4py import MPI
 from runs import refusal, run
 
+from dolfinopt.part.scene_file import toml_text
+
 WORLD = MPI.COMM_WORLD
 QUICK = ["--set", "simulation.tolerance=1e-3"]
 
@@ -16,16 +18,7 @@ def write_scene(scene, folder):
     """Write a scene's file on the root; return its path."""
     path = folder / "machine.toml"
     if WORLD.rank == 0:
-        lines = [f"name = {json.dumps(scene.name)}"]
-        for table, keys in scene.to_tree().items():
-            rows = keys if table == "arms" else [keys]
-            if not isinstance(rows[0], dict) or table == "scenarios":
-                continue
-            for row in rows:
-                lines.append(f"[[{table}]]" if table == "arms" else f"[{table}]")
-                # JSON is TOML, but for tables inside arrays, which these scenes have none of.
-                lines += [f"{k} = {json.dumps(v)}" for k, v in row.items() if v is not None]
-        path.write_text("\n".join(lines) + "\n")
+        path.write_text(toml_text({"name": scene.name} | scene.to_tree()))
     WORLD.barrier()
     return path
 

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 from remainders import built_of, dense_matrices
 from runs import TWO_ARM, overrides, run
-from solids import solid_arm
+from solids import grid, sixths, solid_arm
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -22,13 +22,6 @@ WORLD = MPI.COMM_WORLD
 STEP = 0.25  # a power of two: corners are the same to the last bit
 
 
-def grid(*counts):
-    """Return the corners (n, 4 or 8, d) of cells, as tensor products, and the cells' places."""
-    places = np.indices(counts).reshape(len(counts), -1).T
-    bits = np.array([[(k >> i) & 1 for i in range(len(counts))] for k in range(2 ** len(counts))])
-    return STEP * (places[:, None] + bits[None]), places
-
-
 def found(corners, solid):
     """Return the contacts of an arm from x = 0 to its other end."""
     x = corners[:, :, 0]
@@ -39,7 +32,7 @@ def found(corners, solid):
 def drawn(*rows):
     """Return corners and solid cells of a drawing, its first line on top."""
     lines = [list(row) for row in reversed(rows)]
-    corners, (i, j) = (one := grid(len(lines[0]), len(lines)))[0], one[1].T
+    corners, (i, j) = (one := grid(len(lines[0]), len(lines), step=STEP))[0], one[1].T
     return corners, np.array(lines)[j, i] == "#"
 
 
@@ -78,7 +71,7 @@ def test_the_order_of_cells_does_not_matter():
 @pytest.mark.serial
 def test_contacts_of_solids():
     """Cubes meet in faces, edges or corners; a corner of cubes that share an edge is none more."""
-    cells, places = grid(4, 2, 2)
+    cells, places = grid(4, 2, 2, step=STEP)
     i, j, k = places.T
     low, high = (i < 2) & (j == 0) & (k == 0), (i >= 2) & (k == 0)
     by_face = found(cells, low | (high & (j == 0)))
@@ -96,18 +89,16 @@ def test_contacts_of_solids():
 
 @pytest.mark.serial
 def test_triangles_and_tetrahedra():
-    quads, places = grid(4, 2)
+    quads, places = grid(4, 2, step=STEP)
     first, second = quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]
     halves = np.concatenate([first, second])
     i, j = np.tile(places, (2, 1)).T
     corner = found(halves, ((i < 2) & (j == 0)) | ((i >= 2) & (j == 1)))
     assert (corner.pieces, corner.corners) == (2, 1) and not corner.joins
     assert found(halves, j == 0).pieces == 1
-    cubes, places = grid(4, 2, 2)
-    ways = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]]
-    sixths = np.concatenate([cubes[:, way] for way in ways])
+    cubes, places = grid(4, 2, 2, step=STEP)
     i, j, k = np.tile(places, (6, 1)).T
-    edge = found(sixths, (k == 0) & (((i < 2) & (j == 0)) | ((i >= 2) & (j == 1))))
+    edge = found(sixths(cubes), (k == 0) & (((i < 2) & (j == 0)) | ((i >= 2) & (j == 1))))
     assert (edge.pieces, edge.corners, edge.edges) == (2, 0, 1)
 
 

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from remainders import built_of
 from runs import TWO_ARM, overrides, refused, run
-from solids import solid_scene
+from solids import grid, sixths, solid_scene
 
 import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
@@ -168,16 +168,12 @@ def test_the_place_of_the_thinnest_member(name, place):
 @pytest.mark.serial  # ranks have no part in it
 def test_widths_of_solids():
     """A web of two cells over a window of four, in boxes and in tetrahedra; to a voxel."""
-    bits = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
-    places = np.indices((12, 10, 4)).reshape(3, -1).T
-    boxes = CELL * (places[:, None] + bits[None])
+    boxes, places = grid(12, 10, 4, step=CELL)
     i, j, _ = places.T
     ends = (i < 3) | (i >= 9)
     solid = ends | (j < 4) | (j >= 8)
-    ways = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]]
-    sixths = np.concatenate([boxes[:, way] for way in ways])
     # The side of a tetrahedron's cube is twice that of its own volume: voxels are as fine.
-    for corners, filled in ((boxes, solid), (sixths, np.tile(solid, 6))):
+    for corners, filled in ((boxes, solid), (sixths(boxes), np.tile(solid, 6))):
         member, gap = thinnest_solid(corners, filled, 3.5 * CELL)
         assert member.size == pytest.approx(2.0 * CELL, abs=CELL / 4.0)
         x, y, z = np.array(member.place) / CELL

@@ -59,7 +59,8 @@ def test_bounds_and_order_are_kept(beta, eta):
 @pytest.mark.serial
 def test_no_sharpness_is_the_identity():
     """For eta = 1/2, y = x + beta^2 x (1 - x) (2 x - 1) / 6 and terms of fourth order."""
-    assert np.array_equal(project(X, 0.0, 0.3).value, X)
+    same = project(X, 0.0, 0.3).value
+    assert np.array_equal(same, X) and not np.shares_memory(same, X)
     assert np.array_equal(project(X, 0.0, 0.3).slope, np.ones_like(X))
     assert project(X, 1e-9, 0.3).value == pytest.approx(X, abs=1e-15)
     assert project(X, 1e-9, 0.3).slope == pytest.approx(1.0, abs=2e-15)

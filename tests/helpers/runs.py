@@ -27,6 +27,8 @@ else:
 
 ROOT = Path(__file__).parents[2]
 TWO_ARM = ROOT / "demos" / "two_arm.toml"
+QUICK = ("arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9",
+         "simulation.tolerance=1e-2")  # fmt: skip
 # The tables that every scene states, for tests of one arm's mesh, filter or keys.
 STATED = {"motion": {"path": "arc"}, "payload": {"mass": 6.0}}  # kg
 
@@ -34,6 +36,11 @@ STATED = {"motion": {"path": "arc"}, "payload": {"mass": 6.0}}  # kg
 def scene(*changes: str) -> Scene:
     """Return the two-arm scene with "key.path=value" changed."""
     return do.load_scene(TWO_ARM, changes)
+
+
+def quick(*changes: str, iterations: int = 0) -> Scene:
+    """Return the two-arm scene in few cells, roughly solved."""
+    return scene(*QUICK, f"optimizer.max_iterations={iterations}", *changes)
 
 
 def overrides(*changes: str) -> list[str]:

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM, assert_same_bits, overrides, run, shell
+from runs import QUICK, TWO_ARM, assert_same_bits, overrides, quick, run, shell
 
 import dolfinopt as do
 from dolfinopt.optimization import certificate, iterate, loop
@@ -201,14 +201,7 @@ def test_best_of_what_keeps_the_constraints():
 
 # -- scenes ------------------------------------------------------------------------------------
 
-QUICK = ["arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9"]
-QUICK += ["simulation.tolerance=1e-2"]
 LIGHT = "payload.mass=0.2"
-
-
-def scene(*changes, iterations=0):
-    settings = [*QUICK, f"optimizer.max_iterations={iterations}", *changes]
-    return do.load_scene(TWO_ARM, settings)
 
 
 POSED = {
@@ -235,8 +228,8 @@ POSED = {
 @pytest.mark.parametrize("posed", POSED)
 def test_residual_is_of_the_problem_as_posed(posed):
     """The certificate of frozen loads is the exact run's residual; both tell the same angle."""
-    esl = do.optimize(scene(LIGHT, *POSED[posed]))
-    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", *POSED[posed]))
+    esl = do.optimize(quick(LIGHT, *POSED[posed]))
+    exact = do.optimize(quick(LIGHT, "objective.gradient=exact", *POSED[posed]))
     # The design has the same bits, so its motion has; adjoints come from the same solution.
     assert esl.certificate.kkt == pytest.approx(exact.kkt, rel=1e-9)
     assert exact.certificate.kkt == pytest.approx(exact.kkt, rel=1e-12)
@@ -251,17 +244,17 @@ def test_residual_is_of_the_problem_as_posed(posed):
 def test_limits_of_the_motion_have_frozen_loads():
     """The objective, a mass, has no loads to freeze; the residual is of limits by the motion."""
     posed = ["objective.kind=mass", "constraints.deviation=0.05", "design.initial=0.6"]
-    esl = do.optimize(scene(LIGHT, *posed))
-    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", *posed))
+    esl = do.optimize(quick(LIGHT, *posed))
+    exact = do.optimize(quick(LIGHT, "objective.gradient=exact", *posed))
     assert esl.certificate.kkt == pytest.approx(exact.kkt, rel=1e-9)
     assert np.isnan(esl.certificate.angle)
     with pytest.raises(do.InputError, match=r"reduction.method.*exact_iterations"):
-        scene(*posed, "reduction.method=balanced", "optimizer.exact_iterations=1")
+        quick(*posed, "reduction.method=balanced", "optimizer.exact_iterations=1")
 
 
 @pytest.mark.parametrize("kind", ["static", "eigenfrequency"])
 def test_without_motion_the_gradient_is_exact(kind):
-    result = do.optimize(scene(f"objective.kind={kind}", iterations=2))
+    result = do.optimize(quick(f"objective.kind={kind}", iterations=2))
     assert result.certificate.kkt == result.kkt
     assert np.isnan(result.certificate.angle)
     assert result.certificate.sentence == f"residual {result.kkt:.2g} under the exact gradient"
@@ -274,13 +267,13 @@ def test_without_motion_the_gradient_is_exact(kind):
 )
 def test_no_exact_gradient_is_told(key, value):
     change, reason = f"{key}={value}", f'{key} = "{value}" has no adjoint'
-    found = do.optimize(scene(change, "simulation.tolerance=0.1")).certificate
+    found = do.optimize(quick(change, "simulation.tolerance=0.1")).certificate
     assert np.isnan(found.kkt) and found.missing == reason and reason in found.sentence
     assert found.to_dict()["kkt"] is None
     # Of objectives without motion it is there all the same.
-    assert do.optimize(scene(change, "objective.kind=static")).certificate.missing == ""
+    assert do.optimize(quick(change, "objective.kind=static")).certificate.missing == ""
     with pytest.raises(do.InputError, match=f"{key}.*exact_iterations"):
-        scene(change, "optimizer.exact_iterations=1")
+        quick(change, "optimizer.exact_iterations=1")
 
 
 def test_failing_gradient_does_not_lose_the_design(monkeypatch):
@@ -288,7 +281,7 @@ def test_failing_gradient_does_not_lose_the_design(monkeypatch):
         raise do.ConvergenceError("the adjoint cannot be solved")
 
     monkeypatch.setattr(certificate, "_problem_by", failing)
-    result = do.optimize(scene(iterations=1))
+    result = do.optimize(quick(iterations=1))
     assert result.iterations == 1
     expected = "no exact gradient to judge the design by: the adjoint cannot be solved"
     assert result.certificate.sentence == expected
@@ -301,8 +294,8 @@ def test_light_payload_pays_for_frozen_loads():
 
     The design stays as it is, whatever is learnt of it.
     """
-    plain = do.optimize(scene(LIGHT, iterations=12))
-    result = do.optimize(scene(LIGHT, "optimizer.exact_iterations=15", iterations=12))
+    plain = do.optimize(quick(LIGHT, iterations=12))
+    result = do.optimize(quick(LIGHT, "optimizer.exact_iterations=15", iterations=12))
     assert_same_bits(result, plain)
     assert result.evaluation == plain.evaluation
     assert (result.kkt, result.iterations) == (plain.kkt, plain.iterations)
@@ -314,7 +307,7 @@ def test_light_payload_pays_for_frozen_loads():
     assert further.excess > 0.3
     assert "above the best of 15 further iterations" in found.sentence
     # It is no worse than what the exact gradient finds by itself.
-    exact = do.optimize(scene(LIGHT, "objective.gradient=exact", iterations=27))
+    exact = do.optimize(quick(LIGHT, "objective.gradient=exact", iterations=27))
     assert further.objective < 1.1 * exact.evaluation.objective
 
 
@@ -322,8 +315,8 @@ def test_light_payload_pays_for_frozen_loads():
 def test_projection_goes_on_from_where_it_is():
     """An unfinished continuation is held; what comes after the certificate is not changed."""
     changes = ["design.projection=robust", LIGHT]
-    plain = do.optimize(scene(*changes, iterations=2))
-    result = do.optimize(scene(*changes, "optimizer.exact_iterations=3", iterations=2))
+    plain = do.optimize(quick(*changes, iterations=2))
+    result = do.optimize(quick(*changes, "optimizer.exact_iterations=3", iterations=2))
     assert_same_bits(result, plain)
     assert result.crisp == plain.crisp and result.evaluation == plain.evaluation
     assert result.certificate.further.iterations == 3
@@ -332,9 +325,9 @@ def test_projection_goes_on_from_where_it_is():
 def test_finished_run_is_judged_later(shared_tmp_path):
     """--resume of a finished run adds what was not asked for before, and interrupts nothing."""
     asked = "optimizer.exact_iterations=4"
-    whole = do.optimize(scene(LIGHT, asked, iterations=3))
-    do.optimize(scene(LIGHT, iterations=3), shared_tmp_path)
-    later = do.optimize(scene(LIGHT, asked, iterations=3), shared_tmp_path, resume=True)
+    whole = do.optimize(quick(LIGHT, asked, iterations=3))
+    do.optimize(quick(LIGHT, iterations=3), shared_tmp_path)
+    later = do.optimize(quick(LIGHT, asked, iterations=3), shared_tmp_path, resume=True)
     assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
     assert_same_bits(later, whole)
 
@@ -346,7 +339,7 @@ class Killed(Exception):
 @pytest.mark.parametrize("kept", [0, 2])
 def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept):
     """Those of the checkpoint are not repeated, and the end has the same bits."""
-    asked = scene(LIGHT, "optimizer.exact_iterations=4", iterations=2)
+    asked = quick(LIGHT, "optimizer.exact_iterations=4", iterations=2)
     shown: list[FurtherRow] = []
 
     def keep(row):
@@ -376,7 +369,7 @@ def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept
         made.clear()
         kept = 4 - kept
         with pytest.raises(Killed):  # asked for one more than are left
-            more = scene(LIGHT, "optimizer.exact_iterations=5", iterations=2)
+            more = quick(LIGHT, "optimizer.exact_iterations=5", iterations=2)
             do.optimize(more, shared_tmp_path, resume=True)
     again = do.optimize(asked, shared_tmp_path, resume=True)
     assert replace(again.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
@@ -385,9 +378,9 @@ def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept
 
 def test_further_iterations_of_another_design_do_not_count(shared_tmp_path):
     asked = "optimizer.exact_iterations=2"
-    whole = do.optimize(scene(LIGHT, asked, iterations=2))
-    do.optimize(scene(LIGHT, asked, iterations=1), shared_tmp_path)
-    later = do.optimize(scene(LIGHT, asked, iterations=2), shared_tmp_path, resume=True)
+    whole = do.optimize(quick(LIGHT, asked, iterations=2))
+    do.optimize(quick(LIGHT, asked, iterations=1), shared_tmp_path)
+    later = do.optimize(quick(LIGHT, asked, iterations=2), shared_tmp_path, resume=True)
     assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
 
 
@@ -411,7 +404,7 @@ def test_summary_and_screen(shared_tmp_path):
 
 @pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
 def test_same_certificate_on_any_number_of_ranks():
-    asked = scene(LIGHT, "optimizer.exact_iterations=2", iterations=1)
+    asked = quick(LIGHT, "optimizer.exact_iterations=2", iterations=1)
     together, alone = do.optimize(asked), do.optimize(asked, world=MPI.COMM_SELF)
     found, expected = together.certificate, alone.certificate
     assert found.kkt == pytest.approx(expected.kkt, rel=1e-7)

@@ -40,6 +40,8 @@ def test_reversed_and_mirrored_run_through_the_same_points(curve):
     np.testing.assert_allclose(fine(curve.reversed()), points[::-1], atol=1e-12)
     np.testing.assert_allclose(fine(curve.mirrored()), points * [1.0, -1.0], atol=1e-12)
     np.testing.assert_allclose(direction(curve, 0.0), -direction(curve.reversed(), 1.0), atol=1e-9)
+    t = np.linspace(0.0, 1.0, 6)
+    np.testing.assert_allclose(curvature(curve.mirrored(), t), -curvature(curve, t), atol=1e-9)
 
 
 @pytest.mark.parametrize("curve", CURVES)
@@ -91,7 +93,7 @@ def test_polygon_of_a_bore_is_a_circle(count):
     assert isinstance(found, Arc) and found.is_circle
     assert found.radius == pytest.approx(0.01, abs=1e-10)
     np.testing.assert_allclose(found.centre, [0.3, 0.1], atol=1e-10)
-    np.testing.assert_allclose(np.abs(curvature(found, np.linspace(0.0, 1.0, 5))), 100.0)
+    np.testing.assert_allclose(curvature(found, np.linspace(0.0, 1.0, 5)), 100.0)
     assert [type(curve) for curve in kinds(circle(6))] == [Line] * 6  # a hexagon is none
 
 
