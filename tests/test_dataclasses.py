@@ -49,11 +49,8 @@ def hints(of: type) -> Iterator[Any]:
     """Yield the types of a dataclass' fields, or their text where a name is not known here."""
     known = vars(importlib.import_module(of.__module__))
     for field in fields(of):  # type: ignore[arg-type]
-        if not isinstance(field.type, str):
-            yield field.type
-            continue
         try:
-            yield eval(field.type, dict(known))
+            yield eval(field.type, dict(known)) if isinstance(field.type, str) else field.type
         except NameError:
             yield field.type
 

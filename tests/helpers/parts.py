@@ -15,12 +15,8 @@ def frame(x, y):
     return (np.abs(y) > 0.0149) | (np.abs((x + 0.125) % 0.25 - 0.125) < 0.0124)
 
 
-CHANGES = [
-    "arms.1.rigid=true",
-    "design.projection=robust",
-    "arms.0.passive=0.01",
-    "optimizer.max_iterations=1",
-]
+CHANGES = ["arms.1.rigid=true", "design.projection=robust", "arms.0.passive=0.01",
+           "optimizer.max_iterations=1"]  # fmt: skip
 
 
 def write_run(path, scene, *densities):

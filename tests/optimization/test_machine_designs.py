@@ -74,30 +74,20 @@ def test_same_design_on_any_number_of_ranks(path):
         np.testing.assert_allclose(together.x_phys[k], alone[k], rtol=0, atol=1e-8)
 
 
+TWO_LOADS = "scenarios=[{{changes=['{}']}}, {{changes=['{}']}}]"
 VARIANTS = {
     "gains of a scenario": (
-        CONTROLLED,
-        "scenarios=[{changes=['payload.mass=3']}, {changes=['control.stiffness_factor=0.1']}]",
-    ),
-    "speed of a scenario": (
-        SLIDER_CRANK,
-        "scenarios=[{changes=['payload.mass=0.3']}, {changes=['motion.speed=100']}]",
-    ),
+        CONTROLLED, TWO_LOADS.format("payload.mass=3", "control.stiffness_factor=0.1")),
+    "speed of a scenario": (SLIDER_CRANK, TWO_LOADS.format("payload.mass=0.3", "motion.speed=100")),
     "projection under control": (CONTROLLED, "design.projection=robust", "design.sharpness=4.0"),
     "order under control": (CONTROLLED, "reduction.coordinates=auto"),
     # Much of a rod's load is axial, in which modes add up slowly.
-    "order of a rod": (
-        SLIDER_CRANK,
-        "reduction.coordinates=auto",
-        "reduction.tolerance=0.02",
-        "optimizer.max_iterations=3",
-    ),
+    "order of a rod": (SLIDER_CRANK, "reduction.coordinates=auto", "reduction.tolerance=0.02",
+                       "optimizer.max_iterations=3"),
     "force on the slider of a scenario": (
-        SLIDER_CRANK,
-        "scenarios=[{changes=['closure.force=-200']}, {changes=['closure.force=0']}]",
-        "optimizer.max_iterations=3",
-    ),
-}
+        SLIDER_CRANK, TWO_LOADS.format("closure.force=-200", "closure.force=0"),
+        "optimizer.max_iterations=3"),
+}  # fmt: skip
 
 
 @pytest.mark.slow

@@ -102,15 +102,11 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
     """
     found = []
     for k, mesh in enumerate(meshes):
+        file = tmp_path / f"{k}.msh"
         with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-            write_mesh(gmsh, tmp_path / f"{k}.msh", mesh)
-        one = scene(
-            "arms.1.rigid=true",
-            f"arms.0.mesh={tmp_path / f'{k}.msh'}",
-            "arms.0.element=quadratic",
-            f"arms.0.length={LENGTH}",
-            "design.filter_radius=0.0",
-        )
+            write_mesh(gmsh, file, mesh)
+        arm1 = f"arms.0.mesh={file}", f"arms.0.length={LENGTH}", "arms.0.element=quadratic"
+        one = scene("arms.1.rigid=true", "design.filter_radius=0", *arm1)
         arm = Arm(one, 0, MPI.COMM_SELF, Profile())
         assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=1e-6)
         arm.set_design(np.ones(arm.mesh.num_cells))
