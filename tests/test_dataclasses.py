@@ -1,7 +1,5 @@
 """Dataclasses all over the package compare without asking arrays for a truth value."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil
@@ -51,11 +49,8 @@ def hints(of: type) -> Iterator[Any]:
     """Yield the types of a dataclass' fields, or their text where a name is not known here."""
     known = vars(importlib.import_module(of.__module__))
     for field in fields(of):  # type: ignore[arg-type]
-        if not isinstance(field.type, str):
-            yield field.type
-            continue
         try:
-            yield eval(field.type, dict(known))
+            yield eval(field.type, dict(known)) if isinstance(field.type, str) else field.type
         except NameError:
             yield field.type
 
@@ -70,11 +65,3 @@ def test_dataclasses_with_arrays_compare_by_identity() -> None:
         if one.__eq__ is not object.__eq__ and any(map(holds_array, hints(one)))
     ]
     assert not wrong, "write @dataclass(eq=False)"
-
-
-def test_comparison_of_arrays_does_not_raise() -> None:
-    """Equal arrays in two objects are no error, and the objects are told apart."""
-    one, other = (RigidMotion(*np.zeros((3, 4, 2))) for _ in range(2))
-    assert one == one
-    assert one != other
-    assert len({one, other}) == 2

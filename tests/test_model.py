@@ -1,7 +1,5 @@
 """dolfinopt.Model: the same figures as the functions below it, on any number of ranks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
+from remainders import build
 from runs import TWO_ARM, command, environment, overrides
 
-import dolfinopt as do
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.parallel import (
     SPLIT_CELLS,
@@ -41,9 +41,8 @@ def teams(size, cells):
     """Deal arms out over `size` ranks; return the partitions and, a communicator, its ranks."""
     cells = dict(enumerate(cells))
     partitions = [partition_arms(FakeWorld(size, rank), cells) for rank in range(size)]
-    assert [partition.comm.key for partition in partitions] == list(
-        range(size)
-    )  # ranks keep their order
+    keys = [partition.comm.key for partition in partitions]
+    assert keys == list(range(size))  # ranks keep their order
     groups = {}
     for rank, partition in enumerate(partitions):
         groups.setdefault(partition.comm.color, []).append(rank)
@@ -85,22 +84,15 @@ def test_objects_and_cells_are_collected_on_the_root(num_arms, cells):
     partition = partition_arms(COMM, dict.fromkeys(range(num_arms), cells))
     expected = {k: f"arm {k}" for k in range(num_arms)}
     # Given in any order, and by every rank of a team: the leader's counts.
-    mine = {
-        k: expected[k] if partition.is_root else "not the leader's"
-        for k in reversed(partition.arms)
-    }
-    bodies = gather_arms(partition, mine)
+    own = (lambda k: expected[k]) if partition.is_root else (lambda k: "not the leader's")
+    bodies = gather_arms(partition, {k: own(k) for k in reversed(partition.arms)})
     assert bodies == (expected if COMM.rank == 0 else {})
     assert list(bodies) == sorted(bodies)
     assert COMM.allreduce(int(partition.is_root)) == min(num_arms, COMM.size)
     team = {k: n for arms, n in COMM.allgather((partition.arms, partition.comm.size)) for k in arms}
-    whole = gather_cells(
-        partition,
-        {
-            k: np.full((2 + partition.comm.rank, 3), 10.0 * k + partition.comm.rank)
-            for k in partition.arms
-        },
-    )
+    rank = partition.comm.rank
+    pieces = {k: np.full((2 + rank, 3), 10.0 * k + rank) for k in partition.arms}
+    whole = gather_cells(partition, pieces)
     if COMM.rank > 0:
         assert whole == {}
         return
@@ -197,19 +189,10 @@ def test_ranks_end_together(body, status, line):
 
 # -- PETSc's options -------------------------------------------------------------------------
 
+ORDERING = "pc_factor_mat_ordering_type"
 VIEWED = {  # option, what the view shows by default and with the option
-    "dolfinopt_stiffness_": (
-        "ksp_view",
-        "pc_factor_mat_ordering_type rcm",
-        "ordering: natural",
-        "ordering: rcm",
-    ),
-    "dolfinopt_filter_": (
-        "ksp_view",
-        "pc_factor_mat_ordering_type nd",
-        "ordering: rcm",
-        "ordering: nd",
-    ),
+    "dolfinopt_stiffness_": ("ksp_view", f"{ORDERING} rcm", "ordering: natural", "ordering: rcm"),
+    "dolfinopt_filter_": ("ksp_view", f"{ORDERING} nd", "ordering: rcm", "ordering: nd"),
     "dolfinopt_modes_": ("eps_view", "eps_type arnoldi", "type: krylovschur", "type: arnoldi"),
 }
 
@@ -243,15 +226,10 @@ def test_petsc_options_reach_every_solver(tmp_path):
 @pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize(
-    "option",
-    [
-        "-dolfinopt_stiffness_pc_type nonsense",
-        "-dolfinopt_stiffness_pc_factor_mat_solver_type nonsense",
-        "-dolfinopt_filter_pc_type nonsense",
-        "-dolfinopt_modes_eps_type nonsense",
-    ],
+    "key", ["stiffness_pc", "stiffness_pc_factor_mat_solver", "filter_pc", "modes_eps"]
 )
-def test_options_that_petsc_refuses(tmp_path, option):
+def test_options_that_petsc_refuses(tmp_path, key):
+    option = f"-dolfinopt_{key}_type nonsense"
     run, _ = views(tmp_path, option)
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
@@ -264,9 +242,7 @@ def test_options_of_other_programs_change_nothing():
     for key, value in (("ksp_type", "cg"), ("pc_type", "jacobi"), ("eps_type", "arnoldi")):
         options[key] = value
     try:
-        scene = do.load_scene(TWO_ARM, ("arms.cells=[16,3]",))
-        partition = do.partition_arms(COMM, scene.cell_counts)
-        for arm in do.build_arms(scene, partition, do.Profile()).values():
+        for arm in build(cells=(16, 3)).arms.values():
             arm.reduce(arm.uniform(0.5))
             factor = arm.elastic.factorise()
             if isinstance(factor, PetscFactor):  # across ranks

@@ -1,7 +1,5 @@
 """Seconds by phase: each is counted once."""
 
-from __future__ import annotations
-
 import pytest
 
 from dolfinopt import profiling as profile

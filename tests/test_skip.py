@@ -7,15 +7,12 @@ of one design in test_scenarios and test_cases, time steps that start warm in te
 test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -26,24 +23,14 @@ from remainders import build, wave
 from runs import ROOT, TWO_ARM
 from runs import overrides as set_keys
 
-from dolfinopt.arms.arm import chain_of
 from dolfinopt.cli import commands
-from dolfinopt.dynamics.build import build_mechanism
 from dolfinopt.fem import interior
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.motion import rigid_motion
-from dolfinopt.multibody.tangent import linearise
 from dolfinopt.output import run_folder as results
-from dolfinopt.parallel import gather_arms
 
 WORLD = MPI.COMM_WORLD
 # Coarse in space and time: what is counted depends on neither.
-QUICK = (
-    "arms.cells=[12,2]",
-    "motion.horizon=2.0",
-    "simulation.sample=0.01",
-    "simulation.tolerance=1e-2",
-)
+QUICK = ("arms.cells=[12,2]", "motion.horizon=2.0", "simulation.sample=0.01",
+         "simulation.tolerance=1e-2")  # fmt: skip
 ITERATIONS = 2
 ARMS, DESIGNS = 2, ITERATIONS + 1  # the last one's gradient tells how far it is from an optimum
 
@@ -82,9 +69,8 @@ LOADS = 4 * ARMS  # once a run: whether loads stiffen the arms is estimated
 STILL = {"simulations": 0, "newton_iterations": 0, "adjoints": 0, "reductions": 0}
 ONE_ARM = {key: value // ARMS for key, value in ONCE.items()}
 SHARED, RIGID = "arms.arm2.design=arm1", "arms.arm1.rigid=true"
-EXACT = "objective.gradient=exact"
-
-
+EXACT, PERIOD = "objective.gradient=exact", "objective.kind=eigenfrequency"
+SOLVED = STILL | {"factorisations": EACH, "eigenproblems": EACH}
 EVERYTHING = (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflection=1.0")
 STATIC = STILL | {"assemblies": EACH, "factorisations": EACH, "solves": 3 * EACH}
 STATIC |= {"eigenproblems": 0}
@@ -104,29 +90,15 @@ CASES: dict[tuple[str, ...], Counts] = {
     ("objective.kind=static", "constraints.tip_deflection=1.0", EXACT): STATIC,
     # Eigenfrequency: mass, but no simulation and no basis. Three modes of every arm have elastic
     # and kinetic energy, and only the outer arm is carried, as two fields (mass and inertia).
-    ("objective.kind=eigenfrequency",): {
-        **STILL,
-        "assemblies": 2 * EACH,
-        "factorisations": EACH,
-        "eigenproblems": EACH,
-        "energy_fields": (2 * 3 * ARMS + 2) * DESIGNS,
-    },
+    (PERIOD,): {**SOLVED, "assemblies": 2 * EACH, "energy_fields": (2 * 3 * ARMS + 2) * DESIGNS},
     # Bounded as well as maximised: the same modes.
-    ("objective.kind=eigenfrequency", "constraints.first_frequency=1.0"): {
-        **STILL,
-        "factorisations": EACH,
-        "eigenproblems": EACH,
-    },
+    (PERIOD, "constraints.first_frequency=1.0"): SOLVED,
     # A shared design: all that concerns one arm alone once.
     (SHARED,): {**ONE_ARM, "eigenproblems": DESIGNS, "simulations": DESIGNS},
     (SHARED, EXACT): {**ONE_ARM, "eigenproblems": DESIGNS, "adjoints": DESIGNS},
     (SHARED, "objective.kind=static"): {**STILL, "assemblies": DESIGNS, "solves": 3 * DESIGNS},
-    (SHARED, "objective.kind=eigenfrequency"): {
-        **STILL,
-        "assemblies": 2 * DESIGNS,
-        "factorisations": DESIGNS,
-        "eigenproblems": EACH,  # the two arms carry different things
-    },
+    # The two arms carry different things.
+    (SHARED, PERIOD): {**SOLVED, "assemblies": 2 * DESIGNS, "factorisations": DESIGNS},
     # A rigid arm has nothing to assemble.
     (RIGID,): {**ONE_ARM, "eigenproblems": DESIGNS, "simulations": DESIGNS},
 }
@@ -162,13 +134,7 @@ ONE_LOAD, TIP = "objective.loads=[[0,1,0,0,0,0]]", "constraints.tip_deflection=1
     ],
     ids=["one load", "deflection", "frequency"],
 )
-def test_static_loads_of_solids(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    width: int,
-    overrides: tuple[str, ...],
-    most: int,
-) -> None:
+def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most) -> None:
     """In space a solve a load, where nothing else is asked for, not one a constraint mode."""
     monkeypatch.setattr(interior, "WIDEST", width)
     line = ["optimize", str(SPATIAL), "--no-plots", "--out", str(tmp_path / "out")]
@@ -224,39 +190,6 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
     assert few == many
     if gradient == "esl":
         assert few["energy_fields"] == 3 * EACH
-
-
-# -- damping ---------------------------------------------------------------------------------
-
-
-class Watched(np.ndarray):
-    """A matrix that counts its products."""
-
-    products = 0
-
-    def __array_ufunc__(self, ufunc, method, *inputs, **options):
-        Watched.products += ufunc in (np.matmul, np.multiply)
-        plain = [x.view(np.ndarray) if isinstance(x, Watched) else x for x in inputs]
-        return getattr(ufunc, method)(*plain, **options)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("damping", [0.0, 2e-4])
-def test_undamped_rows_have_no_damping_terms(damping: float) -> None:
-    built = build(f"damping.stiffness_proportional={damping}")
-    x = built.fields(wave)
-    owned = gather_arms(built.partition, {k: a.reduce(x[k]) for k, a in built.arms.items()})
-    bodies = [replace(b, D=b.D.view(Watched)) for b in chain_of(built.scene, owned)]
-    mechanism = build_mechanism(built.scene, bodies)
-    t = np.linspace(0.1, 1.0, 3)
-    motion, q = rigid_motion(t, built.scene), np.full((3, mechanism.num_coordinates), 1e-6)
-    before = Watched.products
-    inverse_dynamics(mechanism, motion, q, q, q)
-    tangent = linearise(mechanism, motion, q, q, q)
-    tangent.dense()
-    tangent.times(q, q, q, np.arange(mechanism.num_coordinates))
-    tangent.transposed(q)
-    assert (Watched.products > before) == (damping > 0.0)
 
 
 # -- warm starts -----------------------------------------------------------------------------
@@ -368,13 +301,8 @@ def test_words_and_completion_need_no_solver(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.serial
 def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     """Nor anything of other commands: statistics, studies, exports."""
-    others = {
-        "scipy.stats",
-        "dolfinopt.plots.design",
-        "dolfinopt.plots.curves",
-        "dolfinopt.study.studies",
-        "dolfinopt.multibody.mbdyn",
-    }
+    others = {"plots.design", "plots.curves", "study.studies", "multibody.mbdyn"}
+    others = {"scipy.stats", *(f"dolfinopt.{name}" for name in others)}
     line = ["optimize", TWO_ARM, "--no-plots", "--out", tmp_path / "out"]
     line += set_keys(*QUICK, "optimizer.max_iterations=1")
     assert loaded(DRAW | others | {"dolfinx"}, MAIN, *line) == {"dolfinx"}

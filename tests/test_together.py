@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import environment, overrides
+from remainders import build
+from runs import TWO_ARM, environment, overrides
 
 import dolfinopt as do
 from dolfinopt.arms import arm, design_state
-from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
@@ -22,7 +22,7 @@ from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output import checkpoint, design, run, summary, views
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
-from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, partition_arms, together
+from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
@@ -140,6 +140,11 @@ def test_an_abandoned_generator_does_not_meet_anybody():
 # -- every place that can fail on one rank ---------------------------------------------------
 
 
+def coarse(*overrides):
+    """Return the two-arm scene in few cells."""
+    return load_scene(TWO_ARM, (*COARSE, *overrides))
+
+
 def fail_on(monkeypatch, rank, owner, name, after=0):
     """Let a function fail on one rank, from its call number `after` on."""
     whole, calls = getattr(owner, name), [0]
@@ -153,105 +158,82 @@ def fail_on(monkeypatch, rank, owner, name, after=0):
     monkeypatch.setattr(owner, name, failing)
 
 
-class Model:
-    """A coarse two-arm machine, built when first asked for."""
-
-    def __init__(self, *overrides):
-        self.scene = load_scene(paper_scene(), (*COARSE, *overrides))
-        self.partition = partition_arms(COMM, self.scene.cell_counts)
-        self.profile = do.Profile()
-        self.arms = do.build_arms(self.scene, self.partition, self.profile)
-        self.x = {k: one.uniform(0.5) for k, one in self.arms.items()}
-
-    @property
-    def place(self):
-        return self.scene, self.partition, self.arms
-
-    def evaluate(self):
-        return do.evaluate(*self.place, self.x, self.profile)
-
-    def gradient(self, trajectory):
-        return do.gradient(*self.place, trajectory, self.profile)
-
-
 # What the work needs first, with overrides of its scene; the work itself is returned.
 
 
 def building(_, *overrides):
-    return lambda: Model(*overrides)
+    return lambda: build(*COARSE, *overrides)
 
 
 def evaluating(_, *overrides):
-    return Model(*overrides).evaluate
+    built = build(*COARSE, *overrides)
+    x = built.uniform()
+    return lambda: built.evaluate(x)
 
 
 def a_batch(_, *overrides):
-    model = Model(*overrides)
-    return lambda: evaluation.evaluate_batch([model.scene], *model.place[1:], model.x, do.Profile())
+    built = build(*COARSE, *overrides)
+    x = built.uniform()
+    return lambda: evaluation.evaluate_batch([built.scene], *built.place[1:], x, built.profile)
 
 
 def gradients(_, *overrides):
-    model = Model(*overrides)
-    _, trajectory = model.evaluate()
-
-    def work():
-        model.gradient(trajectory)
-        evaluation.constraint_gradients(*model.place)
-
-    return work
+    built = build(*COARSE, *overrides)
+    _, trajectory = built.evaluate(built.uniform())
+    return lambda: (built.gradient(trajectory), built.constraint_gradients())
 
 
 def choosing(_):
-    model = Model('reduction.coordinates="auto"', "reduction.tolerance=0.1")
-    return lambda: do.choose_coordinates(*model.place, model.x, model.profile)
+    built = build(*COARSE, "reduction.coordinates=auto", "reduction.tolerance=0.1")
+    x = built.uniform()
+    return lambda: do.choose_coordinates(*built.place, x, built.profile)
 
 
 def optimising(folder):
-    scene = load_scene(
-        paper_scene(), (*COARSE, 'design.projection="heaviside"', "design.continuation=1")
-    )
+    scene = coarse("design.projection=heaviside", "design.continuation=1")
     return lambda: do.optimize(scene, folder, world=COMM)
 
 
 def resuming(folder):
-    scene = load_scene(paper_scene(), COARSE)
-    do.optimize(scene, folder, world=COMM)
-    return lambda: do.optimize(scene, folder, resume=True, world=COMM)
+    do.optimize(coarse(), folder, world=COMM)
+    return lambda: do.optimize(coarse(), folder, resume=True, world=COMM)
 
 
 def writing(folder):
-    model = Model()
-    simulated = Simulated(*model.place, model.x, *model.evaluate(), model.profile)
+    built = build(*COARSE)
+    x = built.uniform()
+    simulated = Simulated(*built.place, x, *built.evaluate(x), built.profile)
     return lambda: write_simulation(folder, simulated, 1.0)
 
 
 def writing_designs(folder):
-    scene = load_scene(paper_scene(), COARSE)
-    result = do.optimize(scene, world=COMM)
-    return lambda: write_result(scene, folder, result, 1.0)
+    result = do.optimize(coarse(), world=COMM)
+    return lambda: write_result(coarse(), folder, result, 1.0)
 
 
 def writing_gradients(folder):
-    model = Model()
-    return lambda: design.write_gradient(folder / "g.npz", *model.place, model.x, 1.0)
+    built = build(*COARSE)
+    x = built.uniform()
+    return lambda: design.write_gradient(folder / "g.npz", *built.place, x, 1.0)
 
 
 def reading_designs(folder):
-    model = Model()
-    found = do.gather_views(*model.place, model.x)
+    built = build(*COARSE)
+    found = do.gather_views(*built.place, built.uniform())
     if COMM.rank == 0:
         design.write_design(folder, found)
     COMM.Barrier()
-    return lambda: design.read_design(folder / "design.npz", model.partition, model.arms)
+    return lambda: design.read_design(folder / "design.npz", built.partition, built.arms)
 
 
 def taylor(_):
-    model = Model()
-    return lambda: taylor_test(*model.place, model.x, model.profile)
+    built = build(*COARSE)
+    x = built.uniform()
+    return lambda: taylor_test(*built.place, x, built.profile)
 
 
-EXACT, STATIC = 'objective.gradient="exact"', 'objective.kind="static"'
-PERIOD, TIP = 'objective.kind="eigenfrequency"', "constraints.tip_deflection=1.0"
+EXACT, STATIC = "objective.gradient=exact", "objective.kind=static"
+PERIOD, TIP = "objective.kind=eigenfrequency", "constraints.tip_deflection=1.0"
 FREQUENCY = "constraints.first_frequency=1.0"
 PLACES = [
     (building, LONE, mesh, "mesh_geo"),
@@ -324,12 +306,12 @@ def test_what_is_told_of_an_iteration():
             raise Unusual("told")
 
     with pytest.raises(Unusual, match=r"^told$"):
-        do.optimize(load_scene(paper_scene(), COARSE), world=COMM, report=report)
+        do.optimize(coarse(), world=COMM, report=report)
     COMM.Barrier()
 
 
 def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeypatch):
-    model = Model()
+    built = build(*COARSE)
     body = design_state.shape_integrals
 
     def stuck(*arguments):
@@ -338,9 +320,8 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
         return body(*arguments)
 
     monkeypatch.setattr(design_state, "shape_integrals", stuck)
-    found = evaluation.evaluate_batch(
-        [model.scene] * 2, model.partition, model.arms, model.x, do.Profile()
-    )
+    twice = [built.scene] * 2
+    found = evaluation.evaluate_batch(twice, *built.place[1:], built.uniform(), built.profile)
     assert [str(one) for one in found] == ["stuck", "stuck"]
     assert all(isinstance(one, ConvergenceError) for one in found)
     COMM.Barrier()
@@ -366,7 +347,7 @@ def test_a_shared_arm(owner, name, monkeypatch):
     # The last rank shares its arm with others from three ranks on; Gmsh runs on the first.
     fail_on(monkeypatch, 0 if name == "mesh_geo" else COMM.size - 1, owner, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
-        Model("arms.1.rigid=true").evaluate()
+        evaluating(None, "arms.1.rigid=true")()
     COMM.Barrier()
 
 
@@ -374,9 +355,7 @@ def test_a_shared_arm(owner, name, monkeypatch):
 
 
 def payloads(*overrides):
-    scenes = (
-        load_scene(paper_scene(), (*COARSE, *overrides, f"payload.mass={m}")) for m in (4, 5, 6)
-    )
+    scenes = (coarse(*overrides, f"payload.mass={m}") for m in (4, 5, 6))
     return [Case(scene, "optimize", label=f"{k}") for k, scene in enumerate(scenes)]
 
 
@@ -404,20 +383,18 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
 
 @ON_RANKS
 def test_samples(monkeypatch, shared_tmp_path):
-    scene = load_scene(paper_scene(), COARSE)
     samples = [(), *((f"payload.mass={mass}",) for mass in np.linspace(4.0, 6.0, 60))]
     fail_on(monkeypatch, LONE, store, "_sample")
     with pytest.raises(Unusual, match=r"^_sample$"):
-        run_cases(sample_cases(scene, samples, "", None), shared_tmp_path, COMM, shown=False)
+        run_cases(sample_cases(coarse(), samples, "", None), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
 
 
 @ON_RANKS
 def test_tables(monkeypatch, shared_tmp_path):
-    scene = load_scene(paper_scene(), COARSE)
     fail_on(monkeypatch, LONE, study, "tabulated")
     with pytest.raises(Unusual, match=r"^tabulated$"):
-        study.study(scene, None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
+        study.study(coarse(), None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
 
 
@@ -460,7 +437,7 @@ main()
 def test_commands(place, kind, tmp_path):
     """All ranks end by themselves, with one message: nobody has to be aborted."""
     module, name, rank, command = COMMANDS[place]
-    arguments = ["dolfinopt", command, str(paper_scene()), "--no-plots", "--out"]
+    arguments = ["dolfinopt", command, str(TWO_ARM), "--no-plots", "--out"]
     arguments += [str(tmp_path / "o"), *overrides(*COARSE)]
     error = f"__import__('dolfinopt').{kind}('lost')" if "Conv" in kind else f"{kind}('lost')"
     script = SCRIPT.format(arguments=arguments, module=module, name=name, rank=rank, error=error)

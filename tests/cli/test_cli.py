@@ -41,20 +41,18 @@ def test_optimize_writes_every_file(optimised):
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_time_is_the_time_one_waited(optimised):
-    """Pictures are part of it, and the animation is drawn on request only."""
+def test_pictures_are_drawn_anew(optimised):
+    """The same again, the animation on request only; they are part of the time one waited."""
     seconds = json.loads((optimised / "summary.json").read_text())["seconds"]
     assert seconds["pictures"] > 0.0
     assert seconds["total"] >= sum(s for name, s in seconds.items() if name != "total")
-    if WORLD.rank == 0:
-        run_alone = optimised.parent / "animated"
-        shutil.copytree(optimised, run_alone)
-        (run_alone / "stress.png").unlink()
-    WORLD.barrier()
-    run("plot", optimised.parent / "animated", "--animation")
-    WORLD.barrier()
-    assert (optimised.parent / "animated" / "motion.gif").stat().st_size > 10_000
-    assert (optimised.parent / "animated" / "stress.png").stat().st_size > 5_000  # redrawn
+    again = shutil.copytree(optimised, optimised.parent / "animated")
+    for name in ("stress.png", "design.png"):
+        (again / name).unlink()
+    run("plot", again, "--animation")
+    assert (again / "motion.gif").stat().st_size > 10_000
+    assert (again / "stress.png").stat().st_size > 5_000
+    assert (again / "design.png").read_bytes() == (optimised / "design.png").read_bytes()
 
 
 def test_design_file(optimised):
@@ -78,16 +76,9 @@ def test_trajectory_files(optimised):
         units = dict(text.split(": ", 1) for text in data["units"].tolist())
     assert units["deviation"] == "m" and units["joint_forces"] == "N, N m, N m"
     assert set(units) == set(shapes) - {"units"}
-    assert shapes == {
-        "t": (601,),
-        "q_r": (601, 3),
-        "q_e": (601, 8),
-        "deviation": (601, 2),
-        "compliance": (601, 2),
-        "joint_forces": (601, 3),
-        "initial_deviation": (601, 2),
-        "units": (7,),
-    }
+    columns = {"q_r": 3, "q_e": 8, "deviation": 2, "compliance": 2, "joint_forces": 3}
+    columns |= {"initial_deviation": 2}
+    assert shapes == {k: (601, n) for k, n in columns.items()} | {"t": (601,), "units": (7,)}
     lines = (optimised / "trajectory.csv").read_text().splitlines()
     assert lines[0].startswith("t,deviation_x,deviation_y,deviation,compliance,q_r_cart,")
     table = np.genfromtxt(optimised / "trajectory.csv", delimiter=",", names=True)
@@ -141,17 +132,6 @@ def test_simulate_reproduces_the_last_design(optimised, shared_tmp_path):
     for key, error in (("compliance", 2e-4), ("max_deviation", 2e-4), ("first_frequency", 1e-9)):
         assert ours[key] == pytest.approx(theirs[key], rel=error)
     assert not list(shared_tmp_path.glob("*.png"))
-
-
-def test_plot_draws_anew(optimised):
-    before = (optimised / "design.png").read_bytes()
-    WORLD.barrier()
-    if WORLD.rank == 0:
-        (optimised / "design.png").unlink()
-    WORLD.barrier()
-    run("plot", optimised)
-    WORLD.barrier()
-    assert (optimised / "design.png").read_bytes() == before
 
 
 @pytest.mark.serial
@@ -356,11 +336,7 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
 # Words of the command line (OUT: its folder), and words of the message.
 BAD = [
     ("optimize SCENE --set payload.mas=1", "payload.mas payload.mass"),
-    ("optimize SCENE --set arms.length=-1", "arms.0.length -1 >= 0"),
-    ("optimize SCENE --set payload.mass=nan", "payload.mass nan"),
     ('optimize SCENE --set payload.mass="six"', "payload.mass six number"),
-    ("optimize SCENE --set design.volume_fraction=1.5", "volume_fraction 1.5"),
-    ("optimize SCENE --set reduction.coordinates=100000", "coordinates 100000"),
     ("optimize SCENE --set motion.radius=5", "at t = shoulder 5"),
     ("optimize OUT/no.toml", "no.toml"),
     ("optimize OUT", "OUT"),

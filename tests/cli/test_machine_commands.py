@@ -8,6 +8,8 @@ from machines import controlled, loop
 from mpi4py import MPI
 from runs import refusal, run
 
+from dolfinopt.part.scene_file import toml_text
+
 WORLD = MPI.COMM_WORLD
 QUICK = ["--set", "simulation.tolerance=1e-3"]
 
@@ -16,16 +18,7 @@ def write_scene(scene, folder):
     """Write a scene's file on the root; return its path."""
     path = folder / "machine.toml"
     if WORLD.rank == 0:
-        lines = [f"name = {json.dumps(scene.name)}"]
-        for table, keys in scene.to_tree().items():
-            rows = keys if table == "arms" else [keys]
-            if not isinstance(rows[0], dict) or table == "scenarios":
-                continue
-            for row in rows:
-                lines.append(f"[[{table}]]" if table == "arms" else f"[{table}]")
-                # JSON is TOML, but for tables inside arrays, which these scenes have none of.
-                lines += [f"{k} = {json.dumps(v)}" for k, v in row.items() if v is not None]
-        path.write_text("\n".join(lines) + "\n")
+        path.write_text(toml_text({"name": scene.name} | scene.to_tree()))
     WORLD.barrier()
     return path
 
@@ -54,25 +47,6 @@ def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     run("plot", out)
     WORLD.barrier()
     assert (out / "drives.png").stat().st_size > 5000
-
-
-@pytest.mark.slow
-@pytest.mark.serial  # ranks: the same in test_optimization
-@pytest.mark.parametrize("kind", SCENES)
-def test_optimisation_goes_on_to_the_same_bits(kind, shared_tmp_path):
-    path = write_scene(SCENES[kind](), shared_tmp_path)
-    whole, parts = shared_tmp_path / "whole", shared_tmp_path / "parts"
-    options = [*QUICK, "--no-plots", "--set"]
-    run("optimize", path, *options, "optimizer.max_iterations=3", "--out", whole)
-    run("optimize", path, *options, "optimizer.max_iterations=1", "--out", parts)
-    run("optimize", path, *options, "optimizer.max_iterations=3", "--out", parts, "--resume")
-    WORLD.barrier()
-    for name in ("design.npz", "trajectory.npz"):
-        with np.load(whole / name) as one, np.load(parts / name) as other:
-            assert set(one.files) == set(other.files)
-            for key in one.files:
-                np.testing.assert_array_equal(one[key], other[key], err_msg=key)
-    WORLD.barrier()
 
 
 def test_bodies_of_a_loop_are_exported(shared_tmp_path):

@@ -1,15 +1,15 @@
 """Pieces that share faces, contacts that do not, and designs rated without these."""
 
-from __future__ import annotations
-
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import built_of, dense_matrices
 from runs import TWO_ARM, overrides, run
-from solids import solid_arm
+from solids import grid, sixths, solid_arm
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -22,13 +22,6 @@ WORLD = MPI.COMM_WORLD
 STEP = 0.25  # a power of two: corners are the same to the last bit
 
 
-def grid(*counts):
-    """Return the corners (n, 4 or 8, d) of cells, as tensor products, and the cells' places."""
-    places = np.indices(counts).reshape(len(counts), -1).T
-    bits = np.array([[(k >> i) & 1 for i in range(len(counts))] for k in range(2 ** len(counts))])
-    return STEP * (places[:, None] + bits[None]), places
-
-
 def found(corners, solid):
     """Return the contacts of an arm from x = 0 to its other end."""
     x = corners[:, :, 0]
@@ -39,7 +32,7 @@ def found(corners, solid):
 def drawn(*rows):
     """Return corners and solid cells of a drawing, its first line on top."""
     lines = [list(row) for row in reversed(rows)]
-    corners, (i, j) = (one := grid(len(lines[0]), len(lines)))[0], one[1].T
+    corners, (i, j) = (one := grid(len(lines[0]), len(lines), step=STEP))[0], one[1].T
     return corners, np.array(lines)[j, i] == "#"
 
 
@@ -78,7 +71,7 @@ def test_the_order_of_cells_does_not_matter():
 @pytest.mark.serial
 def test_contacts_of_solids():
     """Cubes meet in faces, edges or corners; a corner of cubes that share an edge is none more."""
-    cells, places = grid(4, 2, 2)
+    cells, places = grid(4, 2, 2, step=STEP)
     i, j, k = places.T
     low, high = (i < 2) & (j == 0) & (k == 0), (i >= 2) & (k == 0)
     by_face = found(cells, low | (high & (j == 0)))
@@ -96,18 +89,16 @@ def test_contacts_of_solids():
 
 @pytest.mark.serial
 def test_triangles_and_tetrahedra():
-    quads, places = grid(4, 2)
+    quads, places = grid(4, 2, step=STEP)
     first, second = quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]
     halves = np.concatenate([first, second])
     i, j = np.tile(places, (2, 1)).T
     corner = found(halves, ((i < 2) & (j == 0)) | ((i >= 2) & (j == 1)))
     assert (corner.pieces, corner.corners) == (2, 1) and not corner.joins
     assert found(halves, j == 0).pieces == 1
-    cubes, places = grid(4, 2, 2)
-    ways = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]]
-    sixths = np.concatenate([cubes[:, way] for way in ways])
+    cubes, places = grid(4, 2, 2, step=STEP)
     i, j, k = np.tile(places, (6, 1)).T
-    edge = found(sixths, (k == 0) & (((i < 2) & (j == 0)) | ((i >= 2) & (j == 1))))
+    edge = found(sixths(cubes), (k == 0) & (((i < 2) & (j == 0)) | ((i >= 2) & (j == 1))))
     assert (edge.pieces, edge.corners, edge.edges) == (2, 0, 1)
 
 
@@ -146,11 +137,9 @@ QUICK = ("arms.cells=[24,6]", "arms.arm2.rigid=true", "arms.passive=0", "objecti
 @pytest.mark.serial
 def test_the_crisp_design_is_rated_without_contacts():
     """A strut that hangs by a corner changes nothing; a chain alone is no crisp design."""
-    scene = do.load_scene(TWO_ARM, QUICK)
-    partition = do.partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    arms = do.build_arms(scene, partition, do.Profile())
-    evaluator = Evaluator(scene, partition, arms, do.Profile())
-    i, j = (arms[0].mesh.centroid * [24.0, 100.0] + [0.0, 3.0]).astype(int).T
+    built = built_of(do.load_scene(TWO_ARM, QUICK), MPI.COMM_SELF)
+    evaluator = Evaluator(built.scene, built.partition, built.arms, built.profile)
+    i, j = (built.arms[0].mesh.centroid * [24.0, 100.0] + [0.0, 3.0]).astype(int).T
 
     def crisp(solid):
         return _crisp(evaluator, {0: np.where(solid, 1.0, 0.0)})
@@ -222,25 +211,15 @@ def compliance(arm, solid, split):
     """Return f'u of unit loads at the outboard end, cells at contacts with nodes of their own."""
     operators, T = arm.substructure.operators, arm.substructure.T
     cells, points = operators.cells.copy(), list(operators.points)
-    rigid = T.inboard | T.outboard
-    for node in np.flatnonzero(~rigid) if split else ():
+    for node in np.flatnonzero(~(T.inboard | T.outboard)) if split else ():
         at = np.flatnonzero(solid & (cells == node).any(axis=1))
         if len(at) == 2 and len(np.intersect1d(*cells[at])) == 1:
             cells[at[1]] = np.where(cells[at[1]] == node, len(points), cells[at[1]])
             points.append(points[node])
-    young = arm.state(solid * 1.0).elastic.young
-    blocks = np.broadcast_to(operators.stiffness, (len(cells), 8, 8)) * young[:, None, None]
-    K = np.zeros((2 * len(points), 2 * len(points)))
-    for cell, block in zip(cells, blocks, strict=True):
-        dofs = (2 * cell[:, None] + [0, 1]).ravel()
-        K[np.ix_(dofs, dofs)] += block
-    x, y = np.array(points).T[:2]
-    inner = np.flatnonzero((x > 1e-9) & (x < x.max() - 1e-9))
-    basis = np.zeros((len(K), 2 * len(inner) + 3))
-    basis[(2 * inner[:, None] + [0, 1]).ravel(), np.arange(2 * len(inner))] = 1.0
-    end = np.flatnonzero(x > x.max() - 1e-9)
-    basis[2 * end, -3], basis[2 * end + 1, -2], basis[2 * end, -1] = 1.0, 1.0, -y[end]
-    inverse = np.linalg.inv(basis.T @ K @ basis)
+    elastic = arm.state(solid * 1.0).elastic
+    own = replace(operators, cells=cells, points=np.array(points))
+    K, _ = dense_matrices(SimpleNamespace(operators=own, mesh=arm.mesh), elastic.young, solid)
+    inverse = np.linalg.inv(K)
     return inverse[-2, -2] + inverse[-1, -1]  # a force across, a moment
 
 

@@ -1,14 +1,13 @@
 """Widths of members and gaps of crisp designs: drawn by hand, and those of robust ones."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from remainders import built_of
 from runs import TWO_ARM, overrides, refused, run
-from solids import solid_scene
+from solids import grid, sixths, solid_scene
 
 import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
@@ -68,17 +67,12 @@ def test_widths_of_drawn_designs(name, solid, member, gap, triangles):
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_nothing_solid_has_no_widths():
-    corners, i, _ = cells(10, 4)
-    assert thinnest(corners, i < 0) == (None, None)
-
-
-@pytest.mark.serial  # ranks have no part in it
 def test_corners_are_no_members():
     """A triangular island in the middle of a wide field: its corners are thin, it is not."""
     corners, i, j = cells(60, 60)
     member, _ = thinnest(corners, (j > 10) & (abs(2 * i - 59) < 50 - j))
     assert member.size > 10.0 * CELL
+    assert thinnest(corners, i < 0) == (None, None)
 
 
 @pytest.mark.serial  # ranks have no part in it
@@ -135,28 +129,18 @@ def toml(data):
     return "{" + ", ".join(f"{k}={v!r}" for k, v in data.items()) + "}"
 
 
-ROBUST = [
-    "arms.arm2.rigid=true",
-    "arms.length=0.28",
-    "arms.cells=[84,18]",
-    "motion.radius=0.15",
-    "motion.joint_height=-0.2",
-    "objective.kind=static",
-    "design.projection=robust",
-    "design.continuation=5",
-    "design.sharpness=32.0",
-    "optimizer.max_iterations=60",
-]
+ROBUST = ("arms.arm2.rigid=true", "arms.length=0.28", "arms.cells=[84,18]", "motion.radius=0.15",
+          "motion.joint_height=-0.2", "objective.kind=static", "design.projection=robust",
+          "design.continuation=5", "design.sharpness=32",
+          "optimizer.max_iterations=60")  # fmt: skip
 
 
 @pytest.mark.serial
 def test_members_of_a_robust_design_are_as_wide_as_asked():
     """To one cell; members along the edges, too, which a mirroring filter would halve."""
     width, cell = 0.012, 0.06 / 18
-    scene = do.load_scene(
-        TWO_ARM, (*ROBUST, f"design.minimum_member={width}", "design.erosion=0.25")
-    )
-    result = do.optimize(scene)
+    asked = f"design.minimum_member={width}", "design.erosion=0.25"
+    result = do.optimize(do.load_scene(TWO_ARM, (*ROBUST, *asked)))
     widths = _widths(result.partition, result.arms, result.x_phys)
     volume = WORLD.bcast(result.history[-1].volume_fraction if WORLD.rank == 0 else None, root=0)
     assert volume == pytest.approx(0.5, abs=0.01)  # of the nominal design
@@ -184,25 +168,21 @@ def test_the_place_of_the_thinnest_member(name, place):
 @pytest.mark.serial  # ranks have no part in it
 def test_widths_of_solids():
     """A web of two cells over a window of four, in boxes and in tetrahedra; to a voxel."""
-    bits = np.array([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)])
-    places = np.indices((24, 10, 8)).reshape(3, -1).T
-    boxes = CELL * (places[:, None] + bits[None])
+    boxes, places = grid(12, 10, 4, step=CELL)
     i, j, _ = places.T
-    ends = (i < 6) | (i >= 18)
+    ends = (i < 3) | (i >= 9)
     solid = ends | (j < 4) | (j >= 8)
-    ways = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]]
-    sixths = np.concatenate([boxes[:, way] for way in ways])
     # The side of a tetrahedron's cube is twice that of its own volume: voxels are as fine.
-    for corners, filled in ((boxes, solid), (sixths, np.tile(solid, 6))):
-        member, gap = thinnest_solid(corners, filled, 4.0 * CELL)
+    for corners, filled in ((boxes, solid), (sixths(boxes), np.tile(solid, 6))):
+        member, gap = thinnest_solid(corners, filled, 3.5 * CELL)
         assert member.size == pytest.approx(2.0 * CELL, abs=CELL / 4.0)
         x, y, z = np.array(member.place) / CELL
-        assert 5.0 < x < 19.0 and y == pytest.approx(9.0, abs=0.5) and 0.0 < z < 8.0
+        assert 2.0 < x < 10.0 and y == pytest.approx(9.0, abs=0.5) and 0.0 < z < 4.0
         assert gap.size == pytest.approx(4.0 * CELL, abs=CELL / 4.0)
         assert gap.place[1] / CELL == pytest.approx(6.0, abs=0.5)
     assert thinnest_solid(boxes, np.zeros(len(boxes), dtype=bool), CELL) == (None, None)
     whole, none = thinnest_solid(boxes, np.ones(len(boxes), dtype=bool), CELL)
-    assert none is None and whole.size == pytest.approx(8.0 * CELL, abs=CELL / 4.0)
+    assert none is None and whole.size == pytest.approx(4.0 * CELL, abs=CELL / 4.0)
 
 
 @pytest.mark.serial
@@ -253,9 +233,8 @@ def test_a_gap_of_its_own_widens_the_gaps():
 def test_which_design_carries_the_volume(width):
     """With a width the dilated one, scaled so that the nominal one meets its limit; else that."""
     scene = do.load_scene(TWO_ARM, (*ROBUST, f"design.minimum_member={width}"))
-    partition = do.partition_arms(WORLD, scene.cell_counts)
-    arms = do.build_arms(scene, partition, do.Profile())
-    evaluator = Evaluator(scene, partition, arms, do.Profile())
+    built = built_of(scene)
+    evaluator = Evaluator(scene, built.partition, built.arms, built.profile)
     evaluator.continuation.beta = 4.0
     designs = evaluator.evaluate(np.linspace(0.1, 0.9, evaluator.variables.size))
     problem = problem_of(scene, designs)

@@ -1,7 +1,5 @@
 """The Heaviside projection: formula, limits, slopes, and the volume."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -38,7 +36,7 @@ def mine(*arrays):
 
 @pytest.mark.serial
 @pytest.mark.parametrize("eta", ETAS)
-@pytest.mark.parametrize("beta", [0.01, 1.0, 8.0, 64.0])
+@pytest.mark.parametrize("beta", [0.01, 1.0, 8.0, 64.0, 1e3, 1e6])
 def test_published_formula(beta, eta):
     """That of tanh, which loses what is small beside 1: units of rounding of 1 / tanh(beta)."""
     low, high = np.tanh(beta * eta), np.tanh(beta * (1.0 - eta))
@@ -61,22 +59,13 @@ def test_bounds_and_order_are_kept(beta, eta):
 @pytest.mark.serial
 def test_no_sharpness_is_the_identity():
     """For eta = 1/2, y = x + beta^2 x (1 - x) (2 x - 1) / 6 and terms of fourth order."""
-    assert np.array_equal(project(X, 0.0, 0.3).value, X)
+    same = project(X, 0.0, 0.3).value
+    assert np.array_equal(same, X) and not np.shares_memory(same, X)
     assert np.array_equal(project(X, 0.0, 0.3).slope, np.ones_like(X))
     assert project(X, 1e-9, 0.3).value == pytest.approx(X, abs=1e-15)
     assert project(X, 1e-9, 0.3).slope == pytest.approx(1.0, abs=2e-15)
     second = X * (1.0 - X) * (2.0 * X - 1.0) / 6.0
     assert project(X, 0.01, 0.5).value - X == pytest.approx(1e-4 * second, abs=1e-9)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("eta", [0.2, 0.5, 0.8])
-def test_infinite_sharpness_is_the_step(eta):
-    """At a distance d from the threshold exp(-2 beta d) is left, twice."""
-    y = project(X, 1e3, eta)
-    far = np.abs(X - eta) > 4e-3
-    assert y.value[far] == pytest.approx((X > eta)[far].astype(float), abs=2.0 * np.exp(-8.0))
-    assert project(X, 1e6, eta).value[far] == pytest.approx((X > eta)[far].astype(float), abs=0.0)
 
 
 @pytest.mark.serial
@@ -90,16 +79,6 @@ def test_slope_is_the_derivative(beta, eta):
     difference = (y[0] - 8.0 * y[1] + 8.0 * y[2] - y[3]) / (12.0 * h)
     size = max(beta, 1.0)
     assert project(x, beta, eta).slope == pytest.approx(difference, abs=2e-10 * size)
-
-
-@pytest.mark.serial
-def test_input_is_left_alone():
-    x, area = cells()
-    before = x.copy(), area.copy()
-    for beta in (0.0, 8.0):
-        value = kept(x, area, beta, SELF)
-        assert not np.shares_memory(value, x)
-    assert np.array_equal(x, before[0]) and np.array_equal(area, before[1])
 
 
 @pytest.mark.serial
@@ -136,12 +115,6 @@ def test_volume_is_kept_whatever_the_design(x, beta):
     y = kept(x, area, beta, SELF)
     assert abs(area @ (y - x)) < 1e-12 * area.sum()
     assert (y >= 0.0).all() and (y <= 1.0).all()
-
-
-@pytest.mark.serial
-def test_threshold_of_a_symmetric_design_is_one_half():
-    x = np.array([0.1, 0.9, 0.3, 0.7])
-    assert preserving_threshold(x, np.ones(4), 16.0, SELF) == pytest.approx(0.5, abs=1e-12)
 
 
 @pytest.mark.serial

@@ -1,7 +1,5 @@
 """Imported robots."""
 
-from __future__ import annotations
-
 import pytest
 from robots import DEMO, DEMO_MOTION, run_import, write_uneven
 

@@ -1,7 +1,5 @@
 """Robots written back as URDF."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -43,9 +43,7 @@ def test_a_joint_that_follows_and_those_not_named_have_columns(tmp_path, capsys)
     motion.write_text("t,finger,yaw\n0,0.01,0\n1,0.03,2\n")
     run_import(file, "upper", motion, tmp_path / "a")
     rows = np.genfromtxt(tmp_path / "a" / "trajectory.csv", delimiter=",", names=True)
-    assert set(rows.dtype.names) == {
-        "t", "yaw", "lift", "rail", "bend", "roll", "finger", "other"
-    }  # fmt: skip
+    assert {*rows.dtype.names} == {*"t yaw lift rail bend roll finger other".split()}
     assert rows["other"] == pytest.approx(0.005 - rows["finger"], abs=1e-15)
     assert not rows["lift"].any()
     assert "stand still: lift = 0, " in capsys.readouterr().err

@@ -1,7 +1,5 @@
 """Bodies made of point masses, whose shape integrals are sums, in the plane and in space."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

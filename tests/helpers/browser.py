@@ -1,7 +1,5 @@
 """A headless Chromium for tests of pages, driven over the pipe of its DevTools protocol."""
 
-from __future__ import annotations
-
 import base64
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """Machines: control, slider-crank, four-bar; what `tests/reference` says of them, and balances."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """HTML pages, read and checked."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 VOID = {"meta", "link", "img", "input", "br", "path", "rect", "circle"}

@@ -1,7 +1,5 @@
 """Designs whose parts are known, and folders of runs that have them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -17,20 +15,23 @@ def frame(x, y):
     return (np.abs(y) > 0.0149) | (np.abs((x + 0.125) % 0.25 - 0.125) < 0.0124)
 
 
-CHANGES = [
-    "arms.1.rigid=true",
-    "design.projection=robust",
-    "arms.0.passive=0.01",
-    "optimizer.max_iterations=1",
-]
+CHANGES = ["arms.1.rigid=true", "design.projection=robust", "arms.0.passive=0.01",
+           "optimizer.max_iterations=1"]  # fmt: skip
+
+
+def write_run(path, scene, *densities):
+    """Write what `dolfinopt part` reads of a run: scene, and designs by x, y (and z)."""
+    arrays, flexible = {}, [arm for arm in scene.arms if not arm.rigid]
+    for arm, density in zip(flexible, densities, strict=True):
+        mesh = arm_mesh(MPI.COMM_SELF, arm)
+        arrays[f"{arm.name}/centroid"] = mesh.centroid
+        arrays[f"{arm.name}/density"] = mesh.keep(density(*mesh.centroid.T).astype(float))
+    path.mkdir()
+    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
+    np.savez(path / "design.npz", **arrays)
+    return path
 
 
 def folder_with(path, density, *changes):
-    """Write what `dolfinopt part` reads of a run: scene and design."""
-    scene = do.load_scene(TWO_ARM, [*CHANGES, *changes])
-    arm = arm_mesh(MPI.COMM_SELF, scene.arms[0])
-    path.mkdir()
-    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
-    values = arm.keep(density(*arm.centroid.T).astype(float))
-    np.savez(path / "design.npz", **{"arm1/centroid": arm.centroid, "arm1/density": values})
-    return path
+    """Write a run of two arms, of which the second is rigid."""
+    return write_run(path, do.load_scene(TWO_ARM, [*CHANGES, *changes]), density)

@@ -1,7 +1,5 @@
 """Comparison of pictures with ones that were looked at."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from matplotlib.figure import Figure

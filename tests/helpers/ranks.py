@@ -8,8 +8,6 @@ a failure on one of them is a failure on all, reported by rank 0. A rank that fa
 wait for it inside a collective call would wait for ever: after a grace period it ends the run.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import gc
 import os

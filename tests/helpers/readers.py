@@ -1,7 +1,5 @@
 """Forces of one body by standard input data and by MBDyn's modal element, as programs read them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

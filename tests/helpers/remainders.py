@@ -1,7 +1,5 @@
 """Arms of small scenes, dense and built, and Taylor remainders of functions of their densities."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -34,19 +32,22 @@ class Built:
     arms: dict[int, Arm]
     profile: do.Profile
 
+    @property
+    def place(self) -> tuple[Scene, Partition, dict[int, Arm]]:
+        """What most functions of arms take first."""
+        return self.scene, self.partition, self.arms
+
     def evaluate(self, x_phys: Cells, simulated: bool = False):
         """Evaluate physical densities."""
-        place = self.scene, self.partition, self.arms
-        return do.evaluate(*place, x_phys, self.profile, simulated=simulated)
+        return do.evaluate(*self.place, x_phys, self.profile, simulated=simulated)
 
     def gradient(self, trajectory=None):
         """Return the objective's gradient at the design evaluated last."""
-        return do.gradient(self.scene, self.partition, self.arms, trajectory, self.profile)
+        return do.gradient(*self.place, trajectory, self.profile)
 
     def constraint_gradients(self, trajectory=None) -> list[dict[int, np.ndarray]]:
         """Return the gradients of `beside_volume` at the design evaluated last."""
-        place = self.scene, self.partition, self.arms
-        rows = constraint_gradients(*place, trajectory, self.profile)
+        rows = constraint_gradients(*self.place, trajectory, self.profile)
         return [row.cells for row in rows if row.response.name != "volume_fraction"]
 
     def dot(self, a: Cells, b: Cells) -> float:

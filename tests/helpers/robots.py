@@ -1,7 +1,5 @@
 """Robots for tests: URDF texts, and the mechanism that a scene of one describes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

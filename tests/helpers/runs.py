@@ -1,17 +1,17 @@
 """Scenes, and commands run in this process or in processes of their own."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 import click
+import numpy as np
 import pytest
 from mpi4py import MPI
 
@@ -27,6 +27,8 @@ else:
 
 ROOT = Path(__file__).parents[2]
 TWO_ARM = ROOT / "demos" / "two_arm.toml"
+QUICK = ("arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9",
+         "simulation.tolerance=1e-2")  # fmt: skip
 # The tables that every scene states, for tests of one arm's mesh, filter or keys.
 STATED = {"motion": {"path": "arc"}, "payload": {"mass": 6.0}}  # kg
 
@@ -34,6 +36,11 @@ STATED = {"motion": {"path": "arc"}, "payload": {"mass": 6.0}}  # kg
 def scene(*changes: str) -> Scene:
     """Return the two-arm scene with "key.path=value" changed."""
     return do.load_scene(TWO_ARM, changes)
+
+
+def quick(*changes: str, iterations: int = 0) -> Scene:
+    """Return the two-arm scene in few cells, roughly solved."""
+    return scene(*QUICK, f"optimizer.max_iterations={iterations}", *changes)
 
 
 def overrides(*changes: str) -> list[str]:
@@ -69,6 +76,15 @@ def refused(*words: str, error: type[Exception] = InputError) -> Iterator[None]:
     said = str(caught.value)
     assert "\n" not in said
     assert [word for word in words if word not in said] == [], said
+
+
+def assert_same_bits(found: do.Result, expected: do.Result) -> None:
+    """Assert that two optimisations have the same designs and history, but for the seconds."""
+    for k, x in expected.x_phys.items():
+        np.testing.assert_array_equal(found.x_phys[k], x)
+    # As text, in which nan is nan.
+    rows = ([str(replace(row, seconds=0.0)) for row in one.history] for one in (found, expected))
+    assert next(rows) == next(rows)
 
 
 def demo(name: str) -> ModuleType:

@@ -1,7 +1,5 @@
 """One solid arm of a scene, 0.5 x 0.04 x 0.02 m of aluminium."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -51,6 +49,22 @@ def solid_scene(
 def solid_arm(comm: MPI.Comm = MPI.COMM_WORLD, **told: Any) -> Arm:
     """Return this arm, see `solid_scene`."""
     return Arm(solid_scene(**told), 0, comm, Profile())
+
+
+# Of a cube's corners, which of them make six tetrahedra that fill it and meet its neighbours'.
+SIXTHS = [(0, a, a | b, 7) for a in (1, 2, 4) for b in (1, 2, 4) if a != b]
+
+
+def grid(*counts: int, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners (n, 4 or 8, d) of square or cubic cells, as tensor products, and places."""
+    places = np.indices(counts).reshape(len(counts), -1).T
+    bits = (np.arange(2 ** len(counts))[:, None] >> np.arange(len(counts))) & 1
+    return step * (places[:, None] + bits), places
+
+
+def sixths(corners: np.ndarray) -> np.ndarray:
+    """Return the tetrahedra (6 n, 4, 3) that hexahedra (n, 8, 3) are cut into."""
+    return np.concatenate([corners[:, one] for one in SIXTHS])
 
 
 def link_mesh(shape: str, cells: tuple[int, int, int]) -> ArmMesh:

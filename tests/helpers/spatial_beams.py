@@ -4,8 +4,6 @@ The chain: yaw, pitch, pitch, two aluminium links and 4 kg. Geometrically exact 
 of largest deviation as Saint-Venant beams, 18.62 mm with rigid end faces (issue 16).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import eigh
 

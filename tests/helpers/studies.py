@@ -1,7 +1,5 @@
 """What studies wrote, and designs for them."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from typing import Any

@@ -25,8 +25,7 @@ def left_by(scene, folder):
     built = built_of(scene)
     x = built.uniform()
     evaluation, trajectory = built.evaluate(x)
-    place = scene, built.partition, built.arms
-    one = Simulated(*place, x, evaluation, trajectory, built.profile)
+    one = Simulated(*built.place, x, evaluation, trajectory, built.profile)
     write_simulation(folder, one, 0.0, paraview=False)
     with np.load(folder / "trajectory.npz") as data:
         arrays = {name: data[name] for name in data.files}
@@ -78,9 +77,8 @@ def test_slider_leaves_its_place_and_the_force_of_its_guide(tmp_path):
     # Deviation is along the line alone: position less that of rigid arms.
     crank = arrays["q_r"][:, 1]
     rigid = 0.15 * np.cos(crank) + np.sqrt(0.3**2 - (0.15 * np.sin(crank)) ** 2)
-    np.testing.assert_allclose(
-        arrays["deviation"][:, 0], arrays["slider_position"] - rigid, atol=1e-12
-    )
+    away = arrays["slider_position"] - rigid
+    np.testing.assert_allclose(arrays["deviation"][:, 0], away, atol=1e-12)
     assert np.abs(arrays["deviation"][:, 1]).max() < 1e-8
     peak = np.abs(trajectory.closure_force).max()
     assert summary["closure_force_peak"] == pytest.approx(peak, rel=1e-12)
@@ -119,8 +117,6 @@ def test_prescribed_motion_leaves_what_it_left(tmp_path):
     arrays, table, summary, _ = left_by(scene, tmp_path)
     assert "q_r_desired" not in arrays and "closure_force" not in arrays
     assert arrays["joint_forces"].shape[1] == 3
-    assert [name for name in table.dtype.names if name.startswith("joint_force")] == [
-        "joint_force_arm1",
-        "joint_force_arm2",
-    ]  # a fixed base is no drive
+    drives = [name for name in table.dtype.names if name.startswith("joint_force")]
+    assert drives == ["joint_force_arm1", "joint_force_arm2"]  # a fixed base is no drive
     assert list(summary["units"]["drive_peak"]) == ["arm1", "arm2"]

@@ -1,7 +1,5 @@
 """Designs whose parts are known, without an optimisation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Parts in the moving machine, beside the densities that they were made of."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -157,11 +155,3 @@ def test_crisp_design_whose_motion_takes_too_long_is_given_up(made, monkeypatch)
     monkeypatch.setattr(forms, "PATIENCE", 0.01)
     density, none = forms.design_columns(scene_of(made[0]), made[0])
     assert density is not None and none is None
-
-
-def test_scene_of_parts_has_solid_arms(made, tmp_path):
-    run("part", made[0], "--out", tmp_path / "part", "--no-plots", "--no-check")
-    scene = do.load_scene(tmp_path / "part" / "part.toml")
-    assert scene.arms[0].mesh == str(tmp_path / "part" / "arm1.msh")
-    assert scene.arms[0].element == "quadratic" and scene.design.radius == 0.0
-    assert "table" not in json.loads((tmp_path / "part" / "part.json").read_text())

@@ -1,9 +1,8 @@
 """Lines, arcs and splines, the shapes behind polygons, and splines through points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+import shapely
 
 from dolfinopt.part.curves import Arc, Line, Spline, curvature, direction, sampled
 from dolfinopt.part.fit import fit
@@ -41,21 +40,15 @@ def test_reversed_and_mirrored_run_through_the_same_points(curve):
     np.testing.assert_allclose(fine(curve.reversed()), points[::-1], atol=1e-12)
     np.testing.assert_allclose(fine(curve.mirrored()), points * [1.0, -1.0], atol=1e-12)
     np.testing.assert_allclose(direction(curve, 0.0), -direction(curve.reversed(), 1.0), atol=1e-9)
+    t = np.linspace(0.0, 1.0, 6)
+    np.testing.assert_allclose(curvature(curve.mirrored(), t), -curvature(curve, t), atol=1e-9)
 
 
 @pytest.mark.parametrize("curve", CURVES)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
 def test_chords_stay_within_the_tolerance(curve, tolerance):
-    import shapely
-
     line = shapely.LineString(np.vstack([sampled([curve], tolerance), curve.end]))
     assert shapely.distance(shapely.points(fine(curve)), line).max() <= 1.001 * tolerance
-
-
-def test_curvature_of_an_arc_is_that_of_its_radius():
-    t = np.linspace(0.0, 1.0, 5)
-    np.testing.assert_allclose(curvature(CURVES[1], t), 0.5)
-    np.testing.assert_allclose(curvature(CURVES[2], t), -0.5)
 
 
 def test_parts_of_a_spline_are_the_spline():
@@ -82,6 +75,17 @@ def circle(count, radius=0.01, centre=(0.3, 0.1), first=0.0):
     return np.array(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
+@pytest.mark.parametrize("shift", [0, 3, 17])
+def test_rectangle_with_many_nodes_has_four_lines(shift):
+    side, none = np.linspace(0.0, 1.0, 11)[:-1], np.zeros(10)
+    x, y = (np.concatenate(parts) for parts in (
+        (side, none + 1, 1 - side, none), (none, side, none + 1, 1 - side)))  # fmt: skip
+    found = kinds(np.roll(np.stack([x, y], axis=1), shift, axis=0))
+    assert [type(curve) for curve in found] == [Line] * 4
+    corners = {tuple(np.round(curve.start, 12)) for curve in found}
+    assert corners == {(0, 0), (1, 0), (1, 1), (0, 1)}
+
+
 @pytest.mark.parametrize("count", [12, 60])
 def test_polygon_of_a_bore_is_a_circle(count):
     points = circle(count) + 1e-11 * np.random.default_rng(0).normal(size=(count, 2))
@@ -89,23 +93,8 @@ def test_polygon_of_a_bore_is_a_circle(count):
     assert isinstance(found, Arc) and found.is_circle
     assert found.radius == pytest.approx(0.01, abs=1e-10)
     np.testing.assert_allclose(found.centre, [0.3, 0.1], atol=1e-10)
-
-
-def test_hexagon_is_no_circle():
-    assert [type(curve) for curve in kinds(circle(6))] == [Line] * 6
-
-
-def test_rectangle_with_many_nodes_has_four_lines():
-    x = np.linspace(0.0, 1.0, 11)
-    points = np.vstack([
-        np.stack([x[:-1], 0 * x[:-1]], 1), np.stack([1 + 0 * x[:-1], x[:-1]], 1),
-        np.stack([x[:0:-1], 1 + 0 * x[:0:-1]], 1), np.stack([0 * x[:0:-1], x[:0:-1]], 1),
-    ])  # fmt: skip
-    for shift in (0, 3, 17):
-        found = kinds(np.roll(points, shift, axis=0))
-        assert [type(curve) for curve in found] == [Line] * 4
-        corners = {tuple(np.round(curve.start, 12)) for curve in found}
-        assert corners == {(0, 0), (1, 0), (1, 1), (0, 1)}
+    np.testing.assert_allclose(curvature(found, np.linspace(0.0, 1.0, 5)), 100.0)
+    assert [type(curve) for curve in kinds(circle(6))] == [Line] * 6  # a hexagon is none
 
 
 def slot(count):
@@ -157,13 +146,9 @@ def wave(count=400):
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
 def test_spline_keeps_the_tolerance_with_few_points(tolerance):
-    import shapely
-
     found = fit(Target(wave()), tolerance)
-    assert (
-        shapely.distance(shapely.points(wave(1500)), shapely.LineString(fine(found)[::10])).max()
-        <= 1.01 * tolerance
-    )
+    line = shapely.LineString(fine(found)[::10])
+    assert shapely.distance(shapely.points(wave(1500)), line).max() <= 1.01 * tolerance
     # Cubic: the fourth root of the tolerance; 8, 11 and 19 control points.
     assert len(found.points) <= 2 + 2.0 * tolerance**-0.25
     np.testing.assert_array_equal([found.start, found.end], wave()[[0, -1]])

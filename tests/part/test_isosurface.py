@@ -1,12 +1,11 @@
 """Surfaces of solid designs."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from solids import sixths
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
@@ -17,8 +16,6 @@ from dolfinopt.part.solid import triangle_bytes
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 SIZE, CELLS = (0.5, 0.04, 0.02), (60, 8, 4)
-# Of a cube's corners, which of them make six tetrahedra that fill it and meet its neighbours'.
-SIXTHS = [(0, a, a | b, 7) for a in (1, 2, 4) for b in (1, 2, 4) if a != b]
 
 DESIGNS = {
     "solid": lambda x, y, z: np.ones_like(x),
@@ -45,8 +42,7 @@ def test_a_surface_is_closed_and_keeps_the_volume(hexahedra, name, shape):
     density = DESIGNS[name](*hexahedra.mean(axis=1).T)
     corners = hexahedra
     if shape == "tetrahedron":
-        corners = np.concatenate([hexahedra[:, sixth] for sixth in SIXTHS])
-        density = np.tile(density, len(SIXTHS))
+        corners, density = sixths(hexahedra), np.tile(density, 6)
     surface = design_surface(corners, density)
     found = trimesh.load_mesh(io.BytesIO(triangle_bytes(surface.corners, "test, m")), "stl")
     assert found.is_watertight and found.is_winding_consistent

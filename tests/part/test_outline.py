@@ -1,12 +1,11 @@
 """Outlines and shapes of designs that are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import shapely
 from mpi4py import MPI
 from parts import frame
+from scipy.spatial import cKDTree
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -19,12 +18,8 @@ from dolfinopt.part.search import search
 
 pytestmark = pytest.mark.serial
 
-BORES = (
-    f"arms.0.mesh={mesh_folder() / 'arm_bores.geo'}",
-    "arms.0.mesh_size=0.006",
-    "arms.0.passive=0.0075",
-    "arms.0.symmetric=true",
-)
+BORES = (f"arms.0.mesh={mesh_folder() / 'arm_bores.geo'}", "arms.0.mesh_size=0.006",
+         "arms.0.passive=0.0075", "arms.0.symmetric=true")  # fmt: skip
 
 
 def check(part, holes):
@@ -154,25 +149,18 @@ def test_bores_are_exact_and_the_part_is_its_mirror_image(design):
         assert curve.radius == pytest.approx(0.01, abs=1e-9)
     ends = [p.curve for p in part.shape.loops[0] if isinstance(p.curve, Arc)]
     assert [curve.radius for curve in ends] == pytest.approx([0.03, 0.03], abs=1e-9)
-    points = np.vstack([loop for loop in part.shape.polygons(1e-6)])
-    from scipy.spatial import cKDTree
-
+    points = np.vstack(part.shape.polygons(1e-6))
     assert cKDTree(points).query(points * [1.0, -1.0])[0].max() < 1e-12
 
 
 def test_regions_stay_solid_and_void(design):
-    regions = (
-        '[{kind="solid", box=[0.3, -0.02, 0.4, 0.01]}, {kind="void", box=[0.5, 0.02, 0.6, 0.03]}]'
-    )
-    part = make_part(design(frame, f"arms.0.regions={regions}"), None, None)
-    polygon = shapely.Polygon(*_rings(part))
+    solid, void = (f'{{kind="{kind}", box={box}}}' for kind, box in (
+        ("solid", [0.3, -0.02, 0.4, 0.01]), ("void", [0.5, 0.02, 0.6, 0.03])))  # fmt: skip
+    part = make_part(design(frame, f"arms.0.regions=[{solid}, {void}]"), None, None)
+    outer, *holes = part.shape.polygons(1e-7)
+    polygon = shapely.Polygon(outer, holes)
     assert polygon.buffer(1e-8).covers(shapely.box(0.3, -0.02, 0.4, 0.01))
     assert not polygon.buffer(-1e-8).intersects(shapely.box(0.5, 0.02, 0.6, 0.03))
-
-
-def _rings(part):
-    outer, *holes = part.shape.polygons(1e-7)
-    return outer, holes
 
 
 def test_tool_as_wide_as_the_arm_is_refused(design):
@@ -237,12 +225,10 @@ def test_search_finds_roots_and_leaps(size, root, most):
 def test_checkerboard_is_refused_before_it_is_drawn(design, monkeypatch):
     """Its union of thousands of pieces took minutes; a chain of corners alone is drawn."""
 
-    def place(x, y):
-        return np.round((x - x.min()) / 0.02).astype(int), np.round((y - y.min()) / 0.005).astype(
-            int
-        )
+    def density(x, y):
+        return np.rint((x - x.min()) / 0.02 + (y - y.min()) / 0.005).astype(int) % 2 == 0
 
-    board = design(lambda x, y: sum(place(x, y)) % 2 == 0, "arms.cells=[50,12]")
+    board = design(density, "arms.cells=[50,12]")
     assert board.contacts > 400
     monkeypatch.setattr(outline, "_given", None)
     with pytest.raises(InputError, match="checkerboard"):

@@ -1,7 +1,5 @@
 """Meshes along the curves of parts, and the stress on their outline."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -74,16 +72,9 @@ def test_mesh_follows_curves_that_move():
 
     def bar(sag):
         bottom = Spline(knots, np.array([[0, -0.01], [0.03, -sag], [0.07, -sag], [0.1, -0.01]]))
-        return Shape(
-            (
-                (
-                    Piece(bottom, free=True),
-                    Piece(Line(points[1], points[2]), "outboard"),
-                    Piece(Line(points[2], points[3])),
-                    Piece(Line(points[3], points[0]), "inboard"),
-                ),
-            )
-        )
+        lines = [Line(points[k], points[(k + 1) % 4]) for k in (1, 2, 3)]
+        sides = map(Piece, lines, ("outboard", "", "inboard"))
+        return Shape(((Piece(bottom, free=True), *sides),))
 
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
         mesh = body_mesh(gmsh, bar(0.01), 0.004)
@@ -111,15 +102,11 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
     """
     found = []
     for k, mesh in enumerate(meshes):
+        file = tmp_path / f"{k}.msh"
         with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-            write_mesh(gmsh, tmp_path / f"{k}.msh", mesh)
-        one = scene(
-            "arms.1.rigid=true",
-            f"arms.0.mesh={tmp_path / f'{k}.msh'}",
-            "arms.0.element=quadratic",
-            f"arms.0.length={LENGTH}",
-            "design.filter_radius=0.0",
-        )
+            write_mesh(gmsh, file, mesh)
+        arm1 = f"arms.0.mesh={file}", f"arms.0.length={LENGTH}", "arms.0.element=quadratic"
+        one = scene("arms.1.rigid=true", "design.filter_radius=0", *arm1)
         arm = Arm(one, 0, MPI.COMM_SELF, Profile())
         assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=1e-6)
         arm.set_design(np.ones(arm.mesh.num_cells))

@@ -1,7 +1,5 @@
 """Parts from Python."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from runs import TWO_ARM

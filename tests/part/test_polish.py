@@ -1,7 +1,5 @@
 """Shape optimisation of the splines of parts."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,17 +1,13 @@
 """Parts on several processes: the same files."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
 import pytest
-from mpi4py import MPI
-from parts import frame
+from parts import frame, write_run
 from runs import TWO_ARM, run, shell
 
 import dolfinopt as do
-from dolfinopt.mesh.arm_mesh import arm_mesh
 
 pytestmark = pytest.mark.serial  # starts ranks itself
 
@@ -20,18 +16,9 @@ WORDS = ("--no-plots", "--tolerance", 5e-4)
 
 
 def two_arms(path):
-    """Write what `dolfinopt part` reads of a run of two arms."""
-    scene = do.load_scene(TWO_ARM, CHANGES)
-    arrays = {}
-    for arm, strut in zip(scene.arms, (0.3, 0.7), strict=True):
-        mesh = arm_mesh(MPI.COMM_SELF, arm)
-        x, y = mesh.centroid.T
-        arrays[f"{arm.name}/centroid"] = mesh.centroid
-        arrays[f"{arm.name}/density"] = (frame(x, y) | (np.abs(x - strut) < 0.02)).astype(float)
-    path.mkdir()
-    np.savez(path / "design.npz", **arrays)
-    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
-    return path
+    """Write a run of two arms."""
+    designs = (lambda x, y, at=at: frame(x, y) | (np.abs(x - at) < 0.02) for at in (0.3, 0.7))
+    return write_run(path, do.load_scene(TWO_ARM, CHANGES), *designs)
 
 
 def contents(folder):

@@ -1,17 +1,15 @@
 """Parts of solid arms: closed, of the design's volume, exact at the arm's own faces."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
 import zipfile
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from parts import write_run
 from runs import ROOT, run, shell
 from scipy.ndimage import gaussian_filter
 from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
@@ -20,9 +18,9 @@ import dolfinopt as do
 import dolfinopt.part.solid_mesh as solid_mesh_module
 import dolfinopt.part.solid_part as solid_part_module
 from dolfinopt.cli.shared import scene_of
-from dolfinopt.density.members import narrowest
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.part.domain import read_domains
 from dolfinopt.part.isosurface import Surface, cut, eighths, halved, nodal_densities, outside
 from dolfinopt.part.smooth_surface import crossings, distance_to_faces
 from dolfinopt.part.solid import MM, triangle_bytes
@@ -31,7 +29,7 @@ from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
 from dolfinopt.part.solid_part import make_solid_part
 from dolfinopt.part.solid_widths import rasterised
 from dolfinopt.part.step import solid_text
-from dolfinopt.part.three_mf import CORE, three_mf_bytes
+from dolfinopt.part.three_mf import three_mf_bytes
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
@@ -59,15 +57,12 @@ def islands(x, y, z):
 
 
 def read_three_mf(data):
-    """Return the mesh of a 3MF file, its corners as the file has them."""
+    """Return the mesh of a 3MF file, mm, as another program reads it."""
+    pytest.importorskip("networkx")
+    pytest.importorskip("lxml")
     with zipfile.ZipFile(io.BytesIO(data)) as file:
-        model = ElementTree.fromstring(file.read("3D/3dmodel.model"))
-    assert model.get("unit") == "millimeter"
-    points, triangles = (
-        [[one.get(key) for key in keys] for one in model.iter(f"{{{CORE}}}{tag}")]
-        for tag, keys in (("vertex", "xyz"), ("triangle", ("v1", "v2", "v3")))
-    )
-    return trimesh.Trimesh(np.array(points, float), np.array(triangles, int), process=False)
+        assert b'unit="millimeter"' in file.read("3D/3dmodel.model")
+    return trimesh.load(io.BytesIO(data), "3mf", force="mesh")
 
 
 @pytest.fixture(scope="module")
@@ -106,11 +101,15 @@ def test_part_of_a_solid(domain_with, density):
         assert area_in(part.surface, 0, side) == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
 
 
+def area_of(corners):
+    """Return the area of triangles (n, 3, 3)."""
+    a, b, c = corners.swapaxes(0, 1)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
 def area_in(surface, axis, place):
     """Return the area of the triangles in a plane across an axis, m2."""
-    flat = (np.abs(surface.corners[..., axis] - place) < 1e-9).all(axis=1)
-    a, b, c = surface.corners[flat].swapaxes(0, 1)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    return area_of(surface.corners[(np.abs(surface.corners[..., axis] - place) < 1e-9).all(axis=1)])
 
 
 @pytest.mark.parametrize("plate", [False, True])
@@ -124,9 +123,7 @@ def test_mesh_of_a_part(domain_with, plate):
     for facets, x in ((mesh.inboard, 0.0), (mesh.outboard, LENGTH)):
         corners = mesh.points[facets]
         assert np.abs(corners[..., 0] - x).max() < 1e-9
-        a, b, c = corners.swapaxes(0, 1)
-        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
-        assert area == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
+        assert area_of(corners) == pytest.approx(HEIGHT * THICKNESS, rel=1e-9)
     boundary = trimesh.Trimesh(mesh.points, mesh.boundary, process=False)
     assert boundary.is_watertight and boundary.volume == pytest.approx(part.volume, rel=1e-6)
 
@@ -275,31 +272,10 @@ def test_bores_are_interfaces_of_parts(tmp_path):
     found = solid_mesh(part, 1.5 * mesh_size(part))
     assert found.quality.min() > 1e-3
     for faces, facets in ((domain.inboard, found.inboard), (domain.outboard, found.outboard)):
-        areas = []
-        for corners in (faces, found.points[facets]):
-            a, b, c = corners.swapaxes(0, 1)
-            areas.append(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-        assert areas[1] == pytest.approx(areas[0], rel=0.02)
+        assert area_of(found.points[facets]) == pytest.approx(area_of(faces), rel=0.02)
         assert distance_to_faces(found.points[np.unique(facets)], faces).max() < 1e-9
     with pytest.raises(InputError, match="several outboard interfaces"):
         solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
-
-
-def test_narrowest_place_of_voxels():
-    """A plate of 6, a bar of 4 and a window of 10 voxels; edges and corners are no members."""
-    inside = np.zeros((60, 30, 20), dtype=bool)
-    inside[2:-2, 2:-2, 2:-2] = True
-    h = 0.5
-    assert narrowest(inside, h) is None
-    inside[20:40, 8:-2, 2:-2] = False  # a plate of 6
-    assert narrowest(inside, h)[0] == pytest.approx(6 * h, abs=h)
-    inside[20:40, 2:8, 6:-2] = False  # a bar of 6 x 4
-    assert narrowest(inside, h)[0] == pytest.approx(4 * h, abs=h)
-    void = np.ones((70, 40, 30), dtype=bool)
-    void[5:-5, 5:-5, 5:-5] = False
-    void[30:40, :, 10:-10] = True  # a hole of 10 x 10
-    assert narrowest(void, h)[0] == pytest.approx(10 * h, abs=h)
-    assert narrowest(void, h, 6 * h) is None
 
 
 def test_narrow_members_are_told(domain_with):
@@ -310,15 +286,6 @@ def test_narrow_members_are_told(domain_with):
                for one in part.warnings)  # fmt: skip
     asked = replace(part, domain=replace(domain, minimum_member=0.004))
     assert not any("thinnest member" in one for one in asked.warnings)
-
-
-def test_three_mf_is_read_by_others(domain_with):
-    pytest.importorskip("networkx")
-    pytest.importorskip("lxml")
-    surface = make_solid_part(domain_with(windows)).surface
-    found = trimesh.load(io.BytesIO(three_mf_bytes(surface, "a & b")), "3mf", force="mesh")
-    assert found.is_watertight
-    assert found.volume == pytest.approx(1e9 * surface.volume, rel=1e-6)
 
 
 def test_pieces_without_a_joint_are_left_out(domain_with):
@@ -366,17 +333,8 @@ def test_no_part_can_be_made(domain_with, density, words):
 
 
 def finished(path, densities, *changes):
-    """Write what `dolfinopt part` reads of a run of the machine in space; return the folder."""
-    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", list(changes))
-    arrays = {}
-    for arm, density in zip(scene.arms[1:], densities):
-        mesh = arm_mesh(MPI.COMM_SELF, arm)
-        arrays[f"{arm.name}/centroid"] = mesh.centroid
-        arrays[f"{arm.name}/density"] = density(*mesh.centroid.T).astype(float)
-    path.mkdir()
-    np.savez(path / "design.npz", **arrays)
-    (path / "summary.json").write_text(json.dumps({"scene": scene.to_dict()}))
-    return path
+    """Write a run of the machine in space; return its folder."""
+    return write_run(path, do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes), *densities)
 
 
 @pytest.mark.slow
@@ -407,14 +365,9 @@ def test_two_ranks_write_the_same_solids(tmp_path, capfd):
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory):
     """The folder of a run in which one link has a part and the other is rigid; its part."""
-    folder = finished(
-        tmp_path_factory.mktemp("solids") / "run",
-        (windows,),
-        "arms.link1.cells=[16,4,2]",
-        "arms.link2.rigid=true",
-        "simulation.sample=0.01",
-        "constraints.deviation=0.001",
-    )
+    changes = ("arms.link1.cells=[16,4,2]", "arms.link2.rigid=true", "simulation.sample=0.01",
+               "constraints.deviation=0.001")  # fmt: skip
+    folder = finished(tmp_path_factory.mktemp("solids") / "run", (windows,), *changes)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dolfinopt.part.solid_mesh.ACROSS", 1.0)  # large cells take little time
         run("part", folder)
@@ -444,11 +397,8 @@ def test_scene_of_parts_is_the_machine_of_the_table(checked, tmp_path):
     found = do.Model(scene, comm=MPI.COMM_SELF).simulate().evaluation
     for value, name in ((found.compliance, "compliance"), (found.max_deviation, "deviation")):
         assert value == pytest.approx(figures["table"][name]["part"], rel=1e-6)
-
-
-def test_pictures_of_parts(checked):
     for name in ("part.png", "deviation.png", "stress.png"):
-        assert (checked[0] / "part" / name).stat().st_size > 5000
+        assert (folder / "part" / name).stat().st_size > 5000
 
 
 def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
@@ -464,7 +414,9 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
     assert model.check_parts(design) == "check" and told["given"][2].keys() == {1}
 
 
-def test_options_of_outlines_are_refused(tmp_path):
+def test_outlines_of_solids_are_refused(tmp_path):
+    with pytest.raises(InputError, match="arm 'arm1' is a solid"):
+        read_domains(solid_scene(), tmp_path, MPI.COMM_SELF)  # before anything is meshed
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
     for option, words in (("--polish=2", "--polish"), ("--curves=arcs", "varies over the thick")):
         with pytest.raises(InputError, match=words):

@@ -4,6 +4,7 @@ import json
 
 import pytest
 from runs import TWO_ARM, refusal, run, tomllib
+from scenes import minimal
 
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 from dolfinopt.scene.materials import CATALOGUE
@@ -12,12 +13,11 @@ from dolfinopt.scene.schema import scene_schema
 
 pytestmark = pytest.mark.serial
 
-ARM = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}
-
 
 def tree(solid, **arm2):
-    arms = [dict(ARM), {"name": "arm2"} | arm2]
-    return {"material": solid, "arms": arms, "motion": {"path": "arc"}, "payload": {"mass": 6.0}}
+    data = minimal(material=solid)
+    data["arms"][1] |= arm2
+    return data
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

@@ -104,11 +104,8 @@ def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, tex
     path = tmp_path / file
     path.write_text(text)
     data = minimal()
-    data["arms"][0] |= {
-        "mesh": "meshes/arm_bores.geo",
-        "mesh_size": 0.004,
-        "cell_shape": "triangle",
-    }
+    bores = {"mesh": "meshes/arm_bores.geo", "mesh_size": 0.004, "cell_shape": "triangle"}
+    data["arms"][0] |= bores
     data["arms"][1] |= {"mesh": str(path)}
     arm = scene_from_dict(data).arms[1]
     assert (arm.mesh_size, arm.cell_shape, arm.cells) == (size, shape, None)
@@ -203,6 +200,7 @@ def test_files_that_cannot_be_read(tmp_path, monkeypatch):
 KEYS = [info.key for info in describe_keys()]
 TABLES = sorted({key.partition(".")[0] for key in KEYS})
 PATHS = [key.replace("arms.", f"arms.{i}.") for key in KEYS for i in (0, 1)] + ["arms.0", *TABLES]
+NAMES = st.text(max_size=5) | st.sampled_from(["name", "mass"])
 VALUES = st.recursive(
     st.none()
     | st.booleans()
@@ -212,12 +210,7 @@ VALUES = st.recursive(
     | st.text(max_size=20)
     | st.dates()
     | st.sampled_from(["esl", "modal", "generalized-alpha", "arm1", b"bytes", {1: 2}]),
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.dictionaries(
-            st.text(max_size=5) | st.sampled_from(["name", "mass"]), inner, max_size=3
-        )
-    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(NAMES, inner, max_size=3),
     max_leaves=6,
 )
 
