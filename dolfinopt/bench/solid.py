@@ -26,7 +26,7 @@ from dolfinopt.scene.load import Scene
 SIZE = LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
 MOVE = 0.05  # of densities from one design to the next
 # Links from 2e4 to 1e6 dofs.
-CELLS = (90, 9, 6), (120, 12, 8), (180, 18, 12), (260, 26, 17), (362, 36, 24)
+CELLS = (90, 9, 6), (120, 12, 8), (180, 18, 12), (260, 26, 17), (310, 31, 20), (362, 36, 24)
 QUICK = (40, 4, 3), (60, 6, 4)
 OURS = COLD, WARM = "dolfinopt, first design", "dolfinopt, nearby design"
 PLAIN = "plain DOLFINx, one load"
