@@ -298,6 +298,26 @@ class Trajectory:
             by[:, : len(free)] = by_rigid[:, free]
         return by, by_bodies
 
+    def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
+
+        With g(d, q) = 0 of the closure and its dependent joints d, by_q - g_q' g_d'^-1 by_d.
+
+        Args:
+            indices: (n,) of the instants.
+            by: (n, S) derivatives by the system's coordinates, each held.
+        """
+        problem, closure = self.problem, self.closure
+        by_q = by[:, problem.elastic_columns]
+        if not isinstance(problem, MachineSystem) or closure is None:
+            return by_q
+        here = interface_place(self.mechanism, self.motion[indices], self.q_e[indices])
+        J = closure.project(here.jacobian[:, problem.columns])
+        free = problem.ends[0]
+        dependent = slice(free - closure.count, free)
+        by_g = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), by[:, dependent, None])
+        return by_q - np.einsum("nm,nmk->nk", by_g[..., 0], J[:, :, problem.elastic_columns])
+
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
         """How the motion stands to the limits that the scene states of its joints."""

@@ -127,10 +127,10 @@ class MotionResponse(Response):
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
 
         With the equivalent static loads K q_j held, a change of stiffness gives
-        dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j.
+        dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j, which joints of a loop follow.
         """
         cases = self.load_cases(trajectory)
-        by_q = self.derivatives(trajectory, cases)[0][:, trajectory.problem.elastic_columns]
+        by_q = trajectory.by_elastic(cases.indices, self.derivatives(trajectory, cases)[0])
         mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
         return [
             np.linalg.solve(body.K, by_q[:, part].T) @ q[:, part]
