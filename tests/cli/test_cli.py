@@ -85,8 +85,9 @@ def test_trajectory_files(optimised):
         "deviation": (601, 2),
         "compliance": (601, 2),
         "joint_forces": (601, 3),
+        "rotation": (601,),
         "initial_deviation": (601, 2),
-        "units": (7,),
+        "units": (8,),
     }
     lines = (optimised / "trajectory.csv").read_text().splitlines()
     assert lines[0].startswith("t,deviation_x,deviation_y,deviation,compliance,q_r_cart,")
