@@ -61,6 +61,7 @@ def test_cantilever_under_its_payload(kind, controlled, tmp_path):
     assert run.trajectory.max_rotation == np.linalg.norm(turned, axis=1).max()
 
 
+@pytest.mark.slow
 def test_lightest_arm_keeps_its_end_straight(tmp_path):
     """Met by the true value where it can be; what even a solid arm does not keep is said."""
     light = "objective.kind=mass", "arms.cells=[30,4]", "design.filter_radius=0.0"
