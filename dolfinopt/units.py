@@ -9,6 +9,7 @@ SUMMARY = {
     "compliance": "N m",
     "max_deviation": "m",
     "max_deviation_time": "s",
+    "max_rotation": "rad",
     "settling": "m",
     "stress": "Pa",
     "mass": "kg",

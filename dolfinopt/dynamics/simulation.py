@@ -30,6 +30,7 @@ from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
     end_effector_gradient,
+    end_rotation,
     interface_place,
     lengths,
     place_gradient,
@@ -164,6 +165,14 @@ class Trajectory:
         return lengths(self.deviation)
 
     @cached_property
+    def rotation(self) -> np.ndarray:
+        """Rotation vector of the end-effector against that of rigid links (n, 1 or 3), rad.
+
+        Of free rigid coordinates against that of the desired motion.
+        """
+        return end_rotation(self.mechanism, self.motion, self.q_e, self.desired)
+
+    @cached_property
     def compliance(self) -> np.ndarray:
         """q' K q of every arm (n, arms), N m."""
         return self.mechanism.compliance(self.q_e)
@@ -268,24 +277,46 @@ class Trajectory:
         return out
 
     def by_end_effector(
-        self, indices: np.ndarray, weights: np.ndarray
+        self, indices: np.ndarray, weights: np.ndarray, moments: np.ndarray | None = None
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return the gradient of sum_n weights_n . end_effector_n at some instants.
+        """Return the gradient of sum_n weights_n . end_effector_n + moments_n . spin_n.
 
         Args:
             indices: (n,) of the instants.
             weights: (n, 2).
+            moments: (n, 1), in space (n, 3), or None: what its virtual rotation counts.
 
         Returns:
             By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
         """
         motion, q = self.motion[indices], self.q_e[indices]
-        by_q, by_rigid, by_bodies = end_effector_gradient(self.mechanism, motion, q, weights)
+        every = end_effector_gradient(self.mechanism, motion, q, weights, moments)
+        by_q, by_rigid, by_bodies = every
         by = self.by_unknowns(by_q)
         if isinstance(self.problem, MachineSystem):
             free = self.problem.drives.free
             by[:, : len(free)] = by_rigid[:, free]
         return by, by_bodies
+
+    def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
+
+        With g(d, q) = 0 of the closure and its dependent joints d, by_q - g_q' g_d'^-1 by_d.
+
+        Args:
+            indices: (n,) of the instants.
+            by: (n, S) derivatives by the system's coordinates, each held.
+        """
+        problem, closure = self.problem, self.closure
+        by_q = by[:, problem.elastic_columns]
+        if not isinstance(problem, MachineSystem) or closure is None:
+            return by_q
+        here = interface_place(self.mechanism, self.motion[indices], self.q_e[indices])
+        J = closure.project(here.jacobian[:, problem.columns])
+        free = problem.ends[0]
+        dependent = slice(free - closure.count, free)
+        by_g = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), by[:, dependent, None])
+        return by_q - np.einsum("nm,nmk->nk", by_g[..., 0], J[:, :, problem.elastic_columns])
 
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
@@ -351,6 +382,11 @@ class Trajectory:
         """Largest distance between flexible and rigid end-effector, m, and its instant, s."""
         worst = int(np.argmax(self.distance))
         return float(self.distance[worst]), float(self.t[worst])
+
+    @property
+    def max_rotation(self) -> float:
+        """Largest rotation of the end-effector against that of rigid links, rad."""
+        return float(lengths(self.rotation).max())
 
 
 def simulate(

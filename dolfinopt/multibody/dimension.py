@@ -153,6 +153,11 @@ class Plane:
         """Return angular velocities in other components: the same."""
         return w
 
+    @staticmethod
+    def rotation_vector(R: np.ndarray) -> np.ndarray:
+        """Return the angles (1, n) of rotations (2, 2, n), from -pi to pi."""
+        return np.arctan2(R[1, 0], R[0, 0])[None]
+
 
 _TRANSPOSED = np.arange(9).reshape(3, 3).T.ravel()
 
@@ -274,6 +279,14 @@ class Space:
     def rotated(R: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return R w (3, ..., n)."""
         return product(R, w)
+
+    @staticmethod
+    def rotation_vector(R: np.ndarray) -> np.ndarray:
+        """Return the rotation vectors (3, n) of rotations (3, 3, n), at most pi long."""
+        from scipy.spatial.transform import Rotation  # takes as long to import as NumPy
+
+        out: np.ndarray = Rotation.from_matrix(np.moveaxis(R, -1, 0)).as_rotvec().T
+        return out
 
 
 def _add_skew(A: np.ndarray, v: np.ndarray) -> None:

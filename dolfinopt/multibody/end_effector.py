@@ -37,22 +37,51 @@ def deviation(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> n
     return end_effector(mechanism, motion, q) - rigid
 
 
-def end_effector_gradient(
-    mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
-    """Return the gradient of sum_n weights_n . end_effector_n.
+def end_rotation(
+    mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray, desired: RigidMotion
+) -> np.ndarray:
+    """Return the rotation vectors log(R R_0') of the end-effector (n, r), r = 1 or 3, rad.
 
-    It is what a force of these weights on the end-effector does on every coordinate.
+    R is the rotation of the last outboard interface, R_0 that of rigid links along the desired
+    motion; the vectors are in the ground's frame and at most pi long.
+
+    Args:
+        mechanism, motion, q: as for `end_effector`, n instants.
+        desired: rigid coordinates that the rigid links have, n instants.
+    """
+    end = mechanism.way[-1]
+    R = Posed(mechanism, motion.q, q).interface(*end)[1]
+    rigid = Posed(mechanism, desired.q, np.zeros_like(q)).interface(*end)[1]
+    apart = _turned(R, rigid.swapaxes(0, 1))
+    dim = mechanism.tree.constants[0].dim
+    vectors = dim.rotation_vector(apart.reshape(dim.d, dim.d, -1))
+    return np.broadcast_to(vectors.T, (len(q), dim.r))
+
+
+def end_effector_gradient(
+    mechanism: ElasticBodies,
+    motion: RigidMotion,
+    q: np.ndarray,
+    weights: np.ndarray,
+    moments: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
+    """Return the gradient of sum_n weights_n . end_effector_n + moments_n . spin_n.
+
+    It is what a force and a moment of these weights on the end-effector do on every coordinate.
+    The spin is the end-effector's virtual rotation; along a rotation vector, as of `end_rotation`,
+    it changes the vector by itself.
 
     Args:
         mechanism, motion, q: as for `end_effector`, n instants.
         weights: (n, d).
+        moments: (n, r), in the ground's frame; None: zero.
 
     Returns:
         By q (n, N), by the rigid coordinates (n, R), and by every body's outboard modes (b, q) and
         their geometric stiffness (b, q, q), under the names of the shape integrals.
     """
     posed, forces = Posed(mechanism, motion.q, q), weights.T
+    turning = None if moments is None else moments.T
     end = posed.interface(*mechanism.way[-1])[0]
     by_q, by_rigid = np.zeros_like(q), np.zeros_like(motion.q)
     by_bodies = [{"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies]
@@ -62,13 +91,14 @@ def end_effector_gradient(
         joint, origin, R = posed.body(i)
         section, dim, back = posed.section(i, number), joint.dim, R.swapaxes(0, 1)
         force, lever = product(back, forces), product(back, end - origin)
+        own_moment = 0.0 if turning is None else dim.rotated(back, turning)
         if (k := joint.joint.coordinate) is not None:
-            by_rigid[:, k] = joint.drive((force, dim.moment(lever, force)))
+            by_rigid[:, k] = joint.drive((force, dim.moment(lever, force) + own_moment))
         if section.turning is None:
             continue
         body, part, by = mechanism.bodies[i], mechanism.slices[i], by_bodies[i]
         own = slice(dim.b * number, dim.b * (number + 1))
-        moment = dim.moment(lever - section.place, force)
+        moment = dim.moment(lever - section.place, force) + own_moment
         pull, e = np.concatenate([force, section.turning.pulled(moment)]), q[:, part]
         by_q[:, part] = pull.T @ body.outboard[own]
         by["outboard"][own] = pull @ e

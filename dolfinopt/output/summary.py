@@ -306,6 +306,7 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     peak, rms = trajectory.drives
     bodies = trajectory.mechanism.bodies
     found = {
+        "max_rotation": trajectory.max_rotation,
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
         "designed_mass": _designed_mass(scene, bodies),

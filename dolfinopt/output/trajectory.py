@@ -35,6 +35,7 @@ def write_trajectory(
         "deviation": trajectory.deviation,
         "compliance": trajectory.compliance,
         "joint_forces": trajectory.joint_forces,
+        "rotation": _rotation(trajectory),
     } | _of_machine(trajectory)
     scene = trajectory.scene
     if initial is not None and len(initial):
@@ -52,6 +53,7 @@ def write_trajectory(
         "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
         "closure_force": "N, " + _directions(scene),
         "slider_position": "m, from closure.point along closure.direction",
+        "rotation": "rad",
         "initial_deviation": "m",
     }
     arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])
@@ -77,6 +79,12 @@ def _of_machine(trajectory: Trajectory) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _rotation(trajectory: Trajectory) -> np.ndarray:
+    """Return the end-effector's rotation: of the plane an angle (n,), of space vectors (n, 3)."""
+    rotation = trajectory.rotation
+    return rotation[:, 0] if rotation.shape[1] == 1 else rotation
+
+
 def _columns(trajectory: Trajectory) -> list[np.ndarray]:
     """Return the columns of trajectory.csv, see `trajectory_units`."""
     arrays = _of_machine(trajectory)
@@ -90,6 +98,7 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
         trajectory.compliance,
         trajectory.joint_forces[:, trajectory.scene.driven_columns],
         *arrays.values(),
+        trajectory.rotation,
     ]
 
 
@@ -127,7 +136,8 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
         names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
         units |= {f"closure_force_{name}": "N" for name in names}
         units |= {"slider_position": "m"} if scene.closure.kind == "slider" else {}
-    return units
+    ends = [f"_{axis}" for axis in "xyz"] if scene.is_spatial else [""]
+    return units | {f"rotation{end}": "rad" for end in ends}
 
 
 def _directions(scene: Scene) -> str:

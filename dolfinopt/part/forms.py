@@ -216,6 +216,7 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         "mass",
         "deviation",
         "settling",
+        "orientation",
         STRESS,
     ):
         yield "objective", found.objective
@@ -223,6 +224,7 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
     if scene.closure is None or scene.closure.kind != "pin":  # such an end stays where it is
         yield "deviation", found.max_deviation
         yield "settling", motion.settling
+    yield "orientation", motion.max_rotation
     peak, _ = motion.drives
     for name, value in zip(scene.driven, peak[scene.driven_columns], strict=True):
         yield f"drive_peak_{name}", float(value)
@@ -235,7 +237,8 @@ def units_of(scene: Scene, column: Column) -> dict[str, str]:
     """Return the unit of every row."""
     known = {
         "mass": "kg", "first_frequency": "Hz", "objective": objective_of(scene).unit,
-        "compliance": "N m", "deviation": "m", "settling": "m", "closure_force": "N",
+        "compliance": "N m", "deviation": "m", "settling": "m", "orientation": "rad",
+        "closure_force": "N",
         STRESS: "Pa",
     }  # fmt: skip
     drives = {f"drive_peak_{name}": unit for name, unit in drive_units(scene).items()}

@@ -121,7 +121,11 @@ HISTORY = {
 }
 SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
 # Units of constraints in pictures: ending of the label, its replacement, factor.
-DRAWN = ((" [m]", " [mm]", MILLI), (" [Pa]", " [MPa]", 1e-6))
+DRAWN = (
+    (" [m]", " [mm]", MILLI),
+    (" [rad]", " [mrad]", MILLI),
+    (" [Pa]", " [MPa]", 1e-6),
+)
 
 
 def _drawn(constraint: str) -> tuple[str, float]:

@@ -127,10 +127,10 @@ class MotionResponse(Response):
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
 
         With the equivalent static loads K q_j held, a change of stiffness gives
-        dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j.
+        dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j, which joints of a loop follow.
         """
         cases = self.load_cases(trajectory)
-        by_q = self.derivatives(trajectory, cases)[0][:, trajectory.problem.elastic_columns]
+        by_q = trajectory.by_elastic(cases.indices, self.derivatives(trajectory, cases)[0])
         mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
         return [
             np.linalg.solve(body.K, by_q[:, part].T) @ q[:, part]
@@ -304,8 +304,11 @@ class Deviation(MotionResponse):
 
     def _mean(self, trajectory: Trajectory, cases: LoadCases) -> tuple[float, np.ndarray]:
         weights = cases.weights / cases.weights.sum()
-        deviation = trajectory.deviation[cases.indices]
-        return p_norm_of_lengths(deviation, self.options.exponent, weights)
+        vectors = self._vectors(trajectory)[cases.indices]
+        return p_norm_of_lengths(vectors, self.options.exponent, weights)
+
+    def _vectors(self, trajectory: Trajectory) -> np.ndarray:
+        return trajectory.deviation
 
 
 # -- deviation of the end-effector at rest: after the motion and in its dwells --------------------
@@ -326,6 +329,34 @@ class Settling(Deviation):
     def extreme(self, trajectory: Trajectory) -> float:
         """Return the largest of these deviations, m."""
         return trajectory.settling
+
+
+# -- rotation of the end-effector against that of rigid links ------------------------------------
+
+
+@register
+class Orientation(Deviation):
+    """(1/T int |theta|^p dt)^(1/p), rad: close to the end-effector's largest rotation, and smooth.
+
+    theta = log(R R_0') takes its orientation with rigid links to the one that it has.
+    """
+
+    name, label, unit = "orientation", "p-mean of the end-effector's rotation", "rad"
+
+    def extreme(self, trajectory: Trajectory) -> float:
+        """Return the largest rotation of all instants, rad."""
+        return trajectory.max_rotation
+
+    def derivatives(
+        self, trajectory: Trajectory, cases: LoadCases
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return its derivatives; they are along theta, where a spin changes theta by itself."""
+        _, by_rotation = self._mean(trajectory, cases)
+        no_force = np.zeros_like(trajectory.deviation[cases.indices])
+        return trajectory.by_end_effector(cases.indices, no_force, by_rotation)
+
+    def _vectors(self, trajectory: Trajectory) -> np.ndarray:
+        return trajectory.rotation
 
 
 # -- compliance over the whole horizon -----------------------------------------------------------

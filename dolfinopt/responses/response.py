@@ -188,7 +188,8 @@ LIMITED = {"compliance": "load_case_compliance"}
 # Files of responses whose names are not theirs.
 FILES = {
     **dict.fromkeys(
-        ("compliance", "deviation", "esl", "load_case_compliance", "settling"), "motion"
+        ("compliance", "deviation", "esl", "load_case_compliance", "orientation", "settling"),
+        "motion",
     ),
     **dict.fromkeys(("effort", "peak_force"), "drives"),
     **dict.fromkeys(("eigenfrequency", "first_frequency"), "frequency"),

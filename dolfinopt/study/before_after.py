@@ -77,15 +77,16 @@ def before_after(before: Summary, after: Summary) -> Table:
 def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
     """Yield name, value and unit."""
 
-    def millimetres(key: str) -> float | None:
-        return None if summary.get(key) is None else MM * summary[key]
+    def thousandths(key: str) -> float | None:
+        return None if summary.get(key) is None else 1e3 * summary[key]
 
     links = summary["first_frequency"]
     yield "mass of all arms", sum(summary["mass"].values()), "kg"
     for link in links:
         yield f"mass of {link}", summary["mass"][link], "kg"
-    yield "largest tool deflection", millimetres("max_deviation"), "mm"
-    yield "deflection at rest", millimetres("settling"), "mm"
+    yield "largest tool deflection", thousandths("max_deviation"), "mm"
+    yield "largest tool rotation", thousandths("max_rotation"), "mrad"
+    yield "deflection at rest", thousandths("settling"), "mm"
     for link, frequency in links.items():
         yield f"first frequency of {link}", frequency, "Hz"
     joints = {one["name"]: one["type"] for one in summary["scene"].get("joints", ())}

@@ -78,7 +78,8 @@ def test_trajectory_files(optimised):
     assert set(units) == set(shapes) - {"units"}
     columns = {"q_r": 3, "q_e": 8, "deviation": 2, "compliance": 2, "joint_forces": 3}
     columns |= {"initial_deviation": 2}
-    assert shapes == {k: (601, n) for k, n in columns.items()} | {"t": (601,), "units": (7,)}
+    shaped = {k: (601, n) for k, n in columns.items()} | {"t": (601,), "rotation": (601,)}
+    assert shapes == shaped | {"units": (8,)}
     lines = (optimised / "trajectory.csv").read_text().splitlines()
     assert lines[0].startswith("t,deviation_x,deviation_y,deviation,compliance,q_r_cart,")
     table = np.genfromtxt(optimised / "trajectory.csv", delimiter=",", names=True)

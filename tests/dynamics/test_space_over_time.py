@@ -10,7 +10,7 @@ from spatial_beams import DURATION, quintic_motion, reference_chain
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.end_effector import deviation
+from dolfinopt.multibody.end_effector import deviation, end_rotation
 from dolfinopt.multibody.mechanism import Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.paths.time_laws import quintic
@@ -51,6 +51,13 @@ def test_plane_machine_in_space(controlled):
         rates = [y, expected.sample(t, 1), expected.sample(t, 2)]
         forces = [one.at(t).forces(*rates) for one in systems]
         assert np.abs(forces[1] - forces[0]).max() < 1e-11 * np.abs(forces[0]).max()
+    else:  # the end-effector turns about z by the plane's angle
+        motions = plane_motion(t), posed_motion(plane_motion(t))
+        turns = [
+            end_rotation(one.mechanism, motion, y, motion)
+            for one, motion in zip(systems, motions, strict=True)
+        ]
+        assert np.abs(turns[1] - turns[0] * [0.0, 0.0, 1.0]).max() < 1e-14 < np.abs(turns[0]).max()
 
 
 def test_chain_of_beams():

@@ -24,6 +24,7 @@ from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
     end_effector_gradient,
+    end_rotation,
     interface_place,
     place_gradient,
 )
@@ -180,13 +181,18 @@ def test_end_effector(machine: Machine) -> None:
     stiff = end_effector(mechanism, motion, 0.0 * q)
     assert_close(deviation(mechanism, motion, q), place - stiff, 1e-14, np.abs(place).max())
     assert not deviation(mechanism, motion, 0.0 * q).any()
-    weights = rng.normal(size=place.shape)
-    by_q, by_rigid, by_bodies = end_effector_gradient(mechanism, motion, q, weights)
+    assert not end_rotation(mechanism, motion, 0.0 * q, motion).any()
+    weights, turned = rng.normal(size=place.shape), end_rotation(mechanism, motion, q, motion)
+    by_q, by_rigid, by_bodies = end_effector_gradient(mechanism, motion, q, weights, turned)
     step, turn = rng.normal(size=q.shape), rng.normal(size=motion.q.shape)
+
+    def worth(one: Any, moved: RigidMotion, q: np.ndarray) -> float:
+        squares = end_rotation(one, moved, q, motion) ** 2
+        return float(np.sum(weights * end_effector(one, moved, q)) + 0.5 * squares.sum())
 
     def along(h: float) -> float:
         moved = RigidMotion(motion.q + h * turn, motion.qd, motion.qdd)
-        return float(np.sum(weights * end_effector(mechanism, moved, q + h * step)))
+        return worth(mechanism, moved, q + h * step)
 
     expected = np.sum(by_q * step) + np.sum(by_rigid * turn)
     assert_close(expected, derivative(along), DIFFERENCES, 10.0)
@@ -197,8 +203,7 @@ def test_end_effector(machine: Machine) -> None:
             change = change_of(rng, body, name)
 
             def moved(h: float, i: int = i, name: str = name, x: np.ndarray = change) -> float:
-                one = changed(mechanism, i, name, h * x)
-                return float(np.sum(weights * end_effector(one, motion, q)))
+                return worth(changed(mechanism, i, name, h * x), motion, q)
 
             assert_close(np.sum(gradient * change), derivative(moved), DIFFERENCES, 10.0)
 

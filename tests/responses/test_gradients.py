@@ -118,7 +118,7 @@ COMPLIANCE, DEVIATION, STRESS = (
     f"objective.kind={kind}" for kind in ("compliance", "deviation", "stress")
 )
 EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
-SETTLING = "objective.kind=settling"
+SETTLING, ORIENTATION = "objective.kind=settling", "objective.kind=orientation"
 IN_STROKES = ("motion.path=joints", "motion.file='FOLDER/strokes.csv'")
 STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
@@ -130,6 +130,11 @@ TWO = (
     f'scenarios=[{{changes=[{MATERIAL}, "damping.stiffness_proportional=1e-3"]}}, '
     '{changes=["motion.flattening=0.5", "motion.horizon=2.5", "payload.mass=8"], weight=0.3}]'
 )
+TWO_IN_SPACE = (
+    'scenarios=[{changes=["payload.mass=2"]}, '
+    '{changes=["material.young_modulus=60e9", "material.density=2500.0"], weight=2.0}]'
+)
+HELD = "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}"
 REPEATED = (
     "arms.cells=[40,4]", "arms.passive=0.05", "arms.arm2.pattern=arm1", "arms.arm2.length=0.8",
     "arms.arm2.height=0.045", "arms.arm2.thickness=0.012", "arms.symmetric=true",
@@ -228,10 +233,8 @@ CASES = [
     case("pin", slow=True),
     case("pin", *EFFORT, slow=True),
     # Space.
-    case("space", DEVIATION, 'scenarios=[{changes=["payload.mass=2"]}, {changes=['
-         '"material.young_modulus=60e9", "material.density=2500.0"], weight=2.0}]', slow=True),
-    case("space", "objective.kind=effort", "constraints.deviation=0.1",
-         "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}", slow=True),
+    case("space", DEVIATION, TWO_IN_SPACE, slow=True),
+    case("space", "objective.kind=effort", "constraints.deviation=0.1", HELD, slow=True),
     case("space", STRESS, BENT, slow=True),
     case("space", "objective.kind=tip_deflection", slow=True),
     case("space", FREQUENCY, slow=True),
@@ -244,8 +247,14 @@ CASES = [
     case("space", SETTLING, "motion.path=joints", "motion.file='FOLDER/spatial.csv'",
          "motion.duration=0.5", "motion.horizon=0.6", slow=True),
     case("space", SETTLING, "motion.dwells=[[0.1,0.2]]", "constraints.settling_after=0.02",
-         "motion.horizon=0.7",
-         "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}", slow=True),
+         "motion.horizon=0.7", HELD, slow=True),
+    # Orientation of the end-effector.
+    case("two_arm", ORIENTATION, BENT, *LOADED),
+    case("controlled", ORIENTATION, GRAVITY),
+    case("slider", ORIENTATION, GRAVITY),
+    case("pin", ORIENTATION, slow=True),
+    case("fork", ORIENTATION),
+    case("space", ORIENTATION, TWO_IN_SPACE, HELD, slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
       for kind in NEEDS for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),

@@ -48,7 +48,7 @@ def test_deviation_of_the_demo(folder):
 def test_files_in_space(folder):
     with np.load(folder / "trajectory.npz") as found:
         assert found["q_r"].shape == found["joint_forces"].shape == (301, 3)
-        assert found["deviation"].shape == (301, 3)
+        assert found["deviation"].shape == found["rotation"].shape == (301, 3)
         assert found["q_r"][-1] == pytest.approx([1.6, 1.1, -0.5])
         deviation = found["deviation"]
     table = np.genfromtxt(folder / "trajectory.csv", delimiter=",", names=True)

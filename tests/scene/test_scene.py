@@ -330,6 +330,7 @@ BAD_VALUES = [
     ("motion.dwells", [0.5, [0.5, 0.7]], "true or false | an array of arrays of two numbers"),
     ("motion.dwells", [[[0.5, 0.4]], [[0.5, 0.7], [0.6, 0.8]]], "start before end, one after"),
     ("motion.dwells", [[[2.5, 3.5]]], "dwells that end by motion.horizon = 3 [s]"),
+    ("constraints.orientation", [-1e-3, 0.0, "small", 4], "a number >= 1e-15 and <= 3.14159265359"),
     ("constraints.settling_after", [1.2], "at most 1.1 [s], from motion.duration = 1.9"),
     ("motion.horizon", [1.0], "at least motion.duration = 1.9 [s]"),
     ("motion.acceleration_share", [0.3], '0.25, the default, with motion.law = "quintic"'),

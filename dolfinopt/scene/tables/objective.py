@@ -19,6 +19,7 @@ ObjectiveKind = Literal[
     "compliance",
     "deviation",
     "settling",
+    "orientation",
     "stress",
     "mass",
     "effort",
@@ -296,6 +297,7 @@ class Objective(Table):
 Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
 Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
+Angle = Annotated[float, Field(ge=1e-15, le=math.pi)]  # rad
 Delay = Annotated[float, Field(ge=0, le=1e5)]  # s
 Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
@@ -330,6 +332,11 @@ class Constraints(Table):
     settling_after: Delay = Field(
         default=0.0,
         description="time from the beginning of each rest after which settling counts [s]",
+    )
+    orientation: Angle | None = Field(
+        default=None,
+        description="upper limit of the largest rotation of the end-effector against that of "
+        "rigid links [rad]",
     )
     stress: Pressure | None = Field(
         default=None,
@@ -422,6 +429,7 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "compliance": MOTION,
     "deviation": MOTION,
     "settling": MOTION,
+    "orientation": MOTION,
     "stress": MOTION,
     "static": STATICS,
     "eigenfrequency": VIBRATION,
