@@ -152,7 +152,7 @@ class UnitLoads:
                 forces = forces[:, :, :inertial]
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
-        found = GeometricGradient(self, by_V, direct, adjoint, by_stiffness, face)
+        found = GeometricGradient(self, V, by_K0, by_V, direct, adjoint, by_stiffness, face)
         if self.modes is None:
             return found
         return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
@@ -167,7 +167,7 @@ class UnitLoads:
             adjoint: (n_nodes, d, k) of the first fields.
         """
         known, arm = self._last.get("modes"), self.arm
-        if known is not None and known[0] is V and arm.weighed is None:
+        if known is not None and known[0] is V:
             arm.profile.counts.energy_fields += left.shape[2] + adjoint.shape[2]
             return known[1].stiffness_products(left, adjoint)
         fields = self.fields[:, :, : adjoint.shape[2]]
@@ -181,6 +181,7 @@ class GeometricGradient:
 
     Attributes:
         loads: whose stress it is.
+        modes, by_K0: (n_nodes, d, q) and (p, q, q), as given.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         direct: (n_cells,) by Young's modulus, modes and fields held.
         adjoint: (n_nodes, d, k) of the fields of the first k loads.
@@ -190,6 +191,8 @@ class GeometricGradient:
     """
 
     loads: UnitLoads
+    modes: np.ndarray
+    by_K0: np.ndarray
     by_modes: np.ndarray
     direct: np.ndarray
     adjoint: np.ndarray
@@ -210,6 +213,13 @@ class GeometricGradient:
         """By Young's modulus (n_cells,), modes held."""
         fields = self.loads.fields[:, :, : self.adjoint.shape[2]]
         return self.direct - self.loads.arm.cell_stiffness_products(self.adjoint, fields)
+
+    @property
+    def stiffness(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Fields l and r of l . dK r, modes held, but for what stiffens the cells themselves."""
+        every = self.loads.fields
+        pairs = [(-self.adjoint, every[:, :, : self.adjoint.shape[2]])]
+        return pairs if self.face is None else [*pairs, (self.face, every)]
 
     @cached_property
     def _by_loads(self) -> np.ndarray:

@@ -218,6 +218,14 @@ def rigid_motions(points: np.ndarray) -> np.ndarray:
     return motions
 
 
+def by_rigid_motions(by: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n, d) by the points, given those by their `rigid_motions`."""
+    if by.shape[1] == 2:
+        return np.stack([by[:, 1, 2], -by[:, 0, 2]], axis=1)
+    # e_k x X . b = X . (b x e_k)
+    return np.sum([np.cross(by[:, :, 3 + k], np.eye(3)[k]) for k in range(3)], axis=0)
+
+
 def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
     """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
     # The narrower one; on the grid of a slender arm the first, row by row across it, which is half

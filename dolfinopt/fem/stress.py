@@ -172,8 +172,8 @@ class LoadFields:
         weighted = arm.mass_times(mu)
         return ElasticFieldGradient(
             by_modes=moved_transposed(weighted),
-            by_young=-arm.cell_stiffness_products(mu, self.elastic),
-            by_density=arm.cell_mass_products(mu, moved(self.V)),
+            stiffness=(-mu, self.elastic),
+            mass=(mu, moved(self.V)),
         )
 
 
@@ -183,12 +183,12 @@ class ElasticFieldGradient:
 
     Attributes:
         by_modes: (n_nodes, d, q), contributions of this rank's cells.
-        by_young, by_density: (n_cells,) modes held.
+        stiffness, mass: fields l and r of l . dK r and l . dM r, modes held.
     """
 
     by_modes: np.ndarray
-    by_young: np.ndarray
-    by_density: np.ndarray
+    stiffness: tuple[np.ndarray, np.ndarray]
+    mass: tuple[np.ndarray, np.ndarray]
 
 
 def load_fields(loads: UnitLoads, V: np.ndarray, MV: np.ndarray) -> LoadFields:

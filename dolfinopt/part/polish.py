@@ -32,7 +32,6 @@ from dolfinopt.responses.constraints import EXCESS, limits_of
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 
-LINEAR = {"law": "simp", "penalty": 1.0}  # of added material: all it weighs, all its stiffness
 MOVE = 0.1  # of the outline in the first step, cells of the design
 SPIKE = 2.0  # largest move over that of nine of ten
 HALVINGS = 3  # of a step that does not pay
@@ -149,7 +148,7 @@ def _evaluated(
     scene: Scene, parts: Mapping[int, Part], meshes: Mapping[int, BodyMesh]
 ) -> tuple[Simulated, float, float]:
     """Return the simulated machine, its objective, least best, and the worst limit's excess."""
-    state = simulate_bodies(scene, parts, meshes, interpolation=LINEAR, objective=_exact(scene))
+    state = simulate_bodies(scene, parts, meshes, objective=_exact(scene))
     limits = [
         one for one in limits_of(state.scene, state.evaluation) if one.quantity != "volume_fraction"
     ]

@@ -13,6 +13,8 @@ from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.geometric_stiffness import static_response
+from dolfinopt.fem.stress import element_centres
+from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
@@ -27,6 +29,7 @@ from dolfinopt.responses.measured import (
     NEGLIGIBLE_POWER_SHARE,
     P_MEAN_STRIDE,
 )
+from dolfinopt.responses.products import By, Products, StressProduct
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -309,14 +312,17 @@ class Stress(Response):
                 parts[k] = _gradient_of_arm(analysis.partition, found, chosen, found.cells[k], p)
         if self.options.gradient == "esl":
             with together(analysis.partition.world):
-                return [{k: _esl_gradient(one, found.cells[k]) for k, one in parts.items()}]
+                return [
+                    {k: _esl_gradient(one, found.cells[k], analysis.by) for k, one in parts.items()}
+                ]
         by_body = _by_bodies(analysis, parts)
         with together(analysis.partition.world):
             row = {}
             for k, one in parts.items():
                 state, cotangents = found.cells[k].state, by_body[k]
                 columns = found.cells[k].by_columns(one.by_A)
-                row[k] = one.by_x + exact_gradient(state, cotangents, columns)
+                beside = one.beside(found.cells[k])
+                row[k] = exact_gradient(state, cotangents, columns, analysis.by, beside)
             return [row]
 
     def _found(self, analysis: Analysis) -> _Found:
@@ -385,7 +391,8 @@ def _screened(
         coarse = every(len(one.coefficients))
         screened = screen(partition.comm, cells.A, one.coefficients, coarse)
         largest = max(largest, screened.largest)
-        found.append(_Chosen(one, coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]))
+        instants, values = coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]
+        found.append(_Chosen(one, instants, values, len(instants)))
     return found, largest
 
 
@@ -397,11 +404,13 @@ class _Chosen:
         loads: of all instants.
         instants: (k,) of them.
         values: (k,) largest stress of the arm there, Pa.
+        count: of the instants among which they were chosen.
     """
 
     loads: ArmLoads
     instants: np.ndarray
     values: np.ndarray
+    count: int
 
     @property
     def a(self) -> np.ndarray:
@@ -411,7 +420,7 @@ class _Chosen:
     def above(self, limit: float) -> _Chosen:
         """Return those whose stress is not smaller."""
         kept = self.values >= limit
-        return _Chosen(self.loads, self.instants[kept], self.values[kept])
+        return _Chosen(self.loads, self.instants[kept], self.values[kept], self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,12 +452,24 @@ class _ArmGradient:
         chosen: which.
         by_A: (3, n_cells, m) by the stress of the columns at full density.
         by_x: (n_cells,) strains held.
+        by_weight: (n_cells,) by the weights, see `CellStress`.
     """
 
     by_loads: Sequence[np.ndarray]
     chosen: Sequence[_Chosen]
     by_A: np.ndarray
     by_x: np.ndarray
+    by_weight: np.ndarray
+
+    def beside(self, cells: CellStress) -> Products:
+        """Return what it is made of beside the loads and their fields."""
+        state = cells.state
+        stress = StressProduct(
+            element_centres(compat.cell_corner_count(state.mesh.mesh), state.mesh.dim),
+            state.solid.young_modulus * self.by_A,
+            state.load_fields.columns,
+        )
+        return Products(densities=self.by_x, volumes=self.by_weight, stress=stress)
 
 
 def _gradient_of_arm(
@@ -456,7 +477,7 @@ def _gradient_of_arm(
 ) -> _ArmGradient:
     """Differentiate by what one arm's stress is made of (collective on the arm's ranks)."""
     by_loads, by_A = [], np.zeros_like(cells.A)
-    by_x = np.zeros_like(cells.weights)
+    by_x, by_weight = np.zeros((2, len(cells.weights)))
     factor = 0.0
     if found.total:
         factor = float(found.total ** (1.0 / p - 1.0) * found.weight ** (-1.0 / p))
@@ -469,7 +490,14 @@ def _gradient_of_arm(
             by_loads.append(factor * partition.comm.allreduce(by_a))
             by_A += factor * more
             by_x += factor * by
-    return _ArmGradient(by_loads, chosen, by_A, by_x)
+    if found.total:
+        # Of total / weight, to the power 1 / p: a cell's part in either is its weight times a sum.
+        counts = cells.weights > 0.0
+        powers = 2.0 * cells.state.x_phys * by_x
+        np.divide(powers, cells.weights, out=by_weight, where=counts)
+        by_weight -= found.smooth / found.weight * sum(one.count for one in chosen)
+        by_weight *= counts / p
+    return _ArmGradient(by_loads, chosen, by_A, by_x, by_weight)
 
 
 def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[int, ShapeIntegrals]:
@@ -506,15 +534,15 @@ def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[in
     return by_body
 
 
-def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
-    """Return the derivative by x_phys of one arm, all loads of its instants frozen (n_cells,)."""
+def _esl_gradient(part: _ArmGradient, cells: CellStress, by: By) -> np.ndarray:
+    """Return the derivative by the design of one arm, all loads of its instants frozen."""
     # With K u_n = f_n held, dJ = dJ/dx - sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n: as many
     # solves as the loads have directions.
     state = cells.state
     arm, fields = state.elastic, state.load_fields.columns
-    a = np.concatenate([one.a for one in part.chosen])
+    a, beside = np.concatenate([one.a for one in part.chosen]), part.beside(cells)
     if not len(a):
-        return part.by_x
+        return by(state, beside)
     scale = np.sqrt(np.square(cells.A).sum(axis=0).max(axis=0, initial=0.0))
     if arm.comm.size > 1:
         scale = np.max(arm.comm.allgather(scale), axis=0)
@@ -529,7 +557,7 @@ def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
     left = combine(fields, (kept / scale).T)
     with arm.profile.phase("gradient"):
         adjoint = static_response(arm, *arm.restrict(right))
-        return part.by_x - state.young_slope * arm.cell_stiffness_products(adjoint, left)
+        return by(state, replace(beside, stiffness=((-adjoint, left),)))
 
 
 # -- the largest of very many lengths |A_e a_n| over points e and instants n, looking at few
