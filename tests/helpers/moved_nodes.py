@@ -140,8 +140,9 @@ def node_test(
     parts = {}
     for k, arm in built.arms.items():
         mesh = arm.mesh
+        owned = mesh.mesh.geometry.index_map().size_local
         direction = moves(mesh.name, regular[mesh.name])
-        parts[k] = np.array(size * np.sum(found[k] * direction))
+        parts[k] = np.array(size * np.sum(found[k][:owned] * direction[:owned]))
     slope = float(sum_over_arms(built.partition, parts))
     response = objective_of(scene)
     fixed = scene

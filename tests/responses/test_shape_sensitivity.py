@@ -1,0 +1,121 @@
+"""Gradients by the places of nodes: remainders of second order, a closed form, on any ranks.
+
+The reference is the whole program on meshes whose nodes are moved.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from moved_nodes import built_with, node_test
+from remainders import wave
+from runs import ROOT
+
+import dolfinopt as do
+from dolfinopt.responses.evaluation import gradient
+from dolfinopt.responses.shape_sensitivity import by_nodes
+
+WORLD = MPI.COMM_WORLD
+ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
+TRIANGLES = ("arms.mesh='FOLDER/bar.geo'", "arms.cell_shape=triangle")
+QUADRILATERALS = ("arms.cells=[12,2]",)
+SHORT = ("arms.passive=0", "design.filter_radius=0", "motion.horizon=2.2", *ROUGHLY)
+LINK = ("arms.link1.cells=[5,1,1]", "arms.link2.cells=[5,1,1]", "arms.passive=0.06",
+        "objective.load_cases=6", "design.filter_radius=0", *ROUGHLY)  # fmt: skip
+# Quadratic unless a case says otherwise; the outlines of tests/responses/test_gradients.py's bars.
+BAR = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
+Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
+Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
+Transfinite Curve {1, 3} = CELLS; Transfinite Curve {2, 4} = 3; Transfinite Surface {1};
+Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
+"""
+BASES = {  # scene, what makes it small, size of a move (m), whether boxes are cut into tetrahedra
+    "triangles": ("two_arm", (*SHORT, *TRIANGLES), 0.015, False),
+    "controlled": ("controlled_two_arm", (*SHORT, *TRIANGLES), 0.015, False),
+    "quadrilaterals": ("two_arm", (*SHORT, *QUADRILATERALS), 0.015, False),
+    "tetrahedra": ("spatial_arm", LINK, 0.01, True),
+    "hexahedra": ("spatial_arm", LINK, 0.01, False),
+}
+BENT, LINEAR = "simulation.stiffening=true", "simulation.stiffening=false"
+GRAVITY = "motion.gravity=[0.5,-9.81]"
+KEPT = "constraints.compliance=1e6"  # N m; far away
+MODAL, KRYLOV = "reduction.method=modal", ("reduction.method=krylov", "reduction.coordinates=8")
+MATERIAL = '"material.density=3100.0", "material.young_modulus=50e9"'
+TWO = f'scenarios=[{{changes=[{MATERIAL}]}}, {{changes=["payload.mass=8"], weight=0.3}}]'
+CONTROL = "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}"
+
+
+def case(base: str, kind: str, *changes: str, ranks: bool = False, slow: bool = False):
+    marks = [*[pytest.mark.slow] * slow, *[pytest.mark.serial] * (not ranks)]
+    told = (f"objective.kind={kind}", *changes)
+    return pytest.param(base, told, marks=marks, id=" ".join((base, kind, *changes)))
+
+
+CASES = [
+    case("triangles", "mass", KEPT, ranks=True),
+    case("triangles", "static", ranks=True),
+    case("triangles", "tip_deflection"),
+    case("triangles", "eigenfrequency", "payload.inertia=0.4", ranks=True),
+    case("triangles", "esl", LINEAR),
+    case("triangles", "compliance", LINEAR, GRAVITY, "payload.inertia=0.05", ranks=True),
+    case("triangles", "compliance", BENT, GRAVITY, ranks=True),
+    case("triangles", "compliance", LINEAR, "arms.arm2.design=arm1"),
+    case("triangles", "compliance", BENT, *KRYLOV),
+    case("triangles", "compliance", LINEAR, TWO),
+    case("triangles", "deviation", LINEAR, GRAVITY),
+    case("triangles", "deviation", BENT, "reduction.coordinates=6"),
+    case("triangles", "settling", LINEAR),
+    case("triangles", "effort", KEPT, LINEAR),
+    case("triangles", "peak_force", KEPT, BENT),
+    case("triangles", "stress", LINEAR, "objective.stress_margin=0.1"),
+    case("triangles", "stress", BENT, MODAL, GRAVITY),
+    case("controlled", "esl", LINEAR),
+    case("controlled", "deviation", BENT),
+    case("controlled", "settling", BENT, slow=True),
+    case("controlled", "effort", KEPT, BENT),
+    case("controlled", "stress", BENT, slow=True),
+    *(case("quadrilaterals", "compliance", f"arms.element={name}", BENT)
+      for name in ("incompatible", "linear", "quadratic")),
+    case("quadrilaterals", "mass", KEPT, LINEAR),
+    case("quadrilaterals", "stress", BENT),
+    case("tetrahedra", "mass", KEPT),
+    case("tetrahedra", "static"),
+    case("tetrahedra", "eigenfrequency"),
+    case("tetrahedra", "compliance", LINEAR),
+    case("tetrahedra", "deviation", BENT, slow=True),
+    case("tetrahedra", "settling", LINEAR, "motion.dwells=[[0.1,0.2]]", slow=True),
+    case("tetrahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
+    case("tetrahedra", "stress", BENT, slow=True),
+    case("hexahedra", "mass", KEPT),
+    case("hexahedra", "static"),
+    case("hexahedra", "compliance", LINEAR),
+    case("hexahedra", "deviation", BENT, slow=True),
+    case("hexahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
+    case("hexahedra", "stress", BENT, slow=True),
+]  # fmt: skip
+
+
+def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12) -> do.Scene:
+    """Return a scene of `BASES` with keys changed, FOLDER standing for the files' one."""
+    if WORLD.rank == 0:
+        (folder / "bar.geo").write_text(BAR.replace("CELLS", str(cells + 1)))
+    WORLD.barrier()
+    name, quick, _, _ = BASES[base]
+    told = [one.replace("FOLDER", str(folder)) for one in (*quick, *changes)]
+    return do.load_scene(ROOT / "demos" / f"{name}.toml", told)
+
+
+@pytest.mark.parametrize(("base", "changes"), CASES)
+def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypatch) -> None:
+    """Along random moves of all nodes of uneven meshes but those of outboard interfaces."""
+    # Instants that come and go beneath the cut would make small steps of the p-mean.
+    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    scene = scene_of(base, changes, shared_tmp_path)
+    _, _, size, cut = BASES[base]
+    # The margin of cells near the interfaces moves with the nodes: none may come or go.
+    found = node_test(scene, wave, size, cut=cut)
+    assert found.slope != 0.0
+    assert found.rate == pytest.approx(2.0, abs=0.1)
