@@ -48,6 +48,9 @@ class Products:
         mass: pairs of l . dM r.
         geometric: of K0, whose modes are the right fields of the first pair of `stiffness`.
         places: (n_nodes, d) field p by which the nodes are felt as lever arms: p . M dX; None: 0.
+        interfaces: returns the derivatives by the rigid motions of the outboard interfaces' nodes
+            (n_nodes, d, b), in which all fields move them, and by these nodes as other lever arms
+            (n_nodes, d); contributions of this rank's cells; None: 0.
         densities: (n_cells,) by the physical densities otherwise than by K and M; None: 0.
         volumes: (n_cells,) by the cells' areas, in space volumes, likewise; None: 0.
         stress: of stress, whose operator depends on the cells' shape.
@@ -57,6 +60,7 @@ class Products:
     mass: tuple[Pair, ...] = ()
     geometric: GeometricGradient | None = None
     places: np.ndarray | None = None
+    interfaces: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
     densities: np.ndarray | None = None
     volumes: np.ndarray | None = None
     stress: StressProduct | None = None

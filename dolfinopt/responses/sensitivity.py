@@ -6,7 +6,9 @@ are made as well.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
+from dolfinopt.fem.stress import ElasticFieldGradient
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
@@ -22,7 +25,7 @@ from dolfinopt.multibody.shape_integrals import (
     mass_partners,
     rigid_body,
 )
-from dolfinopt.reduction import METHODS, by_frame_fields, frame_fields
+from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
 from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
 from dolfinopt.responses.products import By, Pair, Products, by_densities
 from dolfinopt.responses.response import p_norm_of_lengths
@@ -48,7 +51,8 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_densities) -> np
         keep = values > LOAD_CASES_RANK_SHARE * values[0]
         V = state.basis.V
         pair = combine(V, left[:, keep] * -values[keep]), combine(V, right[keep].T)
-        return by(state, Products(stiffness=(pair,)))
+        interfaces = partial(pairs_at_interfaces, state.elastic, (pair,))
+        return by(state, Products(stiffness=(pair,), interfaces=interfaces))
 
 
 def exact_gradient(
@@ -123,6 +127,7 @@ def _body_products(
         places = places + geometric.by_inertia[:, :, 1]
         if cotangents.is_stiffened:
             partners.left[:, :, 1:-1] += geometric.by_modal_inertia
+    interfaces = partial(_at_interfaces, state, by_V, fields, geometric, inertial)
     stiffness: list[Pair] = [(combine(V, by_K.T) - fields.stiffness, V)]
     mass: list[Pair] = [(partners.left, partners.right)]
     if fields.frame is not None:
@@ -131,7 +136,63 @@ def _body_products(
     if inertial is not None:
         stiffness.append(inertial.stiffness)
         mass.append(inertial.mass)
-    return Products(tuple(stiffness), tuple(mass), geometric, places)
+    return Products(tuple(stiffness), tuple(mass), geometric, places, interfaces)
+
+
+def _at_interfaces(
+    state: DesignState,
+    by_V: np.ndarray,
+    fields: AdjointFields,
+    geometric: GeometricGradient | None,
+    inertial: ElasticFieldGradient | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `Products.interfaces` does of a function of a body (collective).
+
+    Modes and all other fields are T times what they are solved for, and so are their adjoints; what
+    either are multiplied by in the Lagrangian, T aside, is zero within T's range alone.
+    """
+    elastic, basis = state.elastic, state.basis
+    T, V = elastic.substructure.T, basis.V
+    by_V = by_V - elastic.stiffness_times(fields.stiffness) + elastic.mass_times(fields.mass)
+    if geometric is not None:
+        by_S = geometric.by_stiffness + geometric.by_stiffness.T  # see `_body_products`
+        b = len(by_S)
+        by_V[:, :, :b] += elastic.stiffness_times(combine(V[:, :, :b], by_S))
+        if geometric.face is not None:
+            by_V -= geometric.face.by_modes  # the rotations are coordinates, whatever T
+    rigid = by_V @ basis.outboard.T
+    rigid -= elastic.stiffness_times(V) @ T.coordinates(fields.stiffness).T
+    rigid += basis.MV @ T.coordinates(fields.mass).T
+    if fields.frame is not None:
+        weighted = elastic.mass_times(frame_fields(elastic))
+        rigid += weighted @ T.coordinates(fields.frame).T
+    levers = np.zeros_like(elastic.points)
+    if geometric is not None:
+        more, levers = geometric.at_interfaces()
+        rigid += more
+    return rigid if inertial is None else rigid + inertial.at_interfaces(), levers
+
+
+def pairs_at_interfaces(
+    elastic: ElasticArm,
+    stiffness: Sequence[Pair],
+    mass: Sequence[Pair] = (),
+    direct: Sequence[Pair] = (),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `Products.interfaces` does of pairs of fields that T makes (collective).
+
+    Args:
+        elastic: the design.
+        stiffness, mass: as in `Products`.
+        direct: derivatives by nodal values, contributions of this rank's cells, and the field.
+    """
+    T, rigid = elastic.substructure.T, np.zeros_like(elastic.rigid)
+    for by, field in direct:
+        rigid += by @ T.coordinates(field).T
+    for pairs, times in ((stiffness, elastic.stiffness_times), (mass, elastic.mass_times)):
+        for left, right in pairs:
+            rigid += times(left) @ T.coordinates(right).T + times(right) @ T.coordinates(left).T
+    return rigid, np.zeros_like(elastic.points)
 
 
 def _geometric_gradient(
@@ -174,7 +235,9 @@ def _static_gradient(
     fields = state.elastic.static_fields(np.hstack([right, left]))
     with state.elastic.profile.phase("gradient"):
         of_left, of_right = (combine(fields.field, fields.amplitudes(f)) for f in (-left, right))
-        return by(state, Products(stiffness=((of_left, of_right),)))
+        pairs = ((of_left, of_right),)
+        interfaces = partial(pairs_at_interfaces, state.elastic, pairs)
+        return by(state, Products(stiffness=pairs, interfaces=interfaces))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +263,9 @@ def period_gradient(
     """
     with state.elastic.profile.phase("gradient"):
         weighted = modes.field * by_values
-        of_mass = weighted * -modes.values, modes.field
-        own = by(state, Products(stiffness=((weighted, modes.field),), mass=(of_mass,)))
+        pairs = ((weighted, modes.field),), ((weighted * -modes.values, modes.field),)
+        interfaces = partial(pairs_at_interfaces, state.elastic, *pairs)
+        own = by(state, Products(*pairs, interfaces=interfaces))
         carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
         return PeriodGradient(own, carried)
 

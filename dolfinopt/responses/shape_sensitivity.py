@@ -20,10 +20,9 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
     """Return the derivative (n, d) by the places of the nodes of an arm's mesh, per m (collective).
 
     Nodes are those of `mesh.geometry`, corners of cells, ghosts included; nodes on the sides of
-    quadratic cells follow these. Reference points and the physical densities of the cells are held,
-    and so are which cells count as too near to an interface (`objective.stress_margin`), and the
-    coordinates of the outboard interfaces' rigid motion: of nodes there the part by their lever
-    arms is missing.
+    quadratic cells follow these. Interfaces' points of reference and the physical densities of the
+    cells are held, and so is which cells count as too near to an interface
+    (`objective.stress_margin`).
 
     Args:
         state: the design of an arm on this rank.
@@ -45,8 +44,10 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
         by_corners += shape.mass(left, right, elastic.density)
     if (stress := products.stress) is not None:
         by_corners += shape.stress(stress.points, stress.by_stress, stress.fields)
-    found = shape.at_nodes(by_corners)
+    by_points = np.zeros_like(elastic.points)
     if products.places is not None:
-        weighted = elastic.mass_times(products.places[:, :, None])
-        found = found + shape.from_points(weighted[:, :, 0])
-    return shape.total(found)
+        by_points += elastic.mass_times(products.places[:, :, None])[:, :, 0]
+    if products.interfaces is not None:
+        by_rigid, by_levers = products.interfaces()
+        by_points += elastic.substructure.T.by_points(by_rigid) + by_levers
+    return shape.total(shape.at_nodes(by_corners) + shape.from_points(by_points))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -40,7 +41,7 @@ from dolfinopt.responses.response import (
     factors,
     register,
 )
-from dolfinopt.responses.sensitivity import exact_gradient
+from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import NEEDS
 
@@ -557,7 +558,9 @@ def _esl_gradient(part: _ArmGradient, cells: CellStress, by: By) -> np.ndarray:
     left = combine(fields, (kept / scale).T)
     with arm.profile.phase("gradient"):
         adjoint = static_response(arm, *arm.restrict(right))
-        return by(state, replace(beside, stiffness=((-adjoint, left),)))
+        pairs = ((-adjoint, left),)
+        interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((right, left),))
+        return by(state, replace(beside, stiffness=pairs, interfaces=interfaces))
 
 
 # -- the largest of very many lengths |A_e a_n| over points e and instants n, looking at few

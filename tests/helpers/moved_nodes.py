@@ -97,17 +97,6 @@ def noise(arm: str, points: np.ndarray, seed: int = 0) -> np.ndarray:
     return 2.0 * np.modf(np.abs(np.sin(scaled[:, None] + seeds) * 43758.5453))[0] - 1.0
 
 
-def free_noise(scene: Scene, seed: int = 0) -> Moves:
-    """Return `noise` of all nodes but those of outboard interfaces at the far ends."""
-    length = {arm.name: arm.length for arm in scene.arms}
-
-    def moves(arm: str, points: np.ndarray) -> np.ndarray:
-        inside = points[:, :1] < (1.0 - 1e-6) * length[arm]
-        return noise(arm, points, seed) * inside
-
-    return moves
-
-
 def node_test(
     scene: Scene,
     design: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
@@ -124,13 +113,12 @@ def node_test(
         size: of the largest move at a step of 1, m.
         steps: of which the last two tell the rate.
         cut: whether boxes are cut into tetrahedra.
-        moves: a direction of largest entry 1; by default `free_noise`.
+        moves: a direction of largest entry 1; by default `noise` of all nodes.
     """
-    moves = moves or free_noise(scene)
-    uneven = free_noise(scene, seed=7)
+    moves = moves or noise
 
     def places(h: float) -> Moves:
-        return lambda arm, points: size * (0.2 * uneven(arm, points) + h * moves(arm, points))
+        return lambda arm, x: size * (0.2 * noise(arm, x, 7) + h * moves(arm, x))
 
     regular: dict[str, np.ndarray] = {}
     built = built_with(scene, places(0.0), cut, regular)

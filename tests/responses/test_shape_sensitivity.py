@@ -110,7 +110,7 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12)
 
 @pytest.mark.parametrize(("base", "changes"), CASES)
 def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypatch) -> None:
-    """Along random moves of all nodes of uneven meshes but those of outboard interfaces."""
+    """Along random moves of all nodes of uneven meshes, those of interfaces included."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
     scene = scene_of(base, changes, shared_tmp_path)
