@@ -16,10 +16,10 @@ from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.checks import cell_areas, cell_volumes
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.optimization.gradient_check import _at, _with
-from dolfinopt.parallel import sum_over_arms
+from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.motion import MotionResponse
-from dolfinopt.responses.response import objective_of
+from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Arm, Scene
 
@@ -134,7 +134,7 @@ def node_test(
     slope = float(sum_over_arms(built.partition, parts))
     response = objective_of(scene)
     fixed = scene
-    if base is not None:
+    if needs(scene, "motion"):
         fixed = _with(scene, tolerance=min(evaluation.error / AIM, 0.1))
 
     def value(h: float) -> float:
@@ -144,7 +144,9 @@ def node_test(
         other, trajectory = evaluate(*place, x, step.profile, start, simulated=False)
         if not isinstance(response, MotionResponse):
             return other.objective
-        return sum(_at(base, trajectory, part) for _, part in response.parts(scene))
+        parts = response.parts(scene)
+        world = built.partition.world
+        return on_root(world, lambda: sum(_at(base, trajectory, part) for _, part in parts))
 
     here = value(0.0)
     remainders = tuple(abs(value(h) - here - h * slope) for h in steps)

@@ -34,6 +34,7 @@ Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
 BASES = {  # scene, what makes it small, size of a move (m), whether boxes are cut into tetrahedra
     "triangles": ("two_arm", (*SHORT, *TRIANGLES), 0.015, False),
+    "one arm": ("two_arm", (*SHORT, *TRIANGLES, "motion.radius=0.4"), 0.015, False),
     "controlled": ("controlled_two_arm", (*SHORT, *TRIANGLES), 0.015, False),
     "quadrilaterals": ("two_arm", (*SHORT, *QUADRILATERALS), 0.015, False),
     "tetrahedra": ("spatial_arm", LINK, 0.01, True),
@@ -72,6 +73,8 @@ CASES = [
     case("triangles", "peak_force", KEPT, BENT),
     case("triangles", "stress", LINEAR, "objective.stress_margin=0.1"),
     case("triangles", "stress", BENT, MODAL, GRAVITY),
+    case("one arm", "stress", BENT, GRAVITY, ranks=True),
+    case("one arm", "deviation", LINEAR, MODAL, ranks=True),
     case("controlled", "esl", LINEAR),
     case("controlled", "deviation", BENT),
     case("controlled", "settling", BENT, slow=True),
@@ -105,7 +108,11 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12)
     WORLD.barrier()
     name, quick, _, _ = BASES[base]
     told = [one.replace("FOLDER", str(folder)) for one in (*quick, *changes)]
-    return do.load_scene(ROOT / "demos" / f"{name}.toml", told)
+    path = ROOT / "demos" / f"{name}.toml"
+    if base != "one arm":
+        return do.load_scene(path, told)
+    tree = do.load_scene(path).to_tree()
+    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
 
 
 @pytest.mark.parametrize(("base", "changes"), CASES)
@@ -113,9 +120,36 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
     """Along random moves of all nodes of uneven meshes, those of interfaces included."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)  # one arm on two ranks is cut in two
     scene = scene_of(base, changes, shared_tmp_path)
     _, _, size, cut = BASES[base]
     # The margin of cells near the interfaces moves with the nodes: none may come or go.
     found = node_test(scene, wave, size, cut=cut)
     assert found.slope != 0.0
     assert found.rate == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.serial
+def test_height_of_a_bar_bent_by_a_moment(shared_tmp_path) -> None:
+    """Compliance M^2 L / (E t h^3 / 12) and mass: exact in quadratic triangles without nu."""
+    moment, told = 3.0, ("objective.kind=static", "material.poisson_ratio=0.0", KEPT)  # N m
+    scene = scene_of("triangles", (*told, f"objective.loads=[[0,0,{moment}]]"), shared_tmp_path)
+    built = built_with(scene, lambda arm, x: np.zeros_like(x))
+    built.evaluate(built.uniform(1.0))
+    (compliance, mass) = (_along_height(one, built) for one in (scene, _of_mass(scene)))
+    arm, material = scene.arms[0], scene.material
+    bent = moment**2 * arm.length / (material.young_modulus * arm.thickness * arm.height**3 / 12.0)
+    assert compliance == pytest.approx([-3.0 * bent] * 2, rel=1e-8)  # a step of h / h
+    one = material.density * arm.length * arm.height * arm.thickness
+    assert mass == pytest.approx([one] * 2, rel=1e-12)
+
+
+def _of_mass(scene: do.Scene) -> do.Scene:
+    return scene.model_copy(update={"objective": scene.objective.model_copy(update={"kind": "mass"})})
+
+
+def _along_height(scene: do.Scene, built) -> list[float]:
+    """Return the objective's derivative by the relative height of every arm."""
+    found = gradient(scene, built.partition, built.arms, None, built.profile, by=by_nodes)
+    places = {k: arm.mesh.mesh.geometry.x[:, 1] for k, arm in built.arms.items()}
+    return [float(found[k][:, 1] @ y) for k, y in places.items()]
