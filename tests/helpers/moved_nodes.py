@@ -17,9 +17,9 @@ from dolfinopt.mesh.checks import cell_areas, cell_volumes
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.optimization.gradient_check import _at, _with
 from dolfinopt.parallel import on_root, sum_over_arms
-from dolfinopt.responses.evaluation import evaluate, gradient
+from dolfinopt.responses.evaluation import _analysis, evaluate
 from dolfinopt.responses.motion import MotionResponse
-from dolfinopt.responses.response import needs, objective_of
+from dolfinopt.responses.response import Response, needs, objective_of
 from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Arm, Scene
 
@@ -103,9 +103,10 @@ def node_test(
     size: float,
     steps: tuple[float, ...] = (4e-3, 1e-3),
     cut: bool = False,
-    moves: Moves | None = None,
+    moves: Moves = noise,
+    response: Response | None = None,
 ) -> NodeTest:
-    """Test the gradient of a scene's objective by nodes; instants and time steps are held.
+    """Test the gradient of a response by nodes; instants and time steps are held.
 
     Args:
         scene: with objective.gradient = "exact".
@@ -114,8 +115,9 @@ def node_test(
         steps: of which the last two tell the rate.
         cut: whether boxes are cut into tetrahedra.
         moves: a direction of largest entry 1; by default `noise` of all nodes.
+        response: by default the scene's objective.
     """
-    moves = moves or noise
+    response = response or objective_of(scene)
 
     def places(h: float) -> Moves:
         return lambda arm, x: size * (0.2 * noise(arm, x, 7) + h * moves(arm, x))
@@ -124,7 +126,8 @@ def node_test(
     built = built_with(scene, places(0.0), cut, regular)
     x = built.fields(design)
     evaluation, base = built.evaluate(x)
-    found = gradient(scene, built.partition, built.arms, base, built.profile, by=by_nodes)
+    rows = response.gradients(_analysis(scene, built.partition, built.arms, base, built.profile, by_nodes))
+    found = {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in built.arms}
     parts = {}
     for k, arm in built.arms.items():
         mesh = arm.mesh
@@ -132,7 +135,6 @@ def node_test(
         direction = moves(mesh.name, regular[mesh.name])
         parts[k] = np.array(size * np.sum(found[k][:owned] * direction[:owned]))
     slope = float(sum_over_arms(built.partition, parts))
-    response = objective_of(scene)
     fixed = scene
     if needs(scene, "motion"):
         fixed = _with(scene, tolerance=min(evaluation.error / AIM, 0.1))
@@ -141,9 +143,9 @@ def node_test(
         step = built_with(fixed, places(h), cut)
         place = fixed, step.partition, step.arms
         start = () if base is None else base.solutions
-        other, trajectory = evaluate(*place, x, step.profile, start, simulated=False)
+        _, trajectory = evaluate(*place, x, step.profile, start, simulated=False)
         if not isinstance(response, MotionResponse):
-            return other.objective
+            return response.measure(_analysis(*place, trajectory, step.profile)).total
         parts = response.parts(scene)
         world = built.partition.world
         return on_root(world, lambda: sum(_at(base, trajectory, part) for _, part in parts))
