@@ -161,9 +161,7 @@ class UnitLoads:
                 forces = forces[:, :, :inertial]
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
-        found = GeometricGradient(
-            self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face
-        )
+        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face)
         if self.modes is None:
             return found
         return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
@@ -451,9 +449,7 @@ class FaceRotation:
         theta = self._rotations(V)[:, None]
         return (theta.swapaxes(2, 3) @ D @ theta).sum(axis=0)
 
-    def gradient(
-        self, D: np.ndarray, V: np.ndarray, by_K0: np.ndarray
-    ) -> FaceGradient:
+    def gradient(self, D: np.ndarray, V: np.ndarray, by_K0: np.ndarray) -> FaceGradient:
         """Differentiate a function of what K0 gains, given its derivative by it (p, q, q).
 
         It is sum_p y_p . (K u_p - f_p) with nodal fields y, zero but at the interfaces.

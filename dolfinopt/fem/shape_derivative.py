@@ -55,13 +55,16 @@ class ShapeDerivative:
     """Of one arm's cells; n nodes and c corners a cell, d directions.
 
     Derivatives by corners (n_cells, c, d) of sums over this rank's cells, per m.
+
+    Attributes:
+        corners: (n_cells, c, d) of the owned cells, m.
     """
 
     def __init__(self, mesh: ArmMesh, cells: Cells):
         """Take the cells with straight sides as they are."""
         self._mesh, self._cells, self._operators = mesh, cells, cells.operators
-        self._corners = cell_corners(mesh)
-        self._dim, self._around = mesh.dim, self._corners.shape[1]
+        self.corners = cell_corners(mesh)
+        self._dim, self._around = mesh.dim, self.corners.shape[1]
         self._degree = self._operators.element.degree
         self._simplex = self._around == mesh.dim + 1
         C = elasticity(mesh.dim, self._operators.poisson_ratio)
@@ -232,7 +235,7 @@ class ShapeDerivative:
         self, rule: Rule, columns: int, function: Callable[[_At], _Tensor]
     ) -> np.ndarray:
         """Sum a tensor's products with L at the points of a rule, some cells at a time."""
-        out = np.zeros_like(self._corners)
+        out = np.zeros_like(self.corners)
         step = max(1, SHAPE_CHUNK_ENTRIES // (len(rule[0]) * columns))
         for first in range(0, len(out), step):
             at = _At(self, slice(first, first + step), rule)
@@ -310,7 +313,7 @@ class _At:
     def __init__(self, shape: ShapeDerivative, cells: slice, rule: Rule):
         self.shape, self.cells = shape, cells
         self._points = points = rule[0]
-        self._corners = corners = shape._corners[cells]
+        self._corners = corners = shape.corners[cells]
         J = jacobian(corners, points[:1] if shape._simplex else points)
         self.inverse = np.linalg.inv(J)
         self.weight = rule[1] * np.abs(np.linalg.det(J))
@@ -371,7 +374,9 @@ class _At:
         """Differentiate sum_p weight sigma(left) : eps(right), modes and twisting included."""
         strained = [one.strained for one in (left, right)]
         if self.twist is not None:
-            strained = [h + self.twist.strain(one.values) for h, one in zip(strained, (left, right))]
+            strained = [
+                h + self.twist.strain(one.values) for h, one in zip(strained, (left, right))
+            ]
         stress = [weight[:, :, None, None, None] * self.stress(h) for h in strained]
         found = _Tensor.of_volume(_dot(stress[0], strained[1]), self.shape._dim)
         for one, P in zip((left, right), reversed(stress), strict=True):

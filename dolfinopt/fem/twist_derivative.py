@@ -30,7 +30,9 @@ class Twist:
         self._length = np.linalg.norm(centre, axis=1)
         local = shape_derivatives(8, 1, CENTRE)[0]
         signs = np.sign(local)
-        self._pattern = 0.5 * np.stack([signs[:, (k + 1) % 3] * signs[:, (k + 2) % 3] for k in range(3)])
+        self._pattern = 0.5 * np.stack(
+            [signs[:, (k + 1) % 3] * signs[:, (k + 2) % 3] for k in range(3)]
+        )
         self._gradients = local @ inverse
         self._moments = self._pattern @ corners  # sum_n p_kn X_n (cells, 3, 3)
         self._grow = ratio[:, :, None] * (points - 0.5)[:, ALONG]  # (cells, p, 3)

@@ -228,9 +228,7 @@ def deflection_gradient(
     return _static_gradient(state, response.deflection_gradient(exponent), response.loads, by)
 
 
-def _static_gradient(
-    state: DesignState, left: np.ndarray, right: np.ndarray, by: By
-) -> np.ndarray:
+def _static_gradient(state: DesignState, left: np.ndarray, right: np.ndarray, by: By) -> np.ndarray:
     """Differentiate -sum_k u(left_k)' K u(right_k), fields held, of outboard loads (b, k)."""
     fields = state.elastic.static_fields(np.hstack([right, left]))
     with state.elastic.profile.phase("gradient"):

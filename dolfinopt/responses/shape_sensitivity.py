@@ -31,7 +31,9 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
     elastic = state.elastic
     shape, young = elastic.substructure.shape_derivative, elastic.young
     stiffness, mass = list(products.stiffness), list(products.mass)
-    by_corners = shape.volume(np.zeros_like(young) if products.volumes is None else products.volumes)
+    by_corners = np.zeros_like(shape.corners)
+    if products.volumes is not None:
+        by_corners += shape.volume(products.volumes)
     geometric = products.geometric
     if geometric is not None:
         stiffness += geometric.stiffness

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_rectangle
-from mpi4py import MPI
 from moved_nodes import noise, with_moves
+from mpi4py import MPI
 from solids import link_mesh
 
 from dolfinopt.fem.assembly import StressTensor, cells_of

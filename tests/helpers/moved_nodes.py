@@ -11,10 +11,10 @@ from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from remainders import Built, built_of
 
+from dolfinopt.dynamics.radau import AIM
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.checks import cell_areas, cell_volumes
-from dolfinopt.dynamics.radau import AIM
 from dolfinopt.optimization.gradient_check import _at, _with
 from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.evaluation import _analysis, evaluate
@@ -126,7 +126,9 @@ def node_test(
     built = built_with(scene, places(0.0), cut, regular)
     x = built.fields(design)
     evaluation, base = built.evaluate(x)
-    rows = response.gradients(_analysis(scene, built.partition, built.arms, base, built.profile, by_nodes))
+    rows = response.gradients(
+        _analysis(scene, built.partition, built.arms, base, built.profile, by_nodes)
+    )
     found = {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in built.arms}
     parts = {}
     for k, arm in built.arms.items():

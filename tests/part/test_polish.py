@@ -72,15 +72,17 @@ def test_symmetric_arm_stays_symmetric(made):
     assert apart.max() < 1e-9
 
 
-@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
-def test_derivative_at_the_outline_is_that_of_the_objective(made, kind):
+@pytest.mark.parametrize("stiffening", [False, True], ids=["linear", "stiffened"])
+@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation", "stress"])
+def test_derivative_at_the_outline_is_that_of_the_objective(made, kind, stiffening):
     """Against central differences: of a step along the descent, which keeps the area, and another.
 
-    Of the deviation almost all cancels in the former.
+    Instants and time steps are not held: that of the load cases' worst changes by up to 8e-4.
     """
     scene, part, mesh = made[1], made[2][0], made[3].coarse[0]
+    changes = {"objective": {"kind": kind}, "simulation": {"stiffening": stiffening}}
     posed = scene.model_copy(
-        update={"objective": scene.objective.model_copy(update={"kind": kind})}
+        update={key: getattr(scene, key).model_copy(update=one) for key, one in changes.items()}
     )
     outline = polishing.OutlineMoves.of(part)
     state = polishing._evaluated(posed, {0: part}, {0: mesh})[0]
@@ -95,7 +97,7 @@ def test_derivative_at_the_outline_is_that_of_the_objective(made, kind):
             places.append(moved.points[mesh.sides[:, 0]])
             values.append(polishing._evaluated(posed, {0: part}, {0: moved})[1])
         predicted = (pull * (places[0] - places[1])).sum()
-        assert values[0] - values[1] == pytest.approx(predicted, rel=0.02)
+        assert values[0] - values[1] == pytest.approx(predicted, rel=2e-3)
 
 
 def _with_moves(outline, shape, moves):

@@ -9,13 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from moved_nodes import built_with, node_test, noise
 from mpi4py import MPI
-from moved_nodes import built_with, node_test
-from remainders import wave
+from remainders import rates, wave
 from runs import ROOT
 
 import dolfinopt as do
+from dolfinopt.arms.arm import Arm
+from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.responses.evaluation import gradient
+from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.responses.shape_sensitivity import by_nodes
 
 WORLD = MPI.COMM_WORLD
@@ -145,7 +148,9 @@ def test_height_of_a_bar_bent_by_a_moment(shared_tmp_path) -> None:
 
 
 def _of_mass(scene: do.Scene) -> do.Scene:
-    return scene.model_copy(update={"objective": scene.objective.model_copy(update={"kind": "mass"})})
+    return scene.model_copy(
+        update={"objective": scene.objective.model_copy(update={"kind": "mass"})}
+    )
 
 
 def _along_height(scene: do.Scene, built) -> list[float]:
@@ -153,3 +158,36 @@ def _along_height(scene: do.Scene, built) -> list[float]:
     found = gradient(scene, built.partition, built.arms, None, built.profile, by=by_nodes)
     places = {k: arm.mesh.mesh.geometry.x[:, 1] for k, arm in built.arms.items()}
     return [float(found[k][:, 1] @ y) for k, y in places.items()]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("base", ["triangles", "tetrahedra"])
+def test_frozen_loads(base, shared_tmp_path) -> None:
+    """The gradient by equivalent static loads is that of the compliance under held loads."""
+    _, _, size, cut = BASES[base]
+    scene = scene_of(base, (LINEAR,), shared_tmp_path)
+    loads: list[np.ndarray] = []
+
+    def compliance(h: float) -> tuple[Arm, float]:
+        def places(arm: str, x: np.ndarray) -> np.ndarray:
+            return size * (0.2 * noise(arm, x, 7) + h * noise(arm, x))
+
+        arm = next(iter(built_with(scene, places, cut).arms.values()))
+        arm.set_design(np.ones(arm.mesh.num_cells))
+        elastic = arm.current.elastic
+        nodes = elastic.interior_nodes  # in an order that moves may change
+        if not loads:
+            interior, outboard = elastic.restrict(elastic.stiffness_times(arm.current.basis.V))
+            nodal = np.zeros(arm.current.basis.V.shape)
+            nodal[nodes] = interior.reshape(len(nodes), *nodal.shape[1:])
+            loads.extend((nodal, outboard))
+        interior = loads[0][nodes].reshape(-1, loads[0].shape[2])
+        u = static_response(elastic, interior, loads[1])
+        return arm, float(np.trace(elastic.energy_matrix(u)))
+
+    arm, _ = compliance(0.0)
+    found = esl_gradient(arm.current, np.eye(loads[0].shape[2]), by_nodes)
+    even: dict[str, np.ndarray] = {}
+    built_with(scene, lambda name, x: np.zeros_like(x), cut, even)
+    slope = size * float(np.sum(found * noise(arm.mesh.name, even[arm.mesh.name])))
+    assert rates(lambda h: compliance(h)[1], slope) == pytest.approx(2.0, abs=0.05)
