@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from machines import fork
 from moved_nodes import built_with, node_test, noise
 from mpi4py import MPI
 from remainders import rates, wave
@@ -42,6 +43,21 @@ BASES = {  # scene, what makes it small, size of a move (m), whether boxes are c
     "quadrilaterals": ("two_arm", (*SHORT, *QUADRILATERALS), 0.015, False),
     "tetrahedra": ("spatial_arm", LINK, 0.01, True),
     "hexahedra": ("spatial_arm", LINK, 0.01, False),
+    "fork": ("", ("simulation.sample=0.01", *ROUGHLY[2:]), 0.005, False),
+    "slider": (
+        "slider_crank",
+        (
+            "arms.rod.cells=[12,2]",
+            "arms.rod.height=0.008",
+            "arms.rod.passive=0",
+            "motion.speed=60",
+            "motion.duration=0.05",
+            "motion.horizon=0.1",
+            *ROUGHLY,
+        ),
+        0.001,
+        False,
+    ),
 }
 BENT, LINEAR = "simulation.stiffening=true", "simulation.stiffening=false"
 GRAVITY = "motion.gravity=[0.5,-9.81]"
@@ -101,6 +117,11 @@ CASES = [
     case("hexahedra", "deviation", BENT, slow=True),
     case("hexahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
     case("hexahedra", "stress", BENT, slow=True),
+    # Two outboard interfaces; a closed loop.
+    case("fork", "deviation", BENT),
+    case("fork", "eigenfrequency"),
+    case("slider", "deviation", GRAVITY),
+    case("slider", "stress", BENT, slow=True),
 ]  # fmt: skip
 
 
@@ -111,6 +132,9 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12)
     WORLD.barrier()
     name, quick, _, _ = BASES[base]
     told = [one.replace("FOLDER", str(folder)) for one in (*quick, *changes)]
+    if base == "fork":
+        (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
+        return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
     path = ROOT / "demos" / f"{name}.toml"
     if base != "one arm":
         return do.load_scene(path, told)
