@@ -91,6 +91,7 @@ def exact_gradient(
 def _body_products(
     state: DesignState, cotangents: ShapeIntegrals, by_columns: np.ndarray | None
 ) -> Products:
+    """Return what carries a change of one arm's design to a function of its body (collective)."""
     elastic, basis = state.elastic, state.basis
     V = basis.V
     damping = state.scene.damping.stiffness_proportional

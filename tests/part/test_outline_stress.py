@@ -5,11 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from moved_nodes import node_test
+from parts import folder_with, frame
 from runs import ROOT
 
 import dolfinopt as do
+from dolfinopt.cli.shared import scene_of
 from dolfinopt.part import boundary_stress, solid_stress
 from dolfinopt.part.boundary_stress import OutlineStress
+from dolfinopt.part.forms import simulate_bodies
+from dolfinopt.part.mesh import mesh_parts
+from dolfinopt.part.part import make_parts
+from dolfinopt.responses.response import Analysis
 
 pytestmark = pytest.mark.serial
 
@@ -51,3 +57,21 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
 def solid(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return densities of solid material."""
     return np.ones_like(x)
+
+
+def test_largest_is_that_of_the_part(tmp_path) -> None:
+    """As the check of a part finds it; the p-mean is below."""
+    folder = folder_with(tmp_path / "run", frame, "arms.cells=[100,6]", "simulation.sample=0.005")
+    scene = scene_of(folder)
+    parts = make_parts(scene, folder)
+    state = simulate_bodies(scene, parts, mesh_parts(parts).coarse)
+    shapes = {k: part.shape for k, part in parts.items()}
+    apart = {k: boundary_stress.APART * part.domain.cell for k, part in parts.items()}
+    known = boundary_stress.part_stress(state.arms, state.trajectory, shapes, apart)
+    away = boundary_stress.away_from_ends(shapes, apart)
+    response = OutlineStress(scene.objective, away, boundary_stress.corner_stress)
+    designs = {k: arm.current for k, arm in state.arms.items()}
+    place = state.scene, state.partition, designs, state.trajectory
+    found = response.measure(Analysis(*place, do.Profile()))
+    assert found.values[0] == pytest.approx(known[0].peak.value, rel=1e-9)
+    assert 0.1 * found.values[0] < found.smooth[0] < found.values[0]
