@@ -368,15 +368,13 @@ class Stress(Response):
     def _found(self, analysis: Analysis) -> _Found:
         """Return what is known of the design, once for value and gradient (collective)."""
         first: DesignState | None = next(iter(analysis.designs.values()), None)
-        kept = None if first is None else first.kept.get(self.name)
+        kept: _Found | None = None if first is None else first.kept.get(self.name)
         # The root, which has an arm and the trajectory, speaks for all: they work in step.
         known = kept is not None and kept.trajectory is analysis.trajectory
-        known = analysis.partition.world.bcast(known, root=0)
-        if known and first is not None:
-            found: _Found = first.kept[self.name]
-            return found
-        if known:
-            return _Found(analysis.trajectory, {}, {}, 0.0, 0.0, 0.0, 1.0)
+        numbers = None if kept is None or not known else kept.numbers
+        numbers = analysis.partition.world.bcast(numbers, root=0)
+        if numbers is not None:
+            return kept or _Found(analysis.trajectory, {}, {}, *numbers)
         found = self._evaluate(analysis)
         if first is not None:
             first.kept[self.name] = found
@@ -481,6 +479,11 @@ class _Found:
     smooth: float
     total: float
     weight: float
+
+    @property
+    def numbers(self) -> tuple[float, float, float, float]:
+        """What is the same on all ranks."""
+        return self.largest, self.smooth, self.total, self.weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,9 @@ Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
 BASES = {  # scene, what makes it small, size of a move (m), whether boxes are cut into tetrahedra
     "triangles": ("two_arm", (*SHORT, *TRIANGLES), 0.015, False),
-    "one arm": ("two_arm", (*SHORT, *TRIANGLES, "motion.radius=0.4"), 0.015, False),
+    "one arm": ("two_arm", (*SHORT, *QUADRILATERALS, "motion.radius=0.4"), 0.015, False),
+    # Of unknown cells before it is meshed: on two ranks one looks on.
+    "lone file": ("two_arm", (*SHORT, *TRIANGLES, "motion.radius=0.4"), 0.015, False),
     "controlled": ("controlled_two_arm", (*SHORT, *TRIANGLES), 0.015, False),
     "quadrilaterals": ("two_arm", (*SHORT, *QUADRILATERALS), 0.015, False),
     "tetrahedra": ("spatial_arm", LINK, 0.01, True),
@@ -94,6 +96,7 @@ CASES = [
     case("triangles", "stress", BENT, MODAL, GRAVITY),
     case("one arm", "stress", BENT, GRAVITY, ranks=True),
     case("one arm", "deviation", LINEAR, MODAL, ranks=True),
+    case("lone file", "stress", BENT, GRAVITY, ranks=True),
     case("controlled", "esl", LINEAR),
     case("controlled", "deviation", BENT),
     case("controlled", "settling", BENT, slow=True),
@@ -136,7 +139,7 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12)
         (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
         return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
     path = ROOT / "demos" / f"{name}.toml"
-    if base != "one arm":
+    if base not in ("one arm", "lone file"):
         return do.load_scene(path, told)
     tree = do.load_scene(path).to_tree()
     return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
