@@ -148,7 +148,7 @@ def evaluate(
         if isinstance(found, ConvergenceError):
             raise found
         motion = found
-    analysis = _analysis(scene, partition, arms, trajectory, profile)
+    analysis = analysis_of(scene, partition, arms, trajectory, profile)
     return _measured(analysis, motion), trajectory
 
 
@@ -217,14 +217,14 @@ def _evaluate_alike(
             if any(one.needs and "motion" not in one.needs for one in asked_of(scene)):
                 with together(partition.world):
                     under = {k: arm.under(scene) for k, arm in arms.items()}
-            analysis = _analysis(scene, partition, under, trajectory, profile)
+            analysis = analysis_of(scene, partition, under, trajectory, profile)
             found.append((_measured(analysis, motion), trajectory))
         except ConvergenceError as error:
             found.append(error)
     return found
 
 
-def _analysis(
+def analysis_of(
     scene: Scene,
     partition: Partition,
     arms: Mapping[int, Arm],
@@ -282,7 +282,7 @@ def gradient(
         profile: of this rank.
         by: `shape_sensitivity.by_nodes` for the gradient by the places of the arms' nodes.
     """
-    analysis = _analysis(scene, partition, arms, trajectory, profile, by)
+    analysis = analysis_of(scene, partition, arms, trajectory, profile, by)
     rows = objective_of(scene).gradients(analysis)
     if len(rows) == 1:
         return rows[0]
@@ -329,7 +329,7 @@ def constraint_gradients(
         measured: `Evaluation.responses` of the design; measured anew if not given.
         by: as for `gradient`.
     """
-    analysis = _analysis(scene, partition, arms, trajectory, profile or Profile(), by)
+    analysis = analysis_of(scene, partition, arms, trajectory, profile or Profile(), by)
     found = []
     for k, bound in enumerate(constraints_of(scene), 1):
         rows = bound.response.gradients(analysis)

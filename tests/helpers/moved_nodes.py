@@ -17,7 +17,7 @@ from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.checks import cell_areas, cell_volumes
 from dolfinopt.optimization.gradient_check import _at, _with
 from dolfinopt.parallel import on_root, sum_over_arms
-from dolfinopt.responses.evaluation import _analysis, evaluate
+from dolfinopt.responses.evaluation import analysis_of, evaluate
 from dolfinopt.responses.motion import MotionResponse
 from dolfinopt.responses.response import Response, needs, objective_of
 from dolfinopt.responses.shape_sensitivity import by_nodes
@@ -127,7 +127,7 @@ def node_test(
     x = built.fields(design)
     evaluation, base = built.evaluate(x)
     rows = response.gradients(
-        _analysis(scene, built.partition, built.arms, base, built.profile, by_nodes)
+        analysis_of(scene, built.partition, built.arms, base, built.profile, by_nodes)
     )
     found = {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in built.arms}
     parts = {}
@@ -147,7 +147,7 @@ def node_test(
         start = () if base is None else base.solutions
         _, trajectory = evaluate(*place, x, step.profile, start, simulated=False)
         if not isinstance(response, MotionResponse):
-            return response.measure(_analysis(*place, trajectory, step.profile)).total
+            return response.measure(analysis_of(*place, trajectory, step.profile)).total
         parts = response.parts(scene)
         world = built.partition.world
         return on_root(world, lambda: sum(_at(base, trajectory, part) for _, part in parts))
