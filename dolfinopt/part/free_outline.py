@@ -16,12 +16,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
+from dolfinopt.errors import InputError
 from dolfinopt.part.body_mesh import BodyMesh, normals
 from dolfinopt.part.curves import DEGREE, MIRROR, Line, Spline
 from dolfinopt.part.mesh import facing
@@ -41,6 +42,8 @@ NEAREST = 200  # places around each that may be the other side of a member or a 
 WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
 ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
+LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
+WIDENED, WIDENINGS = 0.06, 12  # cells by which thin members grow at a time, and how often
 BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
 
@@ -206,6 +209,9 @@ class FreeOutline:
     def by_s(self, mesh: BodyMesh, by_outline: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s, per m.
 
+        That nodes stand a little off the curves, so that straight sides enclose their area, is
+        left out: a share of about (side over radius)^2 of the derivative.
+
         Args:
             mesh: along the curves of this outline.
             by_outline: (k, 2) derivatives by the first node of every side of the mesh.
@@ -248,16 +254,10 @@ class FreeOutline:
                 found[block] = (by_points * run.frame[1]).sum(axis=1)
         return found
 
-    def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far (count,) control points may move inwards and outwards in a step, m.
-
-        Members and gaps get no narrower than `least`; material stays where it may be.
-        """
-        import shapely
-
+    def widths(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the width (count,) of members, and of gaps, beside every control point, m."""
         at = np.vstack([run.frame[0] for run in self.runs])
-        outward = np.vstack([run.frame[1] for run in self.runs])
-        places, inward = [at], [-outward]
+        places, inward = [at], [-np.vstack([run.frame[1] for run in self.runs])]
         for piece in self.shape.pieces:
             t = _samples(piece, 0.25 * self.part.domain.cell)
             places.append(piece.curve.at(t))
@@ -265,21 +265,51 @@ class FreeOutline:
         every, into = np.vstack(places), np.vstack(inward)
         near = cKDTree(every).query(every, k=min(NEAREST, len(every)))[1]
         beside, found = cKDTree(at).query(every)[1], []
-        for side, least in zip((1.0, -1.0), self.least, strict=True):
+        for side in (1.0, -1.0):
             wide = facing(every, into, near, side)
             narrowest = wide[: len(at)].copy()
             np.minimum.at(narrowest, beside, wide)
-            free = np.maximum(narrowest - least, 0.0)
-            found.append(np.minimum(ROOM_SHARE * free, WIDTH_SHARE * narrowest))
-        inwards, outwards = found
-        points = shapely.points(at)
-        edge = shapely.distance(points, self.arm.boundary)
-        outwards = np.minimum(
-            outwards, np.where(shapely.covers(self.arm, points), EDGE_SHARE * edge, 0.0)
+            found.append(narrowest)
+        return found[0], found[1]
+
+    def room(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far (count,) control points may move inwards and outwards in a step, m.
+
+        Members and gaps get no narrower than `least`; material stays where it may be.
+        """
+        import shapely
+
+        inwards, outwards = (
+            np.minimum(ROOM_SHARE * np.maximum(wide - least, 0.0), WIDTH_SHARE * wide)
+            for wide, least in zip(self.widths(), self.least, strict=True)
         )
+        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
+        outwards = np.minimum(outwards, self._outside(points))
         if not self.stays.is_empty:
             inwards = np.minimum(inwards, EDGE_SHARE * shapely.distance(points, self.stays))
         return self._least_beside(inwards), self._least_beside(outwards)
+
+    def _outside(self, points: Any) -> np.ndarray:
+        """Return how far (n,) material may grow at places of the outline, m."""
+        import shapely
+
+        edge = EDGE_SHARE * shapely.distance(points, self.arm.boundary)
+        return np.where(shapely.covers(self.arm, points), edge, 0.0)
+
+    def widened(self) -> FreeOutline:
+        """Return the outline with members that are thinner than `least` a little wider."""
+        import shapely
+
+        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
+        missing = 0.5 * np.maximum(self.least[0] - self.widths()[0], 0.0)
+        s = np.minimum(missing, np.minimum(WIDENED * self.part.domain.cell, self._outside(points)))
+        for run, block in zip(self.runs, self.blocks, strict=True):
+            if run.closed:
+                own = s[block]
+                s[block] = np.maximum(own, 0.5 * np.maximum(np.roll(own, 1), np.roll(own, -1)))
+            else:
+                s[block][[0, 1, -2, -1]] = 0.0
+        return self.moved(self._symmetric(s))
 
     def _least_beside(self, room: np.ndarray) -> np.ndarray:
         """Return the least of every control point and those beside it."""
@@ -318,8 +348,15 @@ def _samples(piece: Piece, spacing: float) -> np.ndarray:
 
 
 def free_outline(part: Part) -> FreeOutline:
-    """Return the outline of a part with free runs of evenly spaced control points."""
+    """Return the outline of a part with free runs of evenly spaced control points.
+
+    Raises:
+        InputError: its free curves are lines and arcs.
+    """
     import shapely
+
+    if any(piece.free and not isinstance(piece.curve, Spline) for piece in part.shape.pieces):
+        raise InputError("--optimize: expected splines, not --curves arcs")
 
     domain, shape = part.domain, part.shape
     chord, cell = CHORD * domain.cell, domain.cell
@@ -345,8 +382,11 @@ def free_outline(part: Part) -> FreeOutline:
     partner = None
     if domain.symmetric:
         runs, partner = _mirrored(runs)
-    least = max(domain.minimum_member, 2.0 * tool, 0.6 * cell), max(2.0 * tool, 0.3 * cell)
-    return FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner)
+    least = max(domain.minimum_member, LEAST_MEMBER * cell), max(2.0 * tool, LEAST_GAP * cell)
+    made = FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner)
+    for _ in range(WIDENINGS if runs else 0):
+        made = made.widened()
+    return made
 
 
 def _free_rings(shape: Shape, tool: float, chord: float, fixed: int) -> list[np.ndarray]:

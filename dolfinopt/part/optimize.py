@@ -161,10 +161,14 @@ def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[float, tuple[Limit, .
 
 def _part(outline: FreeOutline) -> Part:
     """Return the part with these curves, and what is measured of it."""
-    part = replace(outline.part, shape=outline.shape)
-    outer, *holes = part.shape.polygons(CHORD * part.domain.cell)
-    drawn = replace(part.outline, polygon=shapely.Polygon(outer, holes))
-    return replace(part, outline=drawn, thinnest=thinnest_member(drawn))
+    part, chord = outline.part, CHORD * outline.part.domain.cell
+    outer, *holes = outline.shape.polygons(chord)
+    polygon = shapely.Polygon(outer, holes)
+    drawn = replace(part.outline, polygon=polygon)
+    old, *gaps = part.shape.polygons(chord)
+    apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
+    shape = replace(outline.shape, apart=float(apart))
+    return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
 
 
 # -- the problem at one outline ----------------------------------------------------------------
