@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 
     from dolfinopt.part.check import Check
     from dolfinopt.part.mesh import Meshes
+    from dolfinopt.part.optimize import Optimized
     from dolfinopt.part.part import Part
-    from dolfinopt.part.polish import Polished
     from dolfinopt.part.solid_mesh import SolidMeshes
     from dolfinopt.part.solid_part import SolidPart
     from dolfinopt.scene.load import Scene
@@ -61,11 +62,18 @@ if TYPE_CHECKING:
     help="simulate the machine with the parts, beside the densities they are made of",
 )
 @click.option(
-    "--polish",
-    type=click.IntRange(0, 100),
-    default=0,
+    "--optimize",
+    is_flag=True,
+    help="optimise the parts' free curves: the scene's objective within its limits, on a mesh of "
+    "the parts themselves",
+)
+@click.option(
+    "--iterations",
+    type=click.IntRange(1),
+    default=60,
+    show_default=True,
     metavar="N",
-    help="so many steps of shape optimisation of the splines; left out if they bring less than 1 %",
+    help="of --optimize, at most",
 )
 @overwrite_option
 @plots_option
@@ -76,7 +84,8 @@ def part(
     tolerance: float | None,
     curves: str,
     check: bool,
-    polish: int,
+    optimize: bool,
+    iterations: int,
     overwrite: bool,
     plots: bool,
 ) -> None:
@@ -100,10 +109,10 @@ def part(
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
     if scene.is_spatial:
-        if polish:
+        if optimize:
             raise InputError(
-                f"--polish: of arms in the plane alone; the arms of {folder} are solids; leave it "
-                "out"
+                f"--optimize: of arms in the plane alone; the arms of {folder} are solids; leave "
+                "it out"
             )
         options = tool_radius, tolerance, curves == "arcs"
         make_solids(world, scene, folder, target, options, check, overwrite, plots)
@@ -114,18 +123,21 @@ def part(
         if world.rank == 0:
             warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
             meshes = mesh_parts(parts)
-            polished = _polished(scene, parts, meshes, polish) if polish else None
-            if polished is not None:
-                parts, meshes = polished.parts, polished.meshes
             found = _checked(scene, folder, parts, meshes) if check else None
-            _write(scene, folder, target, parts, meshes, found, polished, plots)
+            optimized = _optimized(scene, parts, iterations) if optimize else None
+            if optimized is not None:
+                parts, meshes = optimized.parts, optimized.meshes
+                after = _checked(scene, folder, parts, meshes) if check else None
+                if found is not None and after is not None:
+                    found = replace(after, before=found.part)
+            _write(scene, folder, target, parts, meshes, found, optimized, plots)
 
 
-def _polished(scene: Scene, parts: dict[int, Part], meshes: Meshes, steps: int) -> Polished:
-    """Return the polished parts, and say what it brought."""
-    from dolfinopt.part.polish import polish
+def _optimized(scene: Scene, parts: dict[int, Part], iterations: int) -> Optimized:
+    """Return the parts with optimised shapes, and say what it brought."""
+    from dolfinopt.part.optimize import optimize_parts
 
-    found = polish(scene, parts, meshes, steps)
+    found = optimize_parts(scene, parts, iterations, lambda line: click.echo(line, err=True))
     click.echo(found.sentence)
     return found
 
@@ -148,7 +160,7 @@ def _write(
     parts: dict[int, Part],
     meshes: Meshes,
     check: Check | None,
-    polished: Polished | None,
+    optimized: Optimized | None,
     plots: bool,
 ) -> None:
     """Write the files and say what was made (root only)."""
@@ -164,7 +176,7 @@ def _write(
     prepare_folder(target)
     drawn = pictures if plots else None
     bodies = meshes.fine if check is None else check.meshes
-    figures = write_parts(target, scene, parts, bodies, check, polished, drawn, run / "design.npz")
+    figures = write_parts(target, scene, parts, bodies, check, optimized, drawn, run / "design.npz")
     for name, row in figures["arms"].items():
         points = f" with {row['control_points']} control points" if row["control_points"] else ""
         click.echo(
@@ -359,10 +371,12 @@ def tell(check: Check) -> None:
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     against = "part/density" if check.crisp is None else "part/crisp"
-    for name in ("", "density", "crisp", "part", "unit", against):
+    figures = check.table()
+    forms = [name for name in figures.columns if name != "unit" and "/" not in name]
+    for name in ("", *forms, "unit", against):
         table.add_column(name, justify="left" if name in ("", "unit") else "right")
-    for name, row in check.table().iterrows():
-        values = [f"{row[form]:.4g}" for form in ("density", "crisp", "part")]
+    for name, row in figures.iterrows():
+        values = [f"{row[form]:.4g}" for form in forms]
         ratio = f"{100.0 * row[against]:+.2f} %"
         cells = [str(name).replace("_", " "), *values, row["unit"], ratio]
         table.add_row(*("-" if "nan" in cell else cell for cell in cells))

@@ -418,35 +418,24 @@ class Cells:
 
     # -- energies ----------------------------------------------------------------------------
 
-    def stiffness_products(
-        self, left: np.ndarray, right: np.ndarray, stiffness: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
-
-        Args:
-            left, right: fields.
-            stiffness: (n_cells, dn, dn) in place of k_e.
-        """
+    def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
         values = self.centred(right)
-        products = self.stiffness_times(values, stiffness)
+        products = self.stiffness_times(values)
         if left is not right:
             values = self.centred(left)
         return _sum_of_products(values, products)
 
-    def mass_products(
-        self, left: np.ndarray, right: np.ndarray, mass: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Return sum_k left_k' m_e right_k (n_cells,) likewise; `mass` in place of m_e."""
+    def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return sum_k left_k' m_e right_k (n_cells,) likewise."""
         values, count = self.values(right), self.count
         flat = values.reshape(len(values), -1, count)
-        return _sum_of_products(self.values(left), times(self.mass if mass is None else mass, flat))
+        return _sum_of_products(self.values(left), times(self.mass, flat))
 
-    def stiffness_times(
-        self, values: np.ndarray, stiffness: np.ndarray | None = None
-    ) -> np.ndarray:
+    def stiffness_times(self, values: np.ndarray) -> np.ndarray:
         """Return k_e times nodal values (n, d, k, n_cells), see `values`."""
         flat = values.reshape(-1, *values.shape[2:])
-        return times(self.stiffness if stiffness is None else stiffness, flat).reshape(values.shape)
+        return times(self.stiffness, flat).reshape(values.shape)
 
     def energy_matrix(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Return field' K field (k, k) of this rank's cells."""

@@ -38,6 +38,7 @@ from dolfinopt.fem.interface import (
 )
 from dolfinopt.fem.interior import ExtendedStiffness, ExtendedSystem, Guesses, InteriorSystem
 from dolfinopt.fem.measured import TETRAHEDRA_BANDWIDTH_RATIO
+from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.fem.stress import element_centres, stress_operator
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -164,6 +165,11 @@ class Substructure:
         return quadrature(self.mesh, self.operators)
 
     @cached_property
+    def shape_derivative(self) -> ShapeDerivative:
+        """Derivatives of what cells add to, by the places of their corners."""
+        return ShapeDerivative(self.mesh, self.cells)
+
+    @cached_property
     def stress_operator(self) -> np.ndarray:
         """That of `fem.stress` at the element centres (n_cells, s, dn), 1/m."""
         corners = compat.cell_corner_count(self.mesh.mesh)
@@ -266,12 +272,9 @@ class ElasticArm:
         comm, inboard, outboard, rigid, interior_nodes, num_interior, num_dofs, expand, restrict:
             of its `InterfaceTransformation`.
         points: (n_nodes, d) reference positions, m.
-        weighed: element matrices k_e and m_e in place of its own in products cell by cell, which
-            are then derivatives by a parameter of these matrices; None of its own.
     """
 
     def __init__(self, substructure: Substructure, K: AssembledMatrix, M: AssembledMatrix):
-        self.weighed: tuple[np.ndarray, np.ndarray] | None = None
         self.substructure = substructure
         self.K, self.M = K, M
         self.mesh, self.operators = substructure.mesh, substructure.operators
@@ -333,8 +336,7 @@ class ElasticArm:
         The derivative of left . K right with respect to Young's modulus of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
-        stiffness = None if self.weighed is None else self.weighed[0]
-        return self.substructure.cells.stiffness_products(left, right, stiffness)
+        return self.substructure.cells.stiffness_products(left, right)
 
     def cell_mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' m_e right_k (n_cells,) for nodal fields (n_nodes, d, k).
@@ -342,8 +344,7 @@ class ElasticArm:
         The derivative of left . M right with respect to the mass density of each owned cell.
         """
         self.profile.counts.energy_fields += left.shape[2]
-        mass = None if self.weighed is None else self.weighed[1]
-        return self.substructure.cells.mass_products(left, right, mass)
+        return self.substructure.cells.mass_products(left, right)
 
     # -- the interior ------------------------------------------------------------------------
 

@@ -271,18 +271,6 @@ class LagrangeElement:
                 poisson_ratio=poisson_ratio,
             )
 
-    def matrices(
-        self, mesh: ArmMesh, operators: ElementOperators, coordinates: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return k_e and m_e of plane cells with other corners (n_cells, corners, 3), m."""
-        k_form = compat.compile_form(stiffness_form(operators.space))
-        m_form = mass_form(mesh, self.degree)
-        thickness = operators.thickness
-        return (
-            compat.tabulate_cells(k_form, [thickness, operators.poisson_ratio], coordinates),
-            compat.tabulate_cells(m_form, [thickness], coordinates),
-        )
-
     def derivatives(self, mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
         """Return those in the reference cell times the inverse Jacobian, see `Element`."""
         return by_cells(
@@ -615,7 +603,7 @@ def twisting_strains(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian(corners, points))
     length = np.linalg.norm(centre, axis=1)
     grow = (points - 0.5)[:, ALONG]
-    amplitudes = _coupled(_amplitudes(corners, centre, inverse, length))
+    amplitudes = coupled(_amplitudes(corners, centre, inverse, length))
     tensors = np.stack([_shear(inverse, length, *pair) for pair in PAIRS], axis=2)
     growing = (ratio[:, :, None] * grow)[:, :, None] * tensors[:, None]
     return growing @ amplitudes[:, None]
@@ -639,7 +627,7 @@ def _amplitudes(
     )
 
 
-def _coupled(a: np.ndarray) -> np.ndarray:
+def coupled(a: np.ndarray) -> np.ndarray:
     """Return (S - 1) a with S S = 1 + s (ones - 1)."""
     alone, together = np.sqrt(1.0 - TWIST_COUPLING), np.sqrt(1.0 + 2.0 * TWIST_COUPLING)
     return (alone - 1.0) * a + (together - alone) / 3.0 * a.sum(axis=1, keepdims=True)

@@ -87,11 +87,18 @@ class UnitLoads:
     @cached_property
     def _face_tensors(self) -> np.ndarray:
         """D (m, p, c, c) of `FaceRotation` (collective)."""
+        return self._face.tensors(self.fields, self.accelerations)
+
+    @property
+    def accelerations(self) -> np.ndarray:
+        """The fields (n_nodes, d, k) whose inertia the first k loads are."""
         points = self.arm.points
-        accelerations = _accelerations(np.ones_like(points), points)
-        if self.modes is not None:
-            accelerations = np.concatenate([accelerations, self.modes], axis=2)
-        return self._face.tensors(self.fields, accelerations)
+        found = _accelerations(np.ones_like(points), points)
+        return found if self.modes is None else np.concatenate([found, self.modes], axis=2)
+
+    def by_levers(self, face: FaceGradient) -> np.ndarray:
+        """Return the derivatives (n_nodes, d) by the interfaces' nodes, see `FaceRotation`."""
+        return self._face.by_levers(face.by_S, self.fields, self.accelerations)
 
     @cached_property
     def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
@@ -141,18 +148,20 @@ class UnitLoads:
             forces = forces + by_fields
         by_stiffness, face = np.zeros_like(compliance), None
         if len(by_K0):
-            by_face, face, turned = self._face.gradient(self._face_tensors, V, by_K0)
-            by_V, direct = by_V + by_face, direct + self._face.stiffness_products(face, self.fields)
-            forces = forces + turned[:, :, : forces.shape[2]]
+            face = self._face.gradient(self._face_tensors, V, by_K0)
+            by_V = by_V + face.by_modes
+            direct = direct + self._face.stiffness_products(face.y, self.fields)
+            forces = forces + face.by_fields[:, :, : forces.shape[2]]
             if work is not None:  # those of the interface's loads are folded already
-                work = work + _fold(turned[:, :, inertial:], by_V, modes.field, compliance)
+                outboard = face.by_fields[:, :, inertial:]
+                work = work + _fold(outboard, by_V, modes.field, compliance)
         if static:
             if work is None:
                 work = _fold(forces[:, :, inertial:], by_V, modes.field, compliance)
                 forces = forces[:, :, :inertial]
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
-        found = GeometricGradient(self, by_V, direct, adjoint, by_stiffness, face)
+        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face)
         if self.modes is None:
             return found
         return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
@@ -167,7 +176,7 @@ class UnitLoads:
             adjoint: (n_nodes, d, k) of the first fields.
         """
         known, arm = self._last.get("modes"), self.arm
-        if known is not None and known[0] is V and arm.weighed is None:
+        if known is not None and known[0] is V:
             arm.profile.counts.energy_fields += left.shape[2] + adjoint.shape[2]
             return known[1].stiffness_products(left, adjoint)
         fields = self.fields[:, :, : adjoint.shape[2]]
@@ -181,20 +190,25 @@ class GeometricGradient:
 
     Attributes:
         loads: whose stress it is.
+        modes, by_K0: (n_nodes, d, q) and (p, q, q), as given.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         direct: (n_cells,) by Young's modulus, modes and fields held.
-        adjoint: (n_nodes, d, k) of the fields of the first k loads.
+        by_fields: (n_nodes, d, k) by the fields of the first k loads, contributions of this
+            rank's cells; those of the others are among those by modes and S.
+        adjoint: (n_nodes, d, k) of these fields.
         by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
-        face: (n_nodes, d, p) what K u_p - f_p is multiplied by at the interface, see
-            `FaceRotation.gradient`.
+        face: of the interfaces' rotations; None of a linear body.
     """
 
     loads: UnitLoads
+    modes: np.ndarray
+    by_K0: np.ndarray
     by_modes: np.ndarray
     direct: np.ndarray
+    by_fields: np.ndarray
     adjoint: np.ndarray
     by_stiffness: np.ndarray
-    face: np.ndarray | None = None
+    face: FaceGradient | None = None
 
     def by_young_beside(self, left: np.ndarray, V: np.ndarray) -> np.ndarray:
         """Return `by_young` plus sum_k left_k' k_e V_k (n_cells,), in one product.
@@ -211,11 +225,35 @@ class GeometricGradient:
         fields = self.loads.fields[:, :, : self.adjoint.shape[2]]
         return self.direct - self.loads.arm.cell_stiffness_products(self.adjoint, fields)
 
+    @property
+    def stiffness(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Fields l and r of l . dK r, modes held, but for what stiffens the cells themselves."""
+        every = self.loads.fields
+        pairs = [(-self.adjoint, every[:, :, : self.adjoint.shape[2]])]
+        return pairs if self.face is None else [*pairs, (self.face.y, every)]
+
+    def at_interfaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives by the outboard interfaces' shape, modes held (collective).
+
+        By `InterfaceTransformation.rigid` (n_nodes, d, b), in which the fields and their adjoints
+        move the interfaces' nodes; and by the nodes' places as lever arms (n_nodes, d).
+        """
+        loads, arm, k = self.loads, self.loads.arm, self.adjoint.shape[2]
+        T, fields, accelerations = arm.substructure.T, loads.fields[:, :, :k], loads.accelerations
+        residual = arm.stiffness_times(fields)
+        count = min(k, accelerations.shape[2])
+        residual[:, :, :count] -= arm.mass_times(accelerations[:, :, :count])
+        by_fields = self.by_fields - arm.stiffness_times(self.adjoint)
+        rigid = by_fields @ T.coordinates(fields).T - residual @ T.coordinates(self.adjoint).T
+        if self.face is None:
+            return rigid, np.zeros_like(arm.points)
+        return rigid, loads.by_levers(self.face)
+
     @cached_property
     def _by_loads(self) -> np.ndarray:
         """By the loads f_p that are inertia (n_nodes, d, k)."""
         adjoint = self.adjoint[:, :, : self.loads.num_inertial]
-        return adjoint if self.face is None else adjoint - self.face[:, :, : adjoint.shape[2]]
+        return adjoint if self.face is None else adjoint - self.face.y[:, :, : adjoint.shape[2]]
 
     @property
     def by_inertia(self) -> np.ndarray:
@@ -334,6 +372,23 @@ def static_response(
 # cantilever buckles at twice the moment.
 
 
+@dataclass(frozen=True, eq=False)
+class FaceGradient:
+    """Derivatives of a function of what the interfaces' rotations add to K0.
+
+    Attributes:
+        by_modes: (n_nodes, d, q), all held but these.
+        by_S: (m, p, d, d) by the moments of the reactions.
+        y: (n_nodes, d, p) fields whose products with K u_p - f_p they are.
+        by_fields: (n_nodes, d, p) K y, contributions of this rank's cells.
+    """
+
+    by_modes: np.ndarray
+    by_S: np.ndarray
+    y: np.ndarray
+    by_fields: np.ndarray
+
+
 class FaceRotation:
     """The outboard interfaces of one design of an arm; m of them, c rotations each.
 
@@ -348,16 +403,9 @@ class FaceRotation:
         self._nodes = cells[self._near]
         self._levers = _levers(arm.rigid)
 
-    @cached_property
-    def _fit(self) -> np.ndarray:
-        """The field (n_nodes, d, (d + c) m) whose products with modes are coordinates, summed."""
-        rigid = self.arm.rigid
-        rows = rigid[self.arm.outboard].reshape(-1, rigid.shape[2])
-        return rigid @ np.linalg.inv(self.arm.comm.allreduce(rows.T @ rows))
-
     def _rotations(self, V: np.ndarray) -> np.ndarray:
         """Return the rotation vectors (m, c, q) in modes (n_nodes, d, q) (collective)."""
-        found = self.arm.comm.allreduce(np.tensordot(self._fit, V, ((0, 1), (0, 1))))
+        found = self.arm.substructure.T.coordinates(V)
         return found.reshape(len(self._levers), -1, V.shape[2])[:, V.shape[1] :]
 
     def tensors(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
@@ -367,30 +415,45 @@ class FaceRotation:
             fields: (n_nodes, d, p) their static fields u_p.
             accelerations: (n_nodes, d, k) of the first k loads, whose inertia loads the nodes.
         """
+        forces, levers = self._reactions(fields, accelerations), self._levers[:, self._nodes]
+        S = self.arm.comm.allreduce(np.einsum("enap,ienb->ipab", forces, levers))
+        return _deviated(0.5 * (S + S.swapaxes(2, 3)))
+
+    def _reactions(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
+        """Return K u_p - f_p of the cells beside the interfaces (cells, n, d, p)."""
         arm, nodes = self.arm, self._nodes
         values = fields[nodes] - fields[nodes].mean(axis=1, keepdims=True)
         forces = self._stiffness_times(values)
         inertia = np.einsum("enm,emap->enap", arm.operators.mass[self._near], accelerations[nodes])
         inertia *= arm.density[self._near, None, None, None]
         forces[..., : accelerations.shape[2]] -= inertia
-        S = arm.comm.allreduce(np.einsum("enap,ienb->ipab", forces, self._levers[:, nodes]))
-        return _deviated(0.5 * (S + S.swapaxes(2, 3)))
+        return forces
+
+    def by_levers(
+        self, by_S: np.ndarray, fields: np.ndarray, accelerations: np.ndarray
+    ) -> np.ndarray:
+        """Return the derivatives (n_nodes, d) by the interfaces' nodes as lever arms.
+
+        Args:
+            by_S: (m, p, d, d) by the moments of the reactions.
+            fields, accelerations: see `tensors`.
+        """
+        forces, found = self._reactions(fields, accelerations), np.zeros_like(self.arm.points)
+        for at, by in zip(self.arm.substructure.T.ends, by_S, strict=True):
+            own = np.einsum("enap,pab->enb", forces, by) * at[self._nodes][:, :, None]
+            np.add.at(found, self._nodes, own)
+        return found
 
     def stiffness(self, D: np.ndarray, V: np.ndarray) -> np.ndarray:
         """Return what K0 (p, q, q) gains in modes V (n_nodes, d, q) (collective)."""
         theta = self._rotations(V)[:, None]
         return (theta.swapaxes(2, 3) @ D @ theta).sum(axis=0)
 
-    def gradient(
-        self, D: np.ndarray, V: np.ndarray, by_K0: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def gradient(self, D: np.ndarray, V: np.ndarray, by_K0: np.ndarray) -> FaceGradient:
         """Differentiate a function of what K0 gains, given its derivative by it (p, q, q).
 
         It is sum_p y_p . (K u_p - f_p) with nodal fields y, zero but at the interfaces.
-
-        Returns:
-            By the modes (n_nodes, d, q), all held but these; y (n_nodes, d, p); and K y, the
-            derivative by the fields; contributions of this rank's cells (collective).
+        Collective.
         """
         theta = self._rotations(V)
         symmetric = 0.5 * (by_K0 + by_K0.swapaxes(1, 2))
@@ -401,7 +464,8 @@ class FaceRotation:
         y = np.einsum("mpab,mnb->nap", by_S, self._levers)
         forces = np.zeros_like(y)
         np.add.at(forces, self._nodes, self._stiffness_times(y[self._nodes]))
-        return self._fit @ by_theta.reshape(-1, V.shape[2]), y, forces
+        by_modes = self.arm.substructure.T.by_coordinates(by_theta.reshape(-1, V.shape[2]))
+        return FaceGradient(by_modes, by_S, y, forces)
 
     def stiffness_products(self, y: np.ndarray, fields: np.ndarray) -> np.ndarray:
         """Return sum_p y_p' k_e u_p (n_cells,) for y that is zero but at the interface."""

@@ -7,6 +7,7 @@ There are b = 3 outboard coordinates in the plane, in space 6 of every outboard 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -188,6 +189,31 @@ class InterfaceTransformation:
             field = self._to_owners(field)
         return field[self.interior_nodes].reshape(-1, columns), outboard
 
+    @cached_property
+    def _fit(self) -> np.ndarray:
+        """The field (n_nodes, d, b) whose products with fields are their coordinates, summed."""
+        rows = self.rigid[self.outboard].reshape(-1, self.num_coordinates)
+        return self.rigid @ np.linalg.inv(self.comm.allreduce(rows.T @ rows))
+
+    def coordinates(self, field: np.ndarray) -> np.ndarray:
+        """Return the outboard coordinates (b, k) of fields that `expand` returned (collective).
+
+        Of others those of the nearest rigid motion.
+        """
+        found = np.tensordot(self._fit, field, ((0, 1), (0, 1)))
+        return np.asarray(self.comm.allreduce(found))
+
+    def by_coordinates(self, by: np.ndarray) -> np.ndarray:
+        """Return the derivatives by a field (n_nodes, d, k), given those by `coordinates`."""
+        return self._fit @ by
+
+    def by_points(self, by_rigid: np.ndarray) -> np.ndarray:
+        """Return the derivatives (n_nodes, d) by the nodes, given those by `rigid`."""
+        found = np.zeros_like(self.points)
+        for at, by in zip(self.ends, np.split(by_rigid, len(self.ends), axis=2), strict=True):
+            found[at] += by_rigid_motions(by[at])
+        return found
+
     def _to_owners(self, field: np.ndarray) -> np.ndarray:
         """Add the ghosts' rows of a nodal field to their owners' rows."""
         out = np.empty_like(field)
@@ -216,6 +242,14 @@ def rigid_motions(points: np.ndarray) -> np.ndarray:
                 -points[:, before],
             )
     return motions
+
+
+def by_rigid_motions(by: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n, d) by the points, given those by their `rigid_motions`."""
+    if by.shape[1] == 2:
+        return np.stack([by[:, 1, 2], -by[:, 0, 2]], axis=1)
+    # e_k x X . b = X . (b x e_k)
+    return np.sum([np.cross(by[:, :, 3 + k], np.eye(3)[k]) for k in range(3)], axis=0)
 
 
 def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:

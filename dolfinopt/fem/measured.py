@@ -16,6 +16,8 @@ STRESS_CHUNK_CELLS = 256
 # these: by default 8192, which takes longer than the products.
 BUFFER_ENTRIES = 256
 QUADRATURE_CHUNK_CELLS = 4096  # whose matrices are summed up at a time
+# Entries of displacement gradients at a time, for derivatives by the places of corners.
+SHAPE_CHUNK_ENTRIES = 250_000
 TWIST_COUPLING = 0.8  # s; 1 has no energy left where two faces of a cell turn against each other
 
 # -- interface -------------------------------------------------------------------------------

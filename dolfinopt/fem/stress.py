@@ -171,9 +171,11 @@ class LoadFields:
         mu = static_response(arm, *arm.restrict(by_elastic))
         weighted = arm.mass_times(mu)
         return ElasticFieldGradient(
+            by_fields=by_elastic,
             by_modes=moved_transposed(weighted),
-            by_young=-arm.cell_stiffness_products(mu, self.elastic),
-            by_density=arm.cell_mass_products(mu, moved(self.V)),
+            stiffness=(-mu, self.elastic),
+            mass=(mu, moved(self.V)),
+            arm=arm,
         )
 
 
@@ -182,13 +184,26 @@ class ElasticFieldGradient:
     """Derivatives of a function of the fields of the elastic motion's inertia.
 
     Attributes:
+        by_fields: (n_nodes, d, 2 q or 9 q), as given.
         by_modes: (n_nodes, d, q), contributions of this rank's cells.
-        by_young, by_density: (n_cells,) modes held.
+        stiffness, mass: fields l and r of l . dK r and l . dM r, modes held.
+        arm: the design.
     """
 
+    by_fields: np.ndarray
     by_modes: np.ndarray
-    by_young: np.ndarray
-    by_density: np.ndarray
+    stiffness: tuple[np.ndarray, np.ndarray]
+    mass: tuple[np.ndarray, np.ndarray]
+    arm: ElasticArm
+
+    def at_interfaces(self) -> np.ndarray:
+        """Return the derivatives by `InterfaceTransformation.rigid`, see `GeometricGradient`."""
+        arm, T = self.arm, self.arm.substructure.T
+        minus, fields = self.stiffness
+        mu, loads = self.mass
+        residual = arm.stiffness_times(fields) - arm.mass_times(loads)
+        by_fields = self.by_fields + arm.stiffness_times(minus)
+        return by_fields @ T.coordinates(fields).T - residual @ T.coordinates(mu).T
 
 
 def load_fields(loads: UnitLoads, V: np.ndarray, MV: np.ndarray) -> LoadFields:

@@ -425,16 +425,19 @@ def _assembled(
 class MassPartners:
     """Nodal fields through which a function of the integrals feels the mass matrix; n nodes.
 
-    With dJ = sum_k left_k . dM right_k and, by the modes, dJ = sum_k (M by_modes)_k . dV_k.
+    With dJ = sum_k left_k . dM right_k and, by the modes, dJ = sum_k (M by_modes)_k . dV_k; by the
+    nodes' places likewise.
 
     Attributes:
         left, right: (n, d, 2 + q).
         by_modes: (n, d, q).
+        by_points: (n, d).
     """
 
     left: np.ndarray
     right: np.ndarray
     by_modes: np.ndarray
+    by_points: np.ndarray
 
 
 def mass_partners(points: np.ndarray, V: np.ndarray, by: ShapeIntegrals) -> MassPartners:
@@ -453,11 +456,9 @@ def mass_partners(points: np.ndarray, V: np.ndarray, by: ShapeIntegrals) -> Mass
     quadratic = np.einsum("cab,nak,ckl->nbl", E, N, by.W, optimize=True)
     transposed = np.einsum("cab,nbk,clk->nal", E, N, by.W, optimize=True)
     left = np.concatenate([quadratic + by.w, by.mass * unit], axis=2)
-    return MassPartners(
-        left=left,
-        right=np.concatenate([N, unit], axis=2),
-        by_modes=(quadratic + transposed + by.w)[:, :, 1:],
-    )
+    by_N = quadratic + transposed + by.w
+    right = np.concatenate([N, unit], axis=2)
+    return MassPartners(left, right, by_modes=by_N[:, :, 1:], by_points=by_N[:, :, 0])
 
 
 # -- single bodies ---------------------------------------------------------------------------

@@ -10,7 +10,7 @@ Source: Williams (1952), doi:10.1115/1.4010553.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,14 +22,28 @@ from dolfinopt.mesh import compat
 from dolfinopt.part.body_mesh import CORNER
 from dolfinopt.part.curves import direction
 from dolfinopt.part.shape import Shape
-from dolfinopt.responses.stress import arm_loads, every, maxima, motions_of, screen
+from dolfinopt.responses.products import Products, StressProduct
+from dolfinopt.responses.stress import (
+    PointStress,
+    Stress,
+    arm_loads,
+    every,
+    maxima,
+    motions_of,
+    screen,
+)
 from dolfinopt.responses.stress_report import ArmStress, Peak
 
 if TYPE_CHECKING:
     from shapely import Geometry
 
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.scene.tables.objective import Objective
+
+# Which places (n, d), m, of an arm count, by its index and the scene's margin, m.
+Away = Callable[[int, np.ndarray, float], np.ndarray]
 
 VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
 # Of a singular point, in cells of the design: the centre of the design's cell in such a corner,
@@ -94,6 +108,11 @@ def part_stress(
         apart: distance from singular points that is looked at, m; so is
             `objective.stress_margin` from the interfaces.
     """
+    return stress_of_parts(arms, trajectory, away_from_ends(shapes, apart), corner_stress)
+
+
+def away_from_ends(shapes: Mapping[int, Shape], apart: Mapping[int, float]) -> Away:
+    """Return which places of parts in the plane count, see `part_stress`."""
     import shapely
 
     def away(k: int, places: np.ndarray, margin: float) -> np.ndarray:
@@ -106,27 +125,27 @@ def part_stress(
             far &= shapely.distance(at, interface_lines(shapes[k])) >= margin
         return far
 
-    return stress_of_parts(arms, trajectory, away, _at_corners)
+    return away
 
 
 def stress_of_parts(
     arms: Mapping[int, Arm],
     trajectory: Trajectory,
-    away: Callable[[int, np.ndarray, float], np.ndarray],
-    at_corners: Callable[[Arm], tuple[np.ndarray, np.ndarray, np.ndarray]],
+    away: Away,
+    at_corners: Callable[[DesignState], CornerStress],
 ) -> dict[int, PartStress]:
     """Return the stress of every part by its place in the chain, on this rank alone.
 
     Args:
         arms, trajectory: as for `part_stress`.
-        away: which places (n, d), m, of an arm count, by its index and the scene's margin, m.
-        at_corners: what `_Points` holds of an arm.
+        away: which places count.
+        at_corners: stress of an arm's design.
     """
     scene = next(iter(arms.values())).scene
     motions = motions_of(trajectory)
     found: dict[int, PartStress] = {}
     for k, loads in arm_loads(scene, motions).items():
-        points = _Points(*at_corners(arms[k]))
+        points = at_corners(arms[k].current)
         counts = away(k, points.places, scene.objective.stress_margin)
         for one in loads:
             a, t = one.coefficients, motions[one.motion].t
@@ -147,42 +166,114 @@ def stress_of_parts(
 
 
 @dataclass(frozen=True, eq=False)
-class _Points:
-    """Corners of triangles or tetrahedra, and their stress by load coefficients.
+class CornerStress(PointStress):
+    """Stress of a part's solid material at the corners of triangles or tetrahedra.
+
+    The mean of the cells that count there, weighted by their areas; weights are 1 on the outline.
 
     Attributes:
-        A: (3 or 5, n, m) components of `fem.stress.VON_MISES`, Pa.
         places: (n, d) m.
         corners: (n_cells, d + 1) of the n.
+        vertices: (d + 1, d) of the reference cell.
+        own: (3 or 5, n_cells (d + 1), m) components of every cell by itself, Pa.
+        shares: (n_cells, d + 1) of every cell in the mean at its corners.
     """
 
-    A: np.ndarray
     places: np.ndarray
     corners: np.ndarray
+    vertices: np.ndarray
+    own: np.ndarray
+    shares: np.ndarray
 
     def peak(self, a: np.ndarray, t: np.ndarray, chosen: np.ndarray) -> Peak:
-        """Return the largest stress of the chosen points."""
+        """Return the largest stress of the chosen points, instants t (n,) and coefficients a."""
         largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
         place = tuple(map(float, self.places[chosen][largest.point]))
         return Peak(largest.largest, place, float(t[largest.instant]))
 
+    def counted(self, counts: np.ndarray) -> CornerStress:
+        """Return it with the points (n,) of the outline that count alone."""
+        weights = self.weights * counts
+        return replace(self, A=self.A * (weights > 0.0)[:, None], weights=weights)
 
-def _at_corners(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `_Points` holds of an arm."""
-    state, mesh = arm.current, arm.mesh
+    def through(
+        self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
+    ) -> tuple[np.ndarray, Products]:
+        """Follow derivatives by the stress to nodes, see `PointStress`; which count is held."""
+        state, at = self.state, self.corners.ravel()
+        by_A = by_A * (self.weights > 0.0)[:, None]
+        shares = self.shares.ravel()
+        by_own = by_A[:, at] * shares[:, None]
+        apart = np.einsum("cim,cim->i", by_own, self.own - self.A[:, at])
+        by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area
+        young = state.solid.young_modulus
+        operator = young * stress_operator(state.mesh, state.elastic.operators, self.vertices)
+        fields = state.load_fields
+        stress = StressProduct(self.vertices, young * by_own, fields.columns)
+        return fields.stress_transposed(operator, by_own), Products(volumes=by_areas, stress=stress)
+
+
+def mean_at_corners(
+    state: DesignState, vertices: np.ndarray, counts: np.ndarray, outer: np.ndarray
+) -> CornerStress:
+    """Return the stress at the corners of a design's cells.
+
+    Args:
+        state: meshed in quadratic triangles or tetrahedra, of solid material.
+        vertices: (d + 1, d) of the reference cell.
+        counts: (n_cells, d + 1) whether a cell counts at its corner.
+        outer: (n,) True for nodes of the outline.
+    """
+    mesh = state.mesh
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
-    operator = stress_operator(mesh, state.elastic.operators, VERTICES)
-    A = state.load_fields.stress(state.solid.young_modulus * operator)
-    points = mesh.mesh.geometry.x[:, :2]
-    columns = np.arange(corners.size)
-    # Of a node of the outline the triangles beside the outline count: others know less of it.
-    ends = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [len(points), 1]
-    _, which, count = np.unique(ends, return_inverse=True, return_counts=True)
-    rim = (count == 1)[which.ravel()].reshape(-1, 3)
-    outer = np.zeros(len(points), dtype=bool)
-    outer[corners[rim]] = outer[np.roll(corners, -1, axis=1)[rim]] = True
-    counts = rim.any(axis=1)[:, None] | ~outer[corners]
+    operator = stress_operator(mesh, state.elastic.operators, vertices)
+    own = state.load_fields.stress(state.solid.young_modulus * operator)
+    points = mesh.mesh.geometry.x[:, : mesh.dim]
     area = (mesh.area[:, None] * counts).ravel()
-    share = area / np.bincount(corners.ravel(), area, len(points))[corners.ravel()]
-    mean = sp.csr_matrix((share, (corners.ravel(), columns)), (len(points), corners.size))
-    return np.stack([mean @ one for one in A]), points, corners
+    shares = area / np.bincount(corners.ravel(), area, len(points))[corners.ravel()]
+    columns = np.arange(corners.size)
+    mean = sp.csr_matrix((shares, (corners.ravel(), columns)), (len(points), corners.size))
+    A = np.stack([mean @ one for one in own])
+    shares = shares.reshape(corners.shape)
+    return CornerStress(state, A, outer.astype(float), points, corners, vertices, own, shares)
+
+
+def corner_stress(state: DesignState) -> CornerStress:
+    """Return the stress of a design in the plane.
+
+    Of a node of the outline the triangles beside the outline count: others know less of it.
+    """
+    mesh = state.mesh
+    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
+    count = len(mesh.mesh.geometry.x)
+    ends = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
+    _, which, number = np.unique(ends, return_inverse=True, return_counts=True)
+    rim = (number == 1)[which.ravel()].reshape(-1, 3)
+    outer = np.zeros(count, dtype=bool)
+    outer[corners[rim]] = outer[np.roll(corners, -1, axis=1)[rim]] = True
+    return mean_at_corners(state, VERTICES, rim.any(axis=1)[:, None] | ~outer[corners], outer)
+
+
+# -- as a response: what shape optimisation limits ------------------------------------------------
+
+
+class OutlineStress(Stress):
+    """p-mean over the outline's nodes and instants of the von Mises stress of parts, Pa.
+
+    Nodes count alike; those near singular points do not. The true value is the largest. By
+    densities there is no gradient, parts being solid; by nodes see `shape_sensitivity.by_nodes`.
+    """
+
+    name = "outline_stress"
+
+    def __init__(
+        self, options: Objective, away: Away, at_corners: Callable[[DesignState], CornerStress]
+    ):
+        """Take the scene's options, which places count, and what stress is there."""
+        super().__init__(options, limited=True)
+        self._away, self._at_corners = away, at_corners
+
+    def points_of(self, index: int, state: DesignState) -> CornerStress:
+        """Return the stress of an arm's design on its outline."""
+        found = self._at_corners(state)
+        return found.counted(self._away(index, found.places, self.options.stress_margin))

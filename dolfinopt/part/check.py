@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 SETTLED, SETTLED_STRESS = 1.5e-2, 0.1
 ROUNDS = 2  # refinements of the mesh where stress is largest, at most
 LOST = 0.05  # compliance above that of the densities from which on parts are another design
-DENSITY, CRISP, PART = "density", "crisp", "part"
+DENSITY, CRISP, PART, OPTIMISED = "density", "crisp", "part", "optimised part"
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +57,7 @@ class Check:
         singular: where stress has no limit on the parts and is larger than the one reported.
         singular_arm: which part has it.
         kind: of the cells.
+        before: the parts before their shape was optimised; None where it was not.
     """
 
     units: Mapping[str, str]
@@ -71,30 +72,37 @@ class Check:
     singular: Peak | None
     singular_arm: str
     kind: str = "triangles"
+    before: Column | None = None
+
+    @property
+    def form(self) -> str:
+        """What the parts are called: with optimised shapes they stand beside those before."""
+        return PART if self.before is None else OPTIMISED
 
     @property
     def columns(self) -> dict[str, Column]:
         """The forms by their names."""
-        found = {DENSITY: self.density, CRISP: self.crisp, PART: self.part}
+        found = {DENSITY: self.density, CRISP: self.crisp, PART: self.before, self.form: self.part}
         return {name: one for name, one in found.items() if one is not None}
 
     def table(self) -> DataFrame:
-        """Return a row a figure: unit, density, crisp and part, and the part less the crisp one.
+        """Return a row a figure: unit, every form, and the last one less density and crisp.
 
-        Columns "unit", "density", "crisp", "part", and relative to the first two "part/density",
-        "part/crisp", each less 1.
+        Columns "unit", "density", "crisp", "part", "optimised part" of parts whose shape was
+        optimised, and relative to the first two "part/density", "part/crisp", each less 1.
         """
         from pandas import DataFrame, Index
 
+        forms = [DENSITY, CRISP, *([PART] if self.before else []), self.form]
         rows = []
         for name, unit in self.units.items():
             values = [
-                float("nan") if one is None else one.values[name]
-                for one in (self.density, self.crisp, self.part)
+                self.columns[form].values[name] if form in self.columns else float("nan")
+                for form in forms
             ]
-            ratios = [_ratio(values[2], other) - 1.0 for other in values[:2]]
+            ratios = [_ratio(values[-1], other) - 1.0 for other in values[:2]]
             rows.append([unit, *values, *ratios])
-        names = ["unit", DENSITY, CRISP, PART, "part/density", "part/crisp"]
+        names = ["unit", *forms, "part/density", "part/crisp"]
         return DataFrame(rows, columns=names, index=Index(self.units, name="figure"))
 
     @cached_property

@@ -24,7 +24,7 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.part.check import Check
-    from dolfinopt.part.polish import Polished
+    from dolfinopt.part.optimize import Optimized
 
 FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
 STAGE = ".part-"  # folder of files about to be renamed
@@ -44,7 +44,7 @@ def figures_of(
     scene: Scene,
     parts: Mapping[int, Part],
     check: Check | None = None,
-    polished: Polished | None = None,
+    optimized: Optimized | None = None,
 ) -> dict[str, Any]:
     """Return the content of part.json."""
     arms = {
@@ -58,8 +58,8 @@ def figures_of(
         "thinnest_member": "m",
     }  # fmt: skip
     checked = {} if check is None else check.to_dict()
-    if polished is not None:
-        checked["polish"] = polished.to_dict()
+    if optimized is not None:
+        checked["optimize"] = optimized.to_dict()
     return {"name": scene.name, "arms": arms, "units": units, **checked}
 
 
@@ -69,7 +69,7 @@ def write_parts(
     parts: Mapping[int, Part],
     meshes: Mapping[int, BodyMesh],
     check: Check | None = None,
-    polished: Polished | None = None,
+    optimized: Optimized | None = None,
     pictures: Callable[[Path], None] | None = None,
     design: Path | None = None,
 ) -> dict[str, Any]:
@@ -83,7 +83,8 @@ def write_parts(
         scene: of the arms.
         parts: by their place in the chain.
         meshes: that the scene of the parts has, likewise.
-        check, polished: what the parts do, and what polishing them brought, if it is known.
+        check, optimized: what the parts do, and what optimising their shape brought, if it is
+            known.
         pictures: draws `PICTURES` into a folder.
         design: design.npz of which the parts were made, if they are to be known by it.
 
@@ -100,7 +101,7 @@ def write_parts(
         write_meshes(made, {arm.name: meshes[k] for arm, k in owned if k is not None})
         if pictures is not None:
             pictures(made)
-        figures = figures_of(scene, parts, check, polished)
+        figures = figures_of(scene, parts, check, optimized)
         publish(made, folder, file_names(scene), figures, design)
     return figures
 

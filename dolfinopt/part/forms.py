@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +33,7 @@ else:
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.collocation import Solution
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.parallel import Partition
     from dolfinopt.responses.evaluation import Evaluation
@@ -73,13 +74,18 @@ class Simulated:
 
 
 def simulate_bodies(
-    scene: Scene, parts: Mapping[int, Part], meshes: Mapping[int, BodyMesh], **changes: Any
+    scene: Scene,
+    parts: Mapping[int, Part],
+    meshes: Mapping[int, BodyMesh],
+    start: Sequence[Solution] = (),
+    **changes: Any,
 ) -> Simulated:
     """Simulate a machine whose arms are parts of solid material on given meshes.
 
     Args:
         scene: of the run.
         parts, meshes: by their place in the chain.
+        start: `Trajectory.solutions` of parts nearby.
         changes: tables of the scene that are other than the run's.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -87,15 +93,15 @@ def simulate_bodies(
         data = scene_data(scene, parts, Path(folder))
         for table, keys in changes.items():
             data[table] = {**data.get(table, {}), **keys}
-        return simulate_scene(data)
+        return simulate_scene(data, start)
 
 
-def simulate_scene(data: Mapping[str, Any]) -> Simulated:
+def simulate_scene(data: Mapping[str, Any], start: Sequence[Solution] = ()) -> Simulated:
     """Simulate a machine whose arms are of solid material, by what part.toml holds of it."""
     scene = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
     partition, arms = _built(scene)
     x_phys = {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
-    return _simulated(scene, partition, arms, x_phys)
+    return _simulated(scene, partition, arms, x_phys, start)
 
 
 def _built(scene: Scene) -> tuple[Partition, dict[int, Arm]]:
@@ -111,12 +117,13 @@ def _simulated(
     partition: Partition,
     arms: Mapping[int, Arm],
     x_phys: Mapping[int, np.ndarray],
+    start: Sequence[Solution] = (),
 ) -> Simulated:
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.order_selection import choose_coordinates
 
     choose_coordinates(scene, partition, arms, x_phys, Profile())
-    evaluation, trajectory = evaluate(scene, partition, arms, x_phys, Profile())
+    evaluation, trajectory = evaluate(scene, partition, arms, x_phys, Profile(), start)
     assert trajectory is not None  # on a single rank
     return Simulated(scene, partition, arms, x_phys, evaluation, trajectory)
 

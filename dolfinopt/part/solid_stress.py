@@ -11,17 +11,22 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from dolfinopt.fem.stress import stress_operator
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import facet_corners
-from dolfinopt.part.boundary_stress import PartStress, stress_of_parts
+from dolfinopt.part.boundary_stress import (
+    Away,
+    CornerStress,
+    PartStress,
+    mean_at_corners,
+    stress_of_parts,
+)
 from dolfinopt.part.smooth_surface import distance_to_faces
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.part.solid_domain import SolidDomain
 
@@ -43,6 +48,11 @@ def solid_part_stress(
         trajectory: of these arms; of scenarios the worst counts.
         domains: of every arm.
     """
+    return stress_of_parts(arms, trajectory, away_from_edges(domains), corner_stress)
+
+
+def away_from_edges(domains: Mapping[int, SolidDomain]) -> Away:
+    """Return which places of solid parts count: none near singular edges and interfaces."""
 
     def away(k: int, places: np.ndarray, margin: float) -> np.ndarray:
         domain = domains[k]
@@ -56,7 +66,7 @@ def solid_part_stress(
                 far &= distance_to_faces(places, faces) >= margin
         return far
 
-    return stress_of_parts(arms, trajectory, away, _at_corners)
+    return away
 
 
 def singular_edges(domain: SolidDomain) -> np.ndarray:
@@ -94,14 +104,11 @@ def _beside(domain: SolidDomain, places: np.ndarray) -> np.ndarray:
     return np.asarray(centroids[cKDTree(centroids).query(places)[1]])
 
 
-def _at_corners(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return components of stress, places and corners, see `boundary_stress`."""
-    state, mesh = arm.current, arm.mesh
+def corner_stress(state: DesignState) -> CornerStress:
+    """Return the stress of a design in space, see `boundary_stress`."""
+    mesh = state.mesh
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
-    operator = stress_operator(mesh, state.elastic.operators, VERTICES)
-    A = state.load_fields.stress(state.solid.young_modulus * operator)
-    points = mesh.mesh.geometry.x
-    count = len(points)
+    count = len(mesh.mesh.geometry.x)
     sides = np.array(facet_corners(3, 4))
     facets = np.sort(corners[:, sides], axis=2) @ np.array([count * count, count, 1])
     _, which, number = np.unique(facets, return_inverse=True, return_counts=True)
@@ -111,8 +118,4 @@ def _at_corners(arm: Arm) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for facet, side in enumerate(sides):
         touches[np.ix_(rim[:, facet], side)] = True
     outer[corners[touches]] = True
-    volume = (mesh.area[:, None] * (touches | ~outer[corners])).ravel()
-    columns = np.arange(corners.size)
-    share = volume / np.bincount(corners.ravel(), volume, count)[corners.ravel()]
-    mean = sp.csr_matrix((share, (corners.ravel(), columns)), (count, corners.size))
-    return np.stack([mean @ one for one in A]), points, corners
+    return mean_at_corners(state, VERTICES, touches | ~outer[corners], outer)

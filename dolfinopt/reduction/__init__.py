@@ -9,7 +9,7 @@ import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import AdjointFields, Basis, Options
-from dolfinopt.reduction.free_arm import frame_fields
+from dolfinopt.reduction.free_arm import by_frame_fields, frame_fields
 from dolfinopt.reduction.gramian import balanced
 from dolfinopt.reduction.krylov import krylov, krylov_adjoint
 from dolfinopt.reduction.modal import craig_bampton, craig_bampton_adjoint, modal, modal_adjoint
@@ -46,6 +46,7 @@ __all__ = [
     "Options",
     "balanced",
     "basis_errors",
+    "by_frame_fields",
     "craig_bampton",
     "frame_fields",
     "krylov",

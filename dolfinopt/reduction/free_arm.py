@@ -7,8 +7,11 @@ from collections.abc import Callable
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.fem.interface import rigid_motions
+from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
 from dolfinopt.reduction.eigenproblem import Operators, Pencil, by_column, interior_operators
+
+# Of `frame_fields` among the rigid motions, by the number of directions.
+FRAME_ORDER = {2: [1, 2, 0], 3: [1, 2, 5, 4, 3, 0]}
 
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
@@ -58,8 +61,13 @@ def frame_fields(arm: ElasticArm) -> np.ndarray:
 
     Transverse ones first: they bend the arm. In space 1_y, 1_z, e_z x X, e_y x X, e_x x X, 1_x.
     """
-    order = [1, 2, 0] if arm.mesh.dim == 2 else [1, 2, 5, 4, 3, 0]
+    order = FRAME_ORDER[arm.mesh.dim]
     return np.ascontiguousarray(rigid_motions(arm.points)[:, :, order])
+
+
+def by_frame_fields(by: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n_nodes, d) by the nodes, given those by `frame_fields`."""
+    return by_rigid_motions(by[:, :, np.argsort(FRAME_ORDER[by.shape[1]])])
 
 
 class FreeOperators:

@@ -34,6 +34,7 @@ from dolfinopt.responses.measured import (
     STIFFENING_UNKNOWN_CHANGE,
 )
 from dolfinopt.responses.motion import motion_objective, worst_instants
+from dolfinopt.responses.products import By, by_densities
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -147,7 +148,7 @@ def evaluate(
         if isinstance(found, ConvergenceError):
             raise found
         motion = found
-    analysis = _analysis(scene, partition, arms, trajectory, profile)
+    analysis = analysis_of(scene, partition, arms, trajectory, profile)
     return _measured(analysis, motion), trajectory
 
 
@@ -216,23 +217,24 @@ def _evaluate_alike(
             if any(one.needs and "motion" not in one.needs for one in asked_of(scene)):
                 with together(partition.world):
                     under = {k: arm.under(scene) for k, arm in arms.items()}
-            analysis = _analysis(scene, partition, under, trajectory, profile)
+            analysis = analysis_of(scene, partition, under, trajectory, profile)
             found.append((_measured(analysis, motion), trajectory))
         except ConvergenceError as error:
             found.append(error)
     return found
 
 
-def _analysis(
+def analysis_of(
     scene: Scene,
     partition: Partition,
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None,
     profile: Profile,
+    by: By = by_densities,
 ) -> Analysis:
     """Return what the scene's responses are computed from: the designs that the arms have."""
     designs = {k: arm.current for k, arm in arms.items()}
-    return Analysis(scene, partition, designs, trajectory, profile)
+    return Analysis(scene, partition, designs, trajectory, profile, by)
 
 
 def _check_densities(partition: Partition, arms: Mapping[int, Arm], x_phys: Cells) -> None:
@@ -269,6 +271,7 @@ def gradient(
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None,
     profile: Profile,
+    by: By = by_densities,
 ) -> dict[int, np.ndarray]:
     """Return the objective's gradient by the physical densities of this rank's arms (collective).
 
@@ -277,8 +280,10 @@ def gradient(
         partition, arms: as for `evaluate`, with the design reduced.
         trajectory: what `evaluate` returned.
         profile: of this rank.
+        by: `shape_sensitivity.by_nodes` for the gradient by the places of the arms' nodes.
     """
-    rows = objective_of(scene).gradients(_analysis(scene, partition, arms, trajectory, profile))
+    analysis = analysis_of(scene, partition, arms, trajectory, profile, by)
+    rows = objective_of(scene).gradients(analysis)
     if len(rows) == 1:
         return rows[0]
     return {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in arms}
@@ -293,7 +298,7 @@ class ConstraintGradient:
     Attributes:
         response: whose value it is.
         smooth: derivative of the smooth value by the physical densities (n_cells,) of every arm
-            that it depends on.
+            that it depends on, or by other variables of the designs.
         limit: in the unit of the smooth value.
     """
 
@@ -314,6 +319,7 @@ def constraint_gradients(
     trajectory: Trajectory | None = None,
     profile: Profile | None = None,
     measured: Sequence[Measured] = (),
+    by: By = by_densities,
 ) -> list[ConstraintGradient]:
     """Return the gradients of `Evaluation.constraints` (collective).
 
@@ -321,8 +327,9 @@ def constraint_gradients(
         scene, partition, arms, trajectory, profile: as for `gradient`; the last two are for
             constraints of the motion alone.
         measured: `Evaluation.responses` of the design; measured anew if not given.
+        by: as for `gradient`.
     """
-    analysis = _analysis(scene, partition, arms, trajectory, profile or Profile())
+    analysis = analysis_of(scene, partition, arms, trajectory, profile or Profile(), by)
     found = []
     for k, bound in enumerate(constraints_of(scene), 1):
         rows = bound.response.gradients(analysis)

@@ -12,6 +12,7 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.parallel import on_all_ranks, on_root, together
+from dolfinopt.responses.products import Products
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -89,7 +90,7 @@ class Eigenfrequency(Response):
             own = {}
             for place, one in modes.items():
                 _, by_values = squared_period(one, self.options.exponent, self.follow)
-                own[place] = period_gradient(by_place[place], one, by_values)
+                own[place] = period_gradient(by_place[place], one, by_values, analysis.by)
         by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
         zero = [np.zeros_like(one.matrix()) for one in chain.carried()]
@@ -98,14 +99,14 @@ class Eigenfrequency(Response):
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
                 by_body: dict[int, Any] = by_owner(scene, chain.cotangents(carried))
                 row = {
-                    k: rigid_gradient(state, by_body[k])
+                    k: rigid_gradient(state, by_body[k], analysis.by)
                     if _counts(by_body[k])
-                    else np.zeros_like(state.x_phys)  # it is not outboard of this place
+                    else analysis.by(state, Products())  # it is not outboard of this place
                     for k, state in designs.items()
                 }
                 owner = scene.owners[place]
                 if owner in row:
-                    row[owner] = row[owner] + own[place].cells
+                    row[owner] = row[owner] + own[place].own
                 rows.append(row)
         return rows
 

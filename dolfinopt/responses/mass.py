@@ -9,6 +9,7 @@ import numpy as np
 from dolfinopt.arms.arm import fixed_body
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import on_root, sum_over_arms, together
+from dolfinopt.responses.products import Products
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -49,10 +50,15 @@ class Mass(Response):
         return Measured(self.name, ("",), value, value)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the derivative rho'_e V_e."""
-        designs = analysis.designs
-        volumes = cell_volumes(analysis.scene, {k: one.mesh for k, one in designs.items()})
-        return [{k: designs[k].density_slope * volume for k, volume in volumes.items()}]
+        """Return the derivative rho'_e V_e by the densities, rho_e by the cells' volumes."""
+        designs, depth, row = analysis.designs, _depths(analysis.scene), {}
+        with together(analysis.partition.world):
+            for k, volume in _of_cells(analysis).items():
+                one = designs[k]
+                by_volume = one.solid.density * depth[k] * one.material.mass
+                products = Products(densities=one.density_slope * volume, volumes=by_volume)
+                row[k] = analysis.by(one, products)
+        return [row]
 
 
 # -- volume of every design, or of all together --------------------------------------------------
@@ -78,10 +84,15 @@ class VolumeFraction(Response):
         return Measured(self.name, names, tuple((filled / full).tolist()), tuple(filled.tolist()))
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the volumes of the cells that belong to each value."""
-        volumes, rows = _of_cells(analysis), _rows(analysis)
+        """Return the volumes of the cells that belong to each value, or x_e by their volumes."""
+        rows, depth, found = _rows(analysis), _depths(analysis.scene), {}
+        with together(analysis.partition.world):
+            for k, volume in _of_cells(analysis).items():
+                one = analysis.designs[k]
+                products = Products(densities=volume, volumes=depth[k] * one.x_phys)
+                found[k] = analysis.by(one, products)
         return [
-            {k: one for k, one in volumes.items() if rows[k] == row}
+            {k: one for k, one in found.items() if rows[k] == row}
             for row in range(1 + max(rows.values()))
         ]
 
@@ -104,8 +115,13 @@ class VolumeFraction(Response):
 
 def cell_volumes(scene: Scene, meshes: Mapping[int, ArmMesh]) -> dict[int, np.ndarray]:
     """Return the volume (n_cells,) of every arm's cells times the arms that have them, m3."""
-    uses = occurrences(scene)
-    return {k: uses[k] * scene.arms[k].depth * mesh.area for k, mesh in meshes.items()}
+    depth = _depths(scene)
+    return {k: depth[k] * mesh.area for k, mesh in meshes.items()}
+
+
+def _depths(scene: Scene) -> dict[int, float]:
+    """Return what an area of a design's mesh counts in all arms that have it, m; in space 1's."""
+    return {k: count * scene.arms[k].depth for k, count in occurrences(scene).items()}
 
 
 def _of_cells(analysis: Analysis) -> dict[int, np.ndarray]:

@@ -200,10 +200,12 @@ class MotionResponse(Response):
         if self.options.gradient == "esl" and self.name not in EXACT_ONLY:
             A = on_root(partition.world, moments)
             with together(partition.world):
-                return {k: esl_gradient(one, A[k]) for k, one in designs.items()}
+                return {k: esl_gradient(one, A[k], analysis.by) for k, one in designs.items()}
         by_body = on_root(partition.world, cotangents)
         with together(partition.world):
-            return {k: exact_gradient(one, by_body[k]) for k, one in designs.items()}
+            return {
+                k: exact_gradient(one, by_body[k], by=analysis.by) for k, one in designs.items()
+            }
 
 
 class ComplianceResponse(MotionResponse):

@@ -27,6 +27,7 @@ from dolfinopt.arms.arm import fixed_body
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, scaled
 from dolfinopt.parallel import Partition
+from dolfinopt.responses.products import By, by_densities
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R", bound="type[Response]")
 
-# (n_cells,) by the arms of this rank; an arm without an entry has no influence.
+# (n_cells,) by the arms of this rank; an arm without an entry has no influence. Where it is the
+# gradient by other variables, see `Analysis.by`, arrays have their shape.
 CellGradient = dict[int, np.ndarray]
 
 
@@ -52,6 +54,7 @@ class Analysis:
         designs: of this rank's arms.
         trajectory: on the root, where a response needs a motion; None elsewhere.
         profile: of this rank.
+        by: what gradients are by: the physical densities, or other variables of the designs.
     """
 
     scene: Scene
@@ -59,6 +62,7 @@ class Analysis:
     designs: Mapping[int, DesignState]
     trajectory: Trajectory | None
     profile: Profile
+    by: By = by_densities
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,10 @@ class Response(ABC):
 
     @abstractmethod
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the gradient of every smooth value by the physical densities (collective)."""
+        """Return the gradient of every smooth value by the physical densities (collective).
+
+        Or by other variables of the designs, as `Analysis.by` says.
+        """
 
     def smooth_limits(
         self, analysis: Analysis, measured: Measured, limits: np.ndarray

@@ -1,8 +1,14 @@
-"""Gradients of one arm's functions by its physical densities, over this rank's cells."""
+"""Gradients of one arm's functions by its design, over this rank's cells.
+
+By default by the physical densities; all end in `Products`, of which gradients by other variables
+are made as well.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +17,7 @@ from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
+from dolfinopt.fem.stress import ElasticFieldGradient
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
@@ -18,13 +25,14 @@ from dolfinopt.multibody.shape_integrals import (
     mass_partners,
     rigid_body,
 )
-from dolfinopt.reduction import METHODS, frame_fields
+from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
 from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
+from dolfinopt.responses.products import By, Pair, Products, by_densities
 from dolfinopt.responses.response import p_norm_of_lengths
 
 
-def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
-    """Return the derivative by x_phys of one arm with the equivalent static loads frozen.
+def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_densities) -> np.ndarray:
+    """Return the derivative by the design of one arm with the equivalent static loads frozen.
 
     dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
     coordinates at most, however many load cases. For the compliance lambda_j = q_j.
@@ -33,24 +41,28 @@ def esl_gradient(state: DesignState, A: np.ndarray) -> np.ndarray:
     Args:
         state: of the arm.
         A: (q, q) see `motion.MotionResponse.load_case_moments`.
+        by: what it is the derivative by.
 
     Returns:
-        (n_cells,) over this rank's cells.
+        (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
         left, values, right = np.linalg.svd(A)
         keep = values > LOAD_CASES_RANK_SHARE * values[0]
         V = state.basis.V
-        energies = state.elastic.cell_stiffness_products(
-            combine(V, left[:, keep] * values[keep]), combine(V, right[keep].T)
-        )
-        return -state.young_slope * energies
+        pair = combine(V, left[:, keep] * -values[keep]), combine(V, right[keep].T)
+        interfaces = partial(pairs_at_interfaces, state.elastic, (pair,))
+        return by(state, Products(stiffness=(pair,), interfaces=interfaces))
 
 
 def exact_gradient(
-    state: DesignState, cotangents: ShapeIntegrals, by_columns: np.ndarray | None = None
+    state: DesignState,
+    cotangents: ShapeIntegrals,
+    by_columns: np.ndarray | None = None,
+    by: By = by_densities,
+    beside: Products | None = None,
 ) -> np.ndarray:
-    """Return the derivative by x_phys of one arm of a function of its floating body.
+    """Return the derivative by the design of one arm of a function of its floating body.
 
     Every integral is a product u . M v or u . K v of modes and rigid motions, so its derivative
     has a part by M and K, cell by cell, and one by the modes V; the latter goes through
@@ -61,56 +73,127 @@ def exact_gradient(
         cotangents: the function's derivatives by the body's integrals; those by D join K's.
         by_columns: (n_nodes, d, columns) its derivatives by `LoadFields.columns`, where it
             depends on these, too; contributions of this rank's cells.
+        by: what it is the derivative by.
+        beside: what the function depends on beside body and columns: neither K, M nor places.
 
     Returns:
-        (n_cells,) over this rank's cells.
+        (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        elastic, basis = state.elastic, state.basis
-        V = basis.V
-        damping = state.scene.damping.stiffness_proportional
-        by_K = cotangents.K + damping * cotangents.D
-        by_modes = cotangents.along_modes
-        if len(by_modes):
-            cotangents, by_modes = by_modal_loads(state.body, cotangents)
-        partners = mass_partners(elastic.points, V, cotangents)
-        by_V = elastic.mass_times(partners.by_modes)
-        by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
-        geometric = inertial = by_unit_loads = None
-        if by_columns is not None:
-            modes, by_unit_loads, by_elastic = state.load_fields.split(by_columns)
-            inertial = state.load_fields.gradient(by_elastic)
-            by_V += modes + inertial.by_modes
-        if cotangents.is_stiffened or by_unit_loads is not None:
-            static = state.scene.reduction.method == "craig-bampton"
-            geometric = _geometric_gradient(state, cotangents, by_modes, by_unit_loads)
-            by_V += geometric.by_modes
-            if static:  # K's first block is S; the constraint modes' interior is in equilibrium
-                b = len(geometric.by_stiffness)
-                by_K[:b, :b] += geometric.by_stiffness
-        interior, outboard = elastic.restrict(by_V)
-        method = METHODS[state.scene.reduction.method]
-        assert method.adjoint is not None  # the scene refuses the others
-        fields = method.adjoint(
-            elastic, basis, state.reduction_options, interior, outboard + cotangents.outboard
-        )
-        partners.left[:, :, 1:-1] += fields.mass
-        left = combine(V, by_K.T) - fields.stiffness
-        if geometric is None:
-            energies = elastic.cell_stiffness_products(left, V)
-        else:
-            energies = geometric.by_young_beside(left, V)
-            # The partners of X and 1_x stand at the ends, those of the modes between them.
-            partners.left[:, :, [-1, 0]] += geometric.by_inertia
-            if cotangents.is_stiffened:
-                partners.left[:, :, 1:-1] += geometric.by_modal_inertia
-        masses = elastic.cell_mass_products(partners.left, partners.right)
-        if fields.frame is not None:
-            masses += elastic.cell_mass_products(fields.frame, frame_fields(elastic))
-        if inertial is not None:
-            energies += inertial.by_young
-            masses += inertial.by_density
-        return state.young_slope * energies + state.density_slope * masses
+        found = _body_products(state, cotangents, by_columns)
+        if beside is not None:
+            found = replace(
+                found, densities=beside.densities, volumes=beside.volumes, stress=beside.stress
+            )
+        return by(state, found)
+
+
+def _body_products(
+    state: DesignState, cotangents: ShapeIntegrals, by_columns: np.ndarray | None
+) -> Products:
+    """Return what carries a change of one arm's design to a function of its body (collective)."""
+    elastic, basis = state.elastic, state.basis
+    V = basis.V
+    damping = state.scene.damping.stiffness_proportional
+    by_K = cotangents.K + damping * cotangents.D
+    by_modes = cotangents.along_modes
+    if len(by_modes):
+        cotangents, by_modes = by_modal_loads(state.body, cotangents)
+    partners = mass_partners(elastic.points, V, cotangents)
+    by_V = elastic.mass_times(partners.by_modes)
+    by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
+    geometric = inertial = by_unit_loads = None
+    if by_columns is not None:
+        modes, by_unit_loads, by_elastic = state.load_fields.split(by_columns)
+        inertial = state.load_fields.gradient(by_elastic)
+        by_V += modes + inertial.by_modes
+    if cotangents.is_stiffened or by_unit_loads is not None:
+        static = state.scene.reduction.method == "craig-bampton"
+        geometric = _geometric_gradient(state, cotangents, by_modes, by_unit_loads)
+        by_V += geometric.by_modes
+        if static:  # K's first block is S; the constraint modes' interior is in equilibrium
+            b = len(geometric.by_stiffness)
+            by_K[:b, :b] += geometric.by_stiffness
+    interior, outboard = elastic.restrict(by_V)
+    method = METHODS[state.scene.reduction.method]
+    assert method.adjoint is not None  # the scene refuses the others
+    fields = method.adjoint(
+        elastic, basis, state.reduction_options, interior, outboard + cotangents.outboard
+    )
+    partners.left[:, :, 1:-1] += fields.mass
+    places = partners.by_points
+    if geometric is not None:
+        # The partners of X and 1_x stand at the ends, those of the modes between them.
+        partners.left[:, :, [-1, 0]] += geometric.by_inertia
+        places = places + geometric.by_inertia[:, :, 1]
+        if cotangents.is_stiffened:
+            partners.left[:, :, 1:-1] += geometric.by_modal_inertia
+    interfaces = partial(_at_interfaces, state, by_V, fields, geometric, inertial)
+    stiffness: list[Pair] = [(combine(V, by_K.T) - fields.stiffness, V)]
+    mass: list[Pair] = [(partners.left, partners.right)]
+    if fields.frame is not None:
+        mass.append((fields.frame, frame_fields(elastic)))
+        places = places + by_frame_fields(fields.frame)
+    if inertial is not None:
+        stiffness.append(inertial.stiffness)
+        mass.append(inertial.mass)
+    return Products(tuple(stiffness), tuple(mass), geometric, places, interfaces)
+
+
+def _at_interfaces(
+    state: DesignState,
+    by_V: np.ndarray,
+    fields: AdjointFields,
+    geometric: GeometricGradient | None,
+    inertial: ElasticFieldGradient | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `Products.interfaces` does of a function of a body (collective).
+
+    Modes and all other fields are T times what they are solved for, and so are their adjoints; what
+    either are multiplied by in the Lagrangian, T aside, is zero within T's range alone.
+    """
+    elastic, basis = state.elastic, state.basis
+    T, V = elastic.substructure.T, basis.V
+    by_V = by_V - elastic.stiffness_times(fields.stiffness) + elastic.mass_times(fields.mass)
+    if geometric is not None:
+        by_S = geometric.by_stiffness + geometric.by_stiffness.T  # see `_body_products`
+        b = len(by_S)
+        by_V[:, :, :b] += elastic.stiffness_times(combine(V[:, :, :b], by_S))
+        if geometric.face is not None:
+            by_V -= geometric.face.by_modes  # the rotations are coordinates, whatever T
+    rigid = by_V @ basis.outboard.T
+    rigid -= elastic.stiffness_times(V) @ T.coordinates(fields.stiffness).T
+    rigid += basis.MV @ T.coordinates(fields.mass).T
+    if fields.frame is not None:
+        weighted = elastic.mass_times(frame_fields(elastic))
+        rigid += weighted @ T.coordinates(fields.frame).T
+    levers = np.zeros_like(elastic.points)
+    if geometric is not None:
+        more, levers = geometric.at_interfaces()
+        rigid += more
+    return rigid if inertial is None else rigid + inertial.at_interfaces(), levers
+
+
+def pairs_at_interfaces(
+    elastic: ElasticArm,
+    stiffness: Sequence[Pair],
+    mass: Sequence[Pair] = (),
+    direct: Sequence[Pair] = (),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `Products.interfaces` does of pairs of fields that T makes (collective).
+
+    Args:
+        elastic: the design.
+        stiffness, mass: as in `Products`.
+        direct: derivatives by nodal values, contributions of this rank's cells, and the field.
+    """
+    T, rigid = elastic.substructure.T, np.zeros_like(elastic.rigid)
+    for by, field in direct:
+        rigid += by @ T.coordinates(field).T
+    for pairs, times in ((stiffness, elastic.stiffness_times), (mass, elastic.mass_times)):
+        for left, right in pairs:
+            rigid += times(left) @ T.coordinates(right).T + times(right) @ T.coordinates(left).T
+    return rigid, np.zeros_like(elastic.points)
 
 
 def _geometric_gradient(
@@ -129,24 +212,31 @@ def _geometric_gradient(
     return loads.gradient(state.basis.V, by_K0, static=static, by_fields=by_fields)
 
 
-def static_gradient(state: DesignState, response: StaticResponse) -> np.ndarray:
-    """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads."""
-    return _static_gradient(state, response.loads, response.loads)
+def static_gradient(
+    state: DesignState, response: StaticResponse, by: By = by_densities
+) -> np.ndarray:
+    """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads.
+
+    Or the derivative by other variables of the design, see `Products`.
+    """
+    return _static_gradient(state, response.loads, response.loads, by)
 
 
 def deflection_gradient(
-    state: DesignState, response: StaticResponse, exponent: float
+    state: DesignState, response: StaticResponse, exponent: float, by: By = by_densities
 ) -> np.ndarray:
-    """Return d deflection / dx_phys (n_cells,), by one adjoint load a case."""
-    return _static_gradient(state, response.deflection_gradient(exponent), response.loads)
+    """Return d deflection / dx_phys (n_cells,), by one adjoint load a case; or by others."""
+    return _static_gradient(state, response.deflection_gradient(exponent), response.loads, by)
 
 
-def _static_gradient(state: DesignState, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return -E' sum_k u(left_k)' k_e u(right_k) for outboard loads (b, k)."""
+def _static_gradient(state: DesignState, left: np.ndarray, right: np.ndarray, by: By) -> np.ndarray:
+    """Differentiate -sum_k u(left_k)' K u(right_k), fields held, of outboard loads (b, k)."""
     fields = state.elastic.static_fields(np.hstack([right, left]))
     with state.elastic.profile.phase("gradient"):
-        of_left, of_right = (combine(fields.field, fields.amplitudes(f)) for f in (left, right))
-        return -state.young_slope * state.elastic.cell_stiffness_products(of_left, of_right)
+        of_left, of_right = (combine(fields.field, fields.amplitudes(f)) for f in (-left, right))
+        pairs = ((of_left, of_right),)
+        interfaces = partial(pairs_at_interfaces, state.elastic, pairs)
+        return by(state, Products(stiffness=pairs, interfaces=interfaces))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,16 +244,17 @@ class PeriodGradient:
     """Derivatives of one arm's squared period.
 
     Attributes:
-        cells: (n_cells,) by its own physical densities, what it carries held.
+        own: (n_cells,) by its own physical densities, or by other variables of its design, what
+            it carries held.
         carried: (3, 3) by the matrix of what it carries.
     """
 
-    cells: np.ndarray
+    own: np.ndarray
     carried: np.ndarray
 
 
 def period_gradient(
-    state: DesignState, modes: LoadedModes, by_values: np.ndarray
+    state: DesignState, modes: LoadedModes, by_values: np.ndarray, by: By = by_densities
 ) -> PeriodGradient:
     """Differentiate a function of the eigenvalues, given its derivative by them (k,).
 
@@ -171,23 +262,27 @@ def period_gradient(
     """
     with state.elastic.profile.phase("gradient"):
         weighted = modes.field * by_values
-        energies = state.elastic.cell_stiffness_products(weighted, modes.field)
-        masses = state.elastic.cell_mass_products(weighted * modes.values, modes.field)
-        cells = state.young_slope * energies
-        cells -= state.density_slope * masses
+        pairs = ((weighted, modes.field),), ((weighted * -modes.values, modes.field),)
+        interfaces = partial(pairs_at_interfaces, state.elastic, *pairs)
+        own = by(state, Products(*pairs, interfaces=interfaces))
         carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
-        return PeriodGradient(cells, carried)
+        return PeriodGradient(own, carried)
 
 
-def rigid_gradient(state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals) -> np.ndarray:
-    """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,)."""
-    points, by = state.elastic.points, by_rigid
-    if isinstance(by, RigidIntegrals):
-        moment = np.array([by.moment.real, by.moment.imag])
-        by = rigid_body(by.mass, moment, by.inertia, np.zeros(2))
-    partners = mass_partners(points, np.empty((*points.shape, 0)), by)
-    masses = state.elastic.cell_mass_products(partners.left, partners.right)
-    return state.density_slope * masses
+def rigid_gradient(
+    state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals, by: By = by_densities
+) -> np.ndarray:
+    """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,).
+
+    Or by other variables of the design, see `Products`.
+    """
+    points, integrals = state.elastic.points, by_rigid
+    if isinstance(integrals, RigidIntegrals):
+        moment = np.array([integrals.moment.real, integrals.moment.imag])
+        integrals = rigid_body(integrals.mass, moment, integrals.inertia, np.zeros(2))
+    partners = mass_partners(points, np.empty((*points.shape, 0)), integrals)
+    mass = partners.left, partners.right
+    return by(state, Products(mass=(mass,), places=partners.by_points))
 
 
 # -- one arm under static loads of its outboard interface: compliance and deflection -------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.parallel import on_all_ranks, together
+from dolfinopt.responses.products import Products
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -42,10 +43,11 @@ class StaticCompliance(Response):
         rows = []
         with together(analysis.partition.world):
             for owner in analysis.scene.cell_counts:
-                row: CellGradient = {k: np.zeros_like(one.x_phys) for k, one in designs.items()}
+                row: CellGradient = {k: analysis.by(one, Products()) for k, one in designs.items()}
                 if owner in designs:
                     response = static_response(designs[owner].elastic, self._loads(analysis))
-                    row[owner] = static_gradient(designs[owner], response) * uses[owner]
+                    gradient = static_gradient(designs[owner], response, analysis.by)
+                    row[owner] = gradient * uses[owner]
                 rows.append(row)
         return rows
 
@@ -79,12 +81,12 @@ class TipDeflection(Response):
         """Return the gradient of every design's deflection (collective)."""
         designs, rows = analysis.designs, []
         for owner in analysis.scene.cell_counts:
-            row = {k: np.zeros_like(one.x_phys) for k, one in designs.items()}
             with together(analysis.partition.world):
+                row = {k: analysis.by(one, Products()) for k, one in designs.items()}
                 if owner in designs:
                     response = static_response(designs[owner].elastic, self._loads(analysis))
                     row[owner] = deflection_gradient(
-                        designs[owner], response, self.options.exponent
+                        designs[owner], response, self.options.exponent, analysis.by
                     )
             rows.append(row)
         return rows

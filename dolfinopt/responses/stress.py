@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +15,8 @@ from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.geometric_stiffness import static_response
+from dolfinopt.fem.stress import element_centres
+from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
@@ -27,6 +31,7 @@ from dolfinopt.responses.measured import (
     NEGLIGIBLE_POWER_SHARE,
     P_MEAN_STRIDE,
 )
+from dolfinopt.responses.products import By, Products, StressProduct
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -37,7 +42,7 @@ from dolfinopt.responses.response import (
     factors,
     register,
 )
-from dolfinopt.responses.sensitivity import exact_gradient
+from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import NEEDS
 
@@ -50,21 +55,19 @@ from dolfinopt.scene.tables.objective import NEEDS
 
 
 @dataclass(frozen=True, eq=False)
-class CellStress:
-    """Relaxed stress of one design by the coefficients of its load fields.
+class PointStress(ABC):
+    """Stress at some points of one design by the coefficients of its load fields.
 
     Attributes:
         state: the design.
-        A: (3, n_cells, m) components whose length is the relaxed stress, Pa per coefficient; zero
-            in cells that do not count.
-        weights: (n_cells,) area of those that count, m2.
-        root: (n_cells,) x^(1/2).
+        A: (3, n_points, m) components whose length is the stress, Pa per coefficient; zero at
+            points that do not count.
+        weights: (n_points,) of those that count in the p-mean.
     """
 
     state: DesignState
     A: np.ndarray
     weights: np.ndarray
-    root: np.ndarray
 
     def power_sum(self, a: np.ndarray, unit: float, exponent: float) -> float:
         """Return sum_n sum_e weight_e (s_en / unit)^p over this rank's cells; a is (n, m)."""
@@ -80,8 +83,8 @@ class CellStress:
         """Differentiate `power_sum` over p, times unit: sum weight (s / unit)^(p-1) ds.
 
         Returns:
-            By the coefficients (n, m); by A of full density (3, n_cells, m); by x (n_cells,), all
-            of them over this rank's cells.
+            By the coefficients (n, m); by A (3, n_points, m); by the logarithms of s, all instants
+            together (n_points,); of this rank's points.
         """
         by_a, by_A = np.empty_like(a), np.zeros_like(self.A)
         squared = np.zeros(len(self.weights))  # dJ . s
@@ -94,15 +97,47 @@ class CellStress:
             flat = e.reshape(-1, e.shape[2])
             by_a[part] = flat.T @ self.A.reshape(len(flat), -1)
             by_A += e @ a[part]
-        x = self.state.x_phys
-        by_x = np.divide(0.5 * squared, x, out=np.zeros_like(x), where=x > 0.0)
-        return by_a, by_A * self.root[:, None], by_x
+        return by_a, by_A, squared
 
-    def by_columns(self, by_A: np.ndarray) -> np.ndarray:
-        """Return the derivatives by `LoadFields.columns` (n_nodes, 2, m) from those by A."""
-        operator = self.state.elastic.substructure.stress_operator
-        young = self.state.solid.young_modulus
-        return self.state.load_fields.stress_transposed(operator, young * by_A)
+    @abstractmethod
+    def through(
+        self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
+    ) -> tuple[np.ndarray, Products]:
+        """Follow derivatives by the stress to the design.
+
+        Args:
+            by_A: (3, n_points, m), the design's fields alone being free.
+            by_logs: (n_points,) by the logarithms of the stress.
+            by_weights: (n_points,).
+
+        Returns:
+            The derivatives by `LoadFields.columns` (n_nodes, d, m), contributions of this rank's
+            cells, and by what else the stress depends on.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class CellStress(PointStress):
+    """Relaxed stress of one design at its element centres; weights are areas, m2.
+
+    Attributes:
+        root: (n_cells,) x^(1/2).
+    """
+
+    root: np.ndarray
+
+    def through(
+        self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
+    ) -> tuple[np.ndarray, Products]:
+        """Follow derivatives by the stress to the design, see `PointStress`."""
+        state, x = self.state, self.state.x_phys
+        by_stress = state.solid.young_modulus * by_A * self.root[:, None]
+        operator = state.elastic.substructure.stress_operator
+        columns = state.load_fields.stress_transposed(operator, by_stress)
+        centre = element_centres(compat.cell_corner_count(state.mesh.mesh), state.mesh.dim)
+        by_x = np.divide(0.5 * by_logs, x, out=np.zeros_like(x), where=x > 0.0)
+        stress = StressProduct(centre, by_stress, state.load_fields.columns)
+        return columns, Products(densities=by_x, volumes=by_weights, stress=stress)
 
 
 def cell_stress(state: DesignState, margin: float = 0.0) -> CellStress:
@@ -309,28 +344,37 @@ class Stress(Response):
                 parts[k] = _gradient_of_arm(analysis.partition, found, chosen, found.cells[k], p)
         if self.options.gradient == "esl":
             with together(analysis.partition.world):
-                return [{k: _esl_gradient(one, found.cells[k]) for k, one in parts.items()}]
+                return [
+                    {k: _esl_gradient(one, found.cells[k], analysis.by) for k, one in parts.items()}
+                ]
         by_body = _by_bodies(analysis, parts)
         with together(analysis.partition.world):
             row = {}
             for k, one in parts.items():
                 state, cotangents = found.cells[k].state, by_body[k]
-                columns = found.cells[k].by_columns(one.by_A)
-                row[k] = one.by_x + exact_gradient(state, cotangents, columns)
+                columns, beside = one.through(found.cells[k])
+                row[k] = exact_gradient(state, cotangents, columns, analysis.by, beside)
             return [row]
+
+    def points_of(self, index: int, state: DesignState) -> PointStress:
+        """Return the stress of an arm's design where it counts (collective on the arm's ranks).
+
+        Args:
+            index: of the arm.
+            state: its design.
+        """
+        return cell_stress(state, self.options.stress_margin)
 
     def _found(self, analysis: Analysis) -> _Found:
         """Return what is known of the design, once for value and gradient (collective)."""
         first: DesignState | None = next(iter(analysis.designs.values()), None)
-        kept = None if first is None else first.kept.get(self.name)
+        kept: _Found | None = None if first is None else first.kept.get(self.name)
         # The root, which has an arm and the trajectory, speaks for all: they work in step.
         known = kept is not None and kept.trajectory is analysis.trajectory
-        known = analysis.partition.world.bcast(known, root=0)
-        if known and first is not None:
-            found: _Found = first.kept[self.name]
-            return found
-        if known:
-            return _Found(analysis.trajectory, {}, {}, 0.0, 0.0, 0.0, 1.0)
+        numbers = None if kept is None or not known else kept.numbers
+        numbers = analysis.partition.world.bcast(numbers, root=0)
+        if numbers is not None:
+            return kept or _Found(analysis.trajectory, {}, {}, *numbers)
         found = self._evaluate(analysis)
         if first is not None:
             first.kept[self.name] = found
@@ -339,20 +383,20 @@ class Stress(Response):
     def _evaluate(self, analysis: Analysis) -> _Found:
         """Screen all motions for the largest stress, and sum powers (collective)."""
         partition, trajectory = analysis.partition, analysis.trajectory
-        options, p = self.options, self.options.stress_exponent
+        p = self.options.stress_exponent
 
         def loads() -> dict[int, list[ArmLoads]]:
             assert trajectory is not None
             return arm_loads(analysis.scene, motions_of(trajectory))
 
         by_owner: dict[int, list[ArmLoads]] = on_root(partition.world, loads)
-        cells: dict[int, CellStress] = {}
+        cells: dict[int, PointStress] = {}
         seen: dict[int, list[_Chosen]] = {}
         weights: dict[int, float] = {}
         largest = 0.0
         with together(partition.world):
             for k, state in analysis.designs.items():
-                cells[k] = cell_stress(state, options.stress_margin)
+                cells[k] = self.points_of(k, state)
                 with analysis.profile.phase("stress"):
                     seen[k], own = _screened(partition, cells[k], by_owner[k])
                     area = partition.comm.allreduce(float(cells[k].weights.sum()))
@@ -377,7 +421,7 @@ class Stress(Response):
 
 
 def _screened(
-    partition: Partition, cells: CellStress, loads: Sequence[ArmLoads]
+    partition: Partition, cells: PointStress, loads: Sequence[ArmLoads]
 ) -> tuple[list[_Chosen], float]:
     """Return every motion's evenly spaced instants, and the largest stress of all (collective)."""
     found, largest = [], 0.0
@@ -385,7 +429,8 @@ def _screened(
         coarse = every(len(one.coefficients))
         screened = screen(partition.comm, cells.A, one.coefficients, coarse)
         largest = max(largest, screened.largest)
-        found.append(_Chosen(one, coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]))
+        instants, values = coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]
+        found.append(_Chosen(one, instants, values, len(instants)))
     return found, largest
 
 
@@ -397,11 +442,13 @@ class _Chosen:
         loads: of all instants.
         instants: (k,) of them.
         values: (k,) largest stress of the arm there, Pa.
+        count: of the instants among which they were chosen.
     """
 
     loads: ArmLoads
     instants: np.ndarray
     values: np.ndarray
+    count: int
 
     @property
     def a(self) -> np.ndarray:
@@ -411,7 +458,7 @@ class _Chosen:
     def above(self, limit: float) -> _Chosen:
         """Return those whose stress is not smaller."""
         kept = self.values >= limit
-        return _Chosen(self.loads, self.instants[kept], self.values[kept])
+        return _Chosen(self.loads, self.instants[kept], self.values[kept], self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,12 +473,17 @@ class _Found:
     """
 
     trajectory: Trajectory | None
-    cells: Mapping[int, CellStress]
+    cells: Mapping[int, PointStress]
     chosen: Mapping[int, Sequence[_Chosen]]
     largest: float
     smooth: float
     total: float
     weight: float
+
+    @property
+    def numbers(self) -> tuple[float, float, float, float]:
+        """What is the same on all ranks."""
+        return self.largest, self.smooth, self.total, self.weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -441,22 +493,26 @@ class _ArmGradient:
     Attributes:
         by_loads: by the loads' coefficients, of every one of `chosen`; of all of the arm's cells.
         chosen: which.
-        by_A: (3, n_cells, m) by the stress of the columns at full density.
-        by_x: (n_cells,) strains held.
+        by_A, by_logs, by_weights: see `PointStress.through`.
     """
 
     by_loads: Sequence[np.ndarray]
     chosen: Sequence[_Chosen]
     by_A: np.ndarray
-    by_x: np.ndarray
+    by_logs: np.ndarray
+    by_weights: np.ndarray
+
+    def through(self, points: PointStress) -> tuple[np.ndarray, Products]:
+        """Return derivatives by the load fields, and what it is made of beside these."""
+        return points.through(self.by_A, self.by_logs, self.by_weights)
 
 
 def _gradient_of_arm(
-    partition: Partition, found: _Found, chosen: Sequence[_Chosen], cells: CellStress, p: float
+    partition: Partition, found: _Found, chosen: Sequence[_Chosen], cells: PointStress, p: float
 ) -> _ArmGradient:
     """Differentiate by what one arm's stress is made of (collective on the arm's ranks)."""
     by_loads, by_A = [], np.zeros_like(cells.A)
-    by_x = np.zeros_like(cells.weights)
+    by_logs, by_weights = np.zeros((2, len(cells.weights)))
     factor = 0.0
     if found.total:
         factor = float(found.total ** (1.0 / p - 1.0) * found.weight ** (-1.0 / p))
@@ -468,8 +524,14 @@ def _gradient_of_arm(
             by_a, more, by = cells.power_sum_gradient(one.a, found.largest, p)
             by_loads.append(factor * partition.comm.allreduce(by_a))
             by_A += factor * more
-            by_x += factor * by
-    return _ArmGradient(by_loads, chosen, by_A, by_x)
+            by_logs += factor * by
+    if found.total:
+        # Of total / weight, to the power 1 / p: a point's part in either is its weight times a sum.
+        counts = cells.weights > 0.0
+        np.divide(by_logs, cells.weights, out=by_weights, where=counts)
+        by_weights -= found.smooth / found.weight * sum(one.count for one in chosen)
+        by_weights *= counts / p
+    return _ArmGradient(by_loads, chosen, by_A, by_logs, by_weights)
 
 
 def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[int, ShapeIntegrals]:
@@ -506,15 +568,16 @@ def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[in
     return by_body
 
 
-def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
-    """Return the derivative by x_phys of one arm, all loads of its instants frozen (n_cells,)."""
+def _esl_gradient(part: _ArmGradient, cells: PointStress, by: By) -> np.ndarray:
+    """Return the derivative by the design of one arm, all loads of its instants frozen."""
     # With K u_n = f_n held, dJ = dJ/dx - sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n: as many
     # solves as the loads have directions.
     state = cells.state
     arm, fields = state.elastic, state.load_fields.columns
     a = np.concatenate([one.a for one in part.chosen])
+    by_columns, beside = part.through(cells)
     if not len(a):
-        return part.by_x
+        return by(state, beside)
     scale = np.sqrt(np.square(cells.A).sum(axis=0).max(axis=0, initial=0.0))
     if arm.comm.size > 1:
         scale = np.max(arm.comm.allgather(scale), axis=0)
@@ -524,12 +587,13 @@ def _esl_gradient(part: _ArmGradient, cells: CellStress) -> np.ndarray:
         sizes, directions = arm.comm.bcast((sizes, directions), root=0)
     kept = directions[sizes > FROZEN_LOADS_RANK_SHARE * sizes[0]]
     # a = y D with D = kept / scale: derivatives by columns are those by y D.
-    by_columns = cells.by_columns(part.by_A)
     right = combine(by_columns, (kept * scale).T)
     left = combine(fields, (kept / scale).T)
     with arm.profile.phase("gradient"):
         adjoint = static_response(arm, *arm.restrict(right))
-        return part.by_x - state.young_slope * arm.cell_stiffness_products(adjoint, left)
+        pairs = ((-adjoint, left),)
+        interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((right, left),))
+        return by(state, replace(beside, stiffness=pairs, interfaces=interfaces))
 
 
 # -- the largest of very many lengths |A_e a_n| over points e and instants n, looking at few

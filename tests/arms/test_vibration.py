@@ -208,7 +208,7 @@ def slopes_at(
     x = design_of(arm, symmetric)
     found = modes(x)
     _, by_values = squared_period(found, exponent, follow)
-    return modes, period_gradient(arm.current, found, by_values).cells
+    return modes, period_gradient(arm.current, found, by_values).own
 
 
 @pytest.mark.serial  # ranks: test_an_arm_cut_in_two

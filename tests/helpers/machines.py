@@ -239,3 +239,32 @@ def gaps(result: SimulationResult) -> np.ndarray:
     motion = instants.motion(y, yd, ydd)
     place = interface_place(system.mechanism, motion, instants.split(y)[1]).place
     return system.closure.gap(place)
+
+
+def fork() -> dict:
+    """Return a link that carries a rigid hand on its end, a slide and the payload on its side."""
+    turned = [0.0, 0.0, 0.5 * np.pi]
+    rigid = {"rigid": True, "length": 0.2, "inertia": [0.01, 0.02, 0.02, 0, 0, 0]}
+    side = {"name": "side", "point": [0.29, 0.02, 0.0], "radius": 0.01}
+    return {
+        "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
+        "arms": [
+            {"name": "link", "length": 0.5, "height": 0.04, "thickness": 0.02, "cells": [6, 2, 2],
+             "passive": 0.05, "interfaces": [side]},
+            {"name": "hand", "mass": 1.0, **rigid},
+            {"name": "slider", "mass": 0.5, **rigid},
+        ],
+        "joints": [
+            {"name": "swing", "type": "revolute", "parent": "ground", "child": "link",
+             "axis": [0.2, 0.1, 1]},
+            {"name": "wrist", "type": "fixed", "parent": "link", "child": "hand", "rpy": turned},
+            {"name": "slide", "type": "prismatic", "parent": "link", "child": "slider",
+             "parent_interface": "side", "axis": [1, 0, 0], "rpy": turned},
+        ],
+        "motion": {"path": "joints", "file": "table.csv", "horizon": 0.2, "gravity": [0, 0, -9.81]},
+        "payload": {"mass": 1.0, "offset": [0, 0.05, 0], "arm": "link", "interface": "side"},
+        "damping": {"stiffness_proportional": 1e-4},
+        "reduction": {"coordinates": 12},
+        "simulation": {"sample": 0.005, "tolerance": 1e-3, "stiffening": True},
+        "objective": {"load_cases": 6},
+    }  # fmt: skip

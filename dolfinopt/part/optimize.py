@@ -1,0 +1,461 @@
+"""Shape optimisation of the parts: the scene's objective within its limits, on their own mesh.
+
+Variables are the normal moves of the free outlines' control points (`free_outline`), the machine is
+that of the parts on meshes along their curves, and gradients are those by the places of the nodes
+(`responses.shape_sensitivity`). A step minimises the method of moving asymptotes' approximation of
+the merit f0 + c sum_i max(0, f_i) within a trust region, and is taken if the merit falls as
+promised, see `optimization.acceptance`. What was found is judged on a finer mesh; limits that are
+not kept there are tightened by what is missing, and the iterations go on.
+Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from mpi4py import MPI
+from scipy.spatial import cKDTree
+
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.optimization.acceptance import Promise, judge_step
+from dolfinopt.optimization.measured import LIMIT_PRICE
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
+from dolfinopt.optimization.problem import Stage
+from dolfinopt.part.body_mesh import BodyMesh, triangle_areas
+from dolfinopt.part.boundary_stress import (
+    APART,
+    OutlineStress,
+    away_from_ends,
+    corner_stress,
+)
+from dolfinopt.part.forms import STRESS, Simulated, part_column, simulate_bodies
+from dolfinopt.part.free_outline import CHORD, FreeOutline, free_outline
+from dolfinopt.part.mesh import Meshes, body_mesh, mesh_parts
+from dolfinopt.part.part import Part
+from dolfinopt.part.widths import thinnest_member
+from dolfinopt.profiling import Profile
+from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
+from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
+from dolfinopt.responses.response import Analysis, objective_of
+from dolfinopt.responses.shape_sensitivity import by_nodes
+from dolfinopt.scene.load import Scene
+
+ITERATIONS = 60  # default, at most
+FARTHEST = 0.2  # cells that a control point moves in a step, at most
+LEAST_RADIUS = 0.02  # of the trust region, of FARTHEST, below which no step is looked for
+SETTLED, PATIENCE = 1e-3, 6  # relative fall of the objective in so many steps that ends a round
+QUALITY = 0.15  # of a triangle, 1 where it is equilateral, below which the mesh is made anew
+MORPHED = 4  # steps that one mesh follows
+SIDES = 1.0  # of the triangles over those of the fine mesh
+ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
+RESERVE = 2e-3  # relative, more than that
+WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Optimized:
+    """What the shape optimisation made of the parts.
+
+    Attributes:
+        parts, meshes: optimised.
+        iterations: steps taken.
+        before, after: objective of the parts before and after, on fine meshes.
+        limits: of the result, on the fine meshes.
+        ending: why it ended.
+    """
+
+    parts: dict[int, Part]
+    meshes: Meshes
+    iterations: int
+    before: float
+    after: float
+    limits: tuple[Limit, ...]
+    ending: str
+
+    @property
+    def sentence(self) -> str:
+        """What it brought, in one line."""
+        missed = [one.sentence for one in self.limits if not one.met]
+        kept = "; ".join(missed) if missed else "all limits kept"
+        return (
+            f"shape optimisation: {self.iterations} iterations ({self.ending}), objective "
+            f"{self.before:.4g} -> {self.after:.4g}, {kept}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+        names = ("iterations", "before", "after", "ending")
+        return {name: getattr(self, name) for name in names}
+
+
+def optimize_parts(
+    scene: Scene, parts: Mapping[int, Part], iterations: int = ITERATIONS, tell: Tell = print
+) -> Optimized:
+    """Return parts that are better by the scene's objective and keep its limits.
+
+    On this rank alone. Lines, arcs, interfaces, bores and what stays solid stay where they are.
+
+    Args:
+        scene: of the run.
+        parts: by their place in the chain.
+        iterations: at most, of all rounds together.
+        tell: gets a line an iteration.
+
+    Raises:
+        ConvergenceError: the machine with the parts cannot be simulated.
+        InputError: parts have no free curves.
+    """
+    outlines = {k: free_outline(part) for k, part in parts.items()}
+    if not any(one.count for one in outlines.values()):
+        raise InputError("--optimize: the parts have no free curves: nothing can move")
+    before, limits = _judged(scene, dict(parts))
+    problem = Problem(scene, {})
+    found = (dict(parts), before, limits)
+    state, done, ending = problem.evaluated(outlines, {}), 0, ""
+    for _ in range(ROUNDS):
+        search = Search(problem, state)
+        ending = search.run(iterations - done, tell, done)
+        done += search.steps
+        state = search.best
+        made = {k: _part(one) for k, one in state.outlines.items()}
+        value, limits = _judged(scene, made)
+        if _rank(scene, value, limits) < _rank(scene, *found[1:]):
+            found = made, value, limits
+        if all(one.met for one in limits) or done >= iterations:
+            break
+        loop = {one.name: one for one in state.limits}
+        missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
+        tell("tightened by what the finer mesh shows: " + ", ".join(missing))
+        problem = replace(problem, tightened={**problem.tightened, **missing})
+    made, after, limits = found
+    return Optimized(made, mesh_parts(made), done, before, after, limits, ending)
+
+
+def _rank(scene: Scene, value: float, limits: tuple[Limit, ...]) -> tuple[float, float]:
+    """Return what orders designs, best first: feasible ones by their objective, else by excess."""
+    excess = max((0.0 if one.met else one.excess for one in limits), default=0.0)
+    return excess, -value if objective_of(scene).turned else value
+
+
+def _tightened(fine: Limit, coarse: Limit) -> float:
+    """Return by how much a limit counts more on the coarse mesh, so that the fine one keeps it."""
+    if fine.least:
+        return (coarse.value / fine.value) ** 2 * (1.0 + RESERVE)
+    return fine.value / coarse.value * (1.0 + RESERVE)
+
+
+def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[float, tuple[Limit, ...]]:
+    """Return objective and limits of parts on their fine meshes, stress that of the outline."""
+    fine = mesh_parts(parts).fine
+    state = simulate_bodies(scene, parts, fine)
+    column, _ = part_column(scene, state, parts)
+    return state.evaluation.objective, column.limits
+
+
+def _part(outline: FreeOutline) -> Part:
+    """Return the part with these curves, and what is measured of it."""
+    part, chord = outline.part, CHORD * outline.part.domain.cell
+    outer, *holes = outline.shape.polygons(chord)
+    polygon = shapely.Polygon(outer, holes)
+    drawn = replace(part.outline, polygon=polygon)
+    old, *gaps = part.shape.polygons(chord)
+    apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
+    shape = replace(outline.shape, apart=float(apart))
+    return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
+
+
+# -- the problem at one outline ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Outlines, their meshes and what the machine does with them.
+
+    Attributes:
+        outlines, bodies: by the arm's place in the chain.
+        simulated: the machine.
+        limits: of the scene, but for the volume's.
+        values: (1 + m,) what is minimised, and the relative constraints, volumes last.
+    """
+
+    outlines: Mapping[int, FreeOutline]
+    bodies: Mapping[int, BodyMesh]
+    simulated: Simulated
+    limits: tuple[Limit, ...]
+    values: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is minimised and limited.
+
+    Attributes:
+        scene: of the run.
+        tightened: factor by the name of a limit, by which its value counts more.
+    """
+
+    scene: Scene
+    tightened: Mapping[str, float]
+
+    def evaluated(
+        self, outlines: Mapping[int, FreeOutline], bodies: Mapping[int, BodyMesh], *start: Any
+    ) -> State:
+        """Return what the machine does; on meshes that are made anew where none are given.
+
+        Raises:
+            ConvergenceError: an outline cannot be meshed, or the machine not be simulated.
+        """
+        parts = {k: replace(one.part, shape=one.shape) for k, one in outlines.items()}
+        if not bodies:
+            with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+                bodies = {
+                    k: body_mesh(gmsh, part.shape, part.domain.cell, SIDES)
+                    for k, part in parts.items()
+                }
+        changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
+        if self.scene.constraints.limits.keys() - {STRESS}:
+            changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
+        simulated = simulate_bodies(self.scene, parts, bodies, *start, **changes)
+        sign = -1.0 if objective_of(self.scene).turned else 1.0
+        limits = [
+            (one, value)
+            for one, value in zip(
+                limits_of(simulated.scene, simulated.evaluation),
+                simulated.evaluation.constraints,
+                strict=True,
+            )
+            if one.quantity not in ("volume_fraction", STRESS)
+        ]
+        if self.scene.constraints.stress is not None:
+            stress, analysis = self._outline_stress(simulated, outlines)
+            value, limit = stress.measure(analysis).values[0], self.scene.constraints.stress
+            limits.append((Limit(STRESS, "", value, limit, "Pa"), value / limit - 1.0))
+        own = [self._factor(one) * (1.0 + value) - 1.0 for one, value in limits]
+        shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
+        values = np.array([sign * simulated.evaluation.objective, *own, *shares])
+        return State(outlines, bodies, simulated, tuple(one for one, _ in limits), values)
+
+    def _factor(self, one: Limit) -> float:
+        return self.tightened.get(one.name, 1.0)
+
+    def _outline_stress(
+        self, simulated: Simulated, outlines: Mapping[int, FreeOutline]
+    ) -> tuple[OutlineStress, Analysis]:
+        """Return the stress on the outlines as a response, and what it is computed from."""
+        shapes = {k: one.shape for k, one in outlines.items()}
+        apart = {k: APART * one.part.domain.cell for k, one in outlines.items()}
+        away = away_from_ends(shapes, apart)
+        one = simulated
+        given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
+        return OutlineStress(one.scene.objective, away, corner_stress), analysis_of(*given)
+
+    def _volumes(
+        self, outlines: Mapping[int, FreeOutline]
+    ) -> list[tuple[float, float, tuple[int, ...]]]:
+        """Return area, largest area (m2) and arms of every limit of the volume."""
+        share = self.scene.design.volume_fraction
+        if share is None:
+            return []
+        area = {k: one.shape.area for k, one in outlines.items()}
+        most = {
+            # What the densities have: curves may have begun a little above the limit.
+            k: max(share * one.part.domain.area.sum(), one.part.domain.volume)
+            for k, one in outlines.items()
+        }
+        if self.scene.design.shared_volume:
+            return [(sum(area.values()), sum(most.values()), tuple(outlines))]
+        return [(area[k], most[k], (k,)) for k in outlines]
+
+    def slopes(self, state: State) -> np.ndarray:
+        """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
+        one = state.simulated
+        given = one.scene, one.partition, one.arms, one.trajectory
+        sign = -1.0 if objective_of(self.scene).turned else 1.0
+        rows = [{k: sign * g for k, g in gradient(*given, Profile(), by=by_nodes).items()}]
+        every = limits_of(one.scene, one.evaluation)
+        found = constraint_gradients(*given, measured=one.evaluation.responses, by=by_nodes)
+        for limit, row in zip(every, found, strict=True):
+            if limit.quantity not in ("volume_fraction", STRESS):
+                rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
+        if self.scene.constraints.stress is not None:
+            stress, analysis = self._outline_stress(one, state.outlines)
+            smooth, (row_,) = stress.measure(analysis), stress.gradients(analysis)
+            (limit,) = (each for each in state.limits if each.quantity == STRESS)
+            scale = self._factor(limit) * limit.value / limit.limit / smooth.smooth[0]
+            rows.append({k: scale * g for k, g in row_.items()})
+        parts = [self._by_x(state, rows)]
+        volumes = self._volumes(state.outlines)
+        if volumes:
+            shares = [
+                np.concatenate(
+                    [
+                        o.by_x(o.area_by_s()[None])[0] / most if k in arms else np.zeros(o.count)
+                        for k, o in state.outlines.items()
+                    ]
+                )
+                for _, most, arms in volumes
+            ]
+            parts.append(np.array(shares))
+        return np.vstack(parts)
+
+    def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:
+        """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""
+        found = []
+        for k, outline in state.outlines.items():
+            places = state.simulated.arms[k].mesh.mesh.geometry.x[:, :2]
+            body = state.bodies[k]
+            order = cKDTree(places).query(body.points)[1]
+            by_s = [
+                outline.by_s(body, body.at_outline(row[k][order]))
+                if k in row
+                else np.zeros(outline.count)
+                for row in rows
+            ]
+            found.append(outline.by_x(np.array(by_s)))
+        return np.hstack(found)
+
+
+# -- the steps ---------------------------------------------------------------------------------
+
+
+class Search:
+    """Steps within a trust region from one state on.
+
+    Attributes:
+        best: the best state so far: of the feasible ones that with the least objective.
+        steps: taken.
+    """
+
+    def __init__(self, problem: Problem, state: State):
+        """Begin at a state."""
+        self.problem, self.state, self.best = problem, state, state
+        self.steps, self.radius, self.morphed = 0, 1.0, 0
+        self.x = np.zeros(sum(one.count for one in state.outlines.values()))
+        self.mma: MMAState = initial_state(self.x)
+        self.falls: list[float] = []
+
+    def run(self, iterations: int, tell: Tell, first: int) -> str:
+        """Take so many steps at most; return why the search ended."""
+        while self.steps < iterations:
+            slopes = self.problem.slopes(self.state)
+            if not self._step(slopes):
+                return "no step betters the parts"
+            self.steps += 1
+            self._keep()
+            tell(self._line(first + self.steps))
+            if self._settled():
+                return "settled"
+        return f"{first + iterations} iterations"
+
+    def _keep(self) -> None:
+        def rank(state: State) -> tuple[float, float]:
+            excess = state.values[1:].max(initial=0.0)
+            return (excess if excess > EXCESS else 0.0), state.values[0]
+
+        if rank(self.state) < rank(self.best):
+            self.best = self.state
+        self.falls.append(self.best.values[0])
+
+    def _settled(self) -> bool:
+        if len(self.falls) <= PATIENCE or self.best.values[1:].max(initial=0.0) > EXCESS:
+            return False
+        fall = self.falls[-1 - PATIENCE] - self.falls[-1]
+        return bool(fall < SETTLED * abs(self.falls[-1]))
+
+    def _line(self, number: int) -> str:
+        one = self.state
+        worst = one.values[1:].max(initial=0.0)
+        words = "limits met" if worst <= EXCESS else f"{100.0 * worst:.2g} % over a limit"
+        mass = sum(o.shape.area for o in one.outlines.values())
+        return (
+            f"{number} objective {one.simulated.evaluation.objective:.5g}, area "
+            f"{1e6 * mass:.5g} mm2, {words}, trust region {self.radius:.2g}"
+        )
+
+    def _step(self, slopes: np.ndarray) -> bool:
+        """Take a step that lowers the merit; return whether there is one."""
+        if self.morphed >= MORPHED or self._worst_triangle() < QUALITY:
+            self.state = self.problem.evaluated(self.state.outlines, {}, self._solutions())
+            self.morphed = 0
+            slopes = self.problem.slopes(self.state)
+        before = self.state
+        stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
+        room = {k: one.room() for k, one in before.outlines.items()}
+        while self.radius >= LEAST_RADIUS:
+            x, after = self._proposed(slopes, stage, room)
+            tried = self._tried(x, room)
+            if tried is None:
+                self.radius *= 0.5
+                continue
+            promised = Promise(before.values + slopes @ (x - self.x), 0.0)
+            verdict = judge_step(stage, before.values, tried.values, promised, exact=True)
+            self.radius = min(1.0, verdict.factor * self.radius)
+            if verdict.accepted:
+                self.x, self.mma, self.state = x, after, tried
+                self.morphed += 1
+                return True
+        return False
+
+    def _proposed(
+        self,
+        slopes: np.ndarray,
+        stage: Stage,
+        room: Mapping[int, tuple[np.ndarray, np.ndarray]],
+    ) -> tuple[np.ndarray, MMAState]:
+        low, high = [], []
+        for k, one in self.state.outlines.items():
+            far = self.radius * FARTHEST * one.part.domain.cell
+            low.append(-np.minimum(room[k][0], far))
+            high.append(np.minimum(room[k][1], far))
+        values = self.state.values
+        return mma_step(
+            self.x,
+            slopes[0],
+            values[1:],
+            slopes[1:],
+            self.x + np.concatenate(low),
+            self.x + np.concatenate(high),
+            self.mma,
+            move=1.0,
+            widest=WIDEST,
+            prices=np.full(len(values) - 1, stage.price),
+        )
+
+    def _tried(
+        self, x: np.ndarray, room: Mapping[int, tuple[np.ndarray, np.ndarray]]
+    ) -> State | None:
+        """Return what a step leads to; None where its outlines cannot be parts."""
+        outlines, first = {}, 0
+        for k, one in self.state.outlines.items():
+            s = one.filtered(x[first : first + one.count] - self.x[first : first + one.count])
+            first += one.count
+            outlines[k] = one.moved(np.clip(s, -room[k][0], room[k][1]))
+            if not outlines[k].is_valid:
+                return None
+        try:
+            bodies = {k: self.state.bodies[k].morphed(one.shape) for k, one in outlines.items()}
+            if any(one.is_folded for one in bodies.values()):
+                bodies = {}
+            return self.problem.evaluated(outlines, bodies, self._solutions())
+        except ConvergenceError:
+            return None
+
+    def _solutions(self) -> Any:
+        return self.state.simulated.trajectory.solutions
+
+    def _worst_triangle(self) -> float:
+        return min(_quality(mesh) for mesh in self.state.bodies.values())
+
+
+def _quality(mesh: BodyMesh) -> float:
+    """Return 4 sqrt(3) area over the sum of the squared sides, the least of all triangles."""
+    corners = mesh.points[mesh.triangles]
+    sides = np.square(corners - np.roll(corners, 1, axis=1)).sum(axis=(1, 2))
+    return float((4.0 * np.sqrt(3.0) * triangle_areas(mesh.points, mesh.triangles) / sides).min())

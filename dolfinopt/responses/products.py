@@ -1,0 +1,85 @@
+"""What a gradient by the design of one arm is made of, whatever the design's variables are.
+
+However long the way from an arm's design to a response is, the adjoint of the way ends in products
+of nodal fields with the changes of K and M, and a few terms beside them:
+
+    dJ = sum_k l_k . dK r_k + sum_k l_k . dM r_k + dJ/dK0 . dK0 + ...
+
+What K, M and the others change by a density of a cell is one thing (`by_densities`), by the place
+of a node another (`shape_sensitivity.by_nodes`); the products are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.geometric_stiffness import GeometricGradient
+
+Pair = tuple[np.ndarray, np.ndarray]  # l and r, each (n_nodes, d, k)
+
+
+@dataclass(frozen=True, eq=False)
+class StressProduct:
+    """dJ = sum by_stress . (d operator) fields, of the operator `fem.stress.stress_operator`.
+
+    Attributes:
+        points: (p, d) of the reference cell.
+        by_stress: (s, n_cells p, k) derivatives by the stress of unit Young's modulus.
+        fields: (n_nodes, d, k) whose stress it is, held.
+    """
+
+    points: np.ndarray
+    by_stress: np.ndarray
+    fields: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """What carries a change of one arm's design to a response; without parts there is none.
+
+    Attributes:
+        stiffness: pairs of l . dK r.
+        mass: pairs of l . dM r.
+        geometric: of K0, whose modes are the right fields of the first pair of `stiffness`.
+        places: (n_nodes, d) field p by which the nodes are felt as lever arms: p . M dX; None: 0.
+        interfaces: returns the derivatives by the rigid motions of the outboard interfaces' nodes
+            (n_nodes, d, b), in which all fields move them, and by these nodes as other lever arms
+            (n_nodes, d); contributions of this rank's cells; None: 0.
+        densities: (n_cells,) by the physical densities otherwise than by K and M; None: 0.
+        volumes: (n_cells,) by the cells' areas, in space volumes, likewise; None: 0.
+        stress: of stress, whose operator depends on the cells' shape.
+    """
+
+    stiffness: tuple[Pair, ...] = ()
+    mass: tuple[Pair, ...] = ()
+    geometric: GeometricGradient | None = None
+    places: np.ndarray | None = None
+    interfaces: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
+    densities: np.ndarray | None = None
+    volumes: np.ndarray | None = None
+    stress: StressProduct | None = None
+
+
+# From products to a gradient by variables of the design: by its cells, or by its nodes.
+By = Callable[["DesignState", Products], np.ndarray]
+
+
+def by_densities(state: DesignState, products: Products) -> np.ndarray:
+    """Return the gradient by the physical densities (n_cells,), over this rank's cells."""
+    elastic, pairs = state.elastic, products.stiffness
+    energies, masses = np.zeros((2, len(state.x_phys)))
+    if products.geometric is not None:
+        (left, V), *pairs = pairs
+        energies += products.geometric.by_young_beside(left, V)
+    for left, right in pairs:
+        energies += elastic.cell_stiffness_products(left, right)
+    for left, right in products.mass:
+        masses += elastic.cell_mass_products(left, right)
+    found = state.young_slope * energies + state.density_slope * masses
+    return found if products.densities is None else found + products.densities

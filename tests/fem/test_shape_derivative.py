@@ -1,0 +1,122 @@
+"""Derivatives of what cells add to by the places of their corners, against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dolfinx.mesh import CellType, create_rectangle
+from moved_nodes import noise, with_moves
+from mpi4py import MPI
+from solids import link_mesh
+
+from dolfinopt.fem.assembly import StressTensor, cells_of
+from dolfinopt.fem.elements import ELEMENTS, quadrature
+from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
+from dolfinopt.fem.shape_derivative import ShapeDerivative
+from dolfinopt.fem.stress import stress_operator, stress_points
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.mesh.checks import cell_areas
+from dolfinopt.reduction import by_frame_fields
+
+pytestmark = pytest.mark.serial  # ranks have no part in it
+
+SIZE, STEP = 2e-3, 1e-4  # m, of cells of 10 to 100 mm; of it, for differences
+ELEMENTS_OF = [
+    ("triangle", "linear"), ("triangle", "quadratic"), ("quadrilateral", "incompatible"),
+    ("quadrilateral", "linear"), ("quadrilateral", "quadratic"), ("tetrahedron", "linear"),
+    ("tetrahedron", "quadratic"), ("hexahedron", "incompatible"), ("hexahedron", "linear"),
+    ("hexahedron", "quadratic"),
+]  # fmt: skip
+
+
+def even_mesh(shape: str) -> ArmMesh:
+    """Return a regular mesh of these cells."""
+    if shape in ("triangle", "quadrilateral"):
+        corners = [np.array([0.0, -0.02]), np.array([0.2, 0.02])]
+        mesh = create_rectangle(MPI.COMM_SELF, corners, [4, 2], getattr(CellType, shape))
+        count, _ = compat.local_cell_counts(mesh)
+        ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, 0.2)]
+        places = compat.cell_coordinates(mesh, count)[:, :, :2]
+        none = np.zeros(count, dtype=bool)
+        parts = places.mean(axis=1), cell_areas(places), none, none
+        return ArmMesh("a", MPI.COMM_SELF, mesh, *parts, *ends, np.array([0.2, 0.0]))
+    return link_mesh(shape, (3, 2, 1))
+
+
+def direction(mesh: ArmMesh) -> np.ndarray:
+    """Return random moves (n, d) of a regular mesh's nodes, m."""
+    return SIZE * noise("a", mesh.mesh.geometry.x[:, : mesh.dim])
+
+
+def mesh_of(shape: str, h: float) -> ArmMesh:
+    """Return an uneven mesh, its nodes moved by h times `direction`."""
+    even = even_mesh(shape)
+    uneven = SIZE * noise("a", even.mesh.geometry.x[:, : even.dim], 5)
+    return with_moves(even, uneven + h * direction(even))
+
+
+def functions(shape: str, element: str, h: float, weights: dict) -> dict[str, float]:
+    """Return what cells of a moved mesh add up to, with random weights."""
+    mesh = mesh_of(shape, h)
+    operators = ELEMENTS[element].operators(mesh, 0.01 if mesh.dim == 2 else 1.0, 0.3)
+    cells = cells_of(mesh.comm, operators)
+    u, v, e = weights["u"], weights["v"], weights["e"]
+    one = quadrature(mesh, operators)
+    K0 = StressTensor(cells, one.derivatives, one.stress).of(u, e, v).stiffness()
+    points = stress_points(compat.cell_corner_count(mesh.mesh), mesh.dim)
+    operator = stress_operator(mesh, operators, points)
+    values = u[operators.cells].reshape(len(e), -1, u.shape[2])
+    s = 3 if mesh.dim == 2 else 5
+    stress = np.moveaxis((operator @ values).reshape(len(e), -1, s, u.shape[2]), 2, 0)
+    return {
+        "stiffness": float(e @ cells.stiffness_products(u, v)),
+        "mass": float(e @ cells.mass_products(u, v)),
+        "volume": float(e @ mesh.area),
+        "geometric stiffness": float(np.sum(weights["K0"] * K0)),
+        "stress": float(np.sum(weights["s"] * stress.reshape(s, -1, u.shape[2]))),
+        "points": float(np.sum(weights["x"] * operators.points)),
+    }
+
+
+@pytest.mark.parametrize(("shape", "element"), ELEMENTS_OF)
+def test_derivatives_of_cells(shape: str, element: str) -> None:
+    """Of uneven cells, random fields: central differences leave their square, 1e-8."""
+    mesh, rng = mesh_of(shape, 0.0), np.random.default_rng(3)
+    operators = ELEMENTS[element].operators(mesh, 0.01 if mesh.dim == 2 else 1.0, 0.3)
+    n, count, d, k = len(operators.points), mesh.num_cells, mesh.dim, 2
+    points = stress_points(compat.cell_corner_count(mesh.mesh), d)
+    u, v = rng.normal(size=(2, n, d, k))
+    weights = {
+        "u": u, "v": v, "e": rng.uniform(1.0, 2.0, count), "K0": rng.normal(size=(k, k, k)),
+        "s": rng.normal(size=(3 if d == 2 else 5, count * len(points), k)),
+        "x": rng.normal(size=(n, d)),
+    }  # fmt: skip
+    shape_of = ShapeDerivative(mesh, cells_of(mesh.comm, operators))
+    e = weights["e"]
+    found = {
+        "stiffness": shape_of.stiffness(u, v, e),
+        "mass": shape_of.mass(u, v, e),
+        "volume": shape_of.volume(e),
+        "geometric stiffness": shape_of.geometric_stiffness(u, v, weights["K0"], e),
+        "stress": shape_of.stress(points, weights["s"], u),
+    }
+    by_nodes = {name: shape_of.at_nodes(one) for name, one in found.items()}
+    by_nodes["points"] = shape_of.from_points(weights["x"])
+    moves = direction(even_mesh(shape))
+    ends = [functions(shape, element, h, weights) for h in (STEP, -STEP)]
+    for name, one in by_nodes.items():
+        expected = (ends[0][name] - ends[1][name]) / (2.0 * STEP)
+        terms = np.abs(one * moves).sum()
+        assert np.sum(one * moves) == pytest.approx(expected, abs=1e-6 * terms), name
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_places_by_rigid_motions(dim: int) -> None:
+    """They are linear in the points but for translations, so that products are the same."""
+    X = np.random.default_rng(1).normal(size=(5, dim))
+    by = np.random.default_rng(2).normal(size=rigid_motions(X).shape)
+    turns = rigid_motions(X)[:, :, dim:]
+    assert np.sum(by_rigid_motions(by) * X) == pytest.approx(np.sum(by[:, :, dim:] * turns))
+    order = [1, 2, 0] if dim == 2 else [1, 2, 5, 4, 3, 0]
+    assert by_frame_fields(by[:, :, order]) == pytest.approx(by_rigid_motions(by))

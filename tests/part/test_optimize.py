@@ -1,0 +1,136 @@
+"""Shape optimisation of parts: the scene's objective within its limits."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from parts import folder_with, frame
+from runs import run
+
+from dolfinopt.cli.shared import scene_of
+from dolfinopt.errors import InputError
+from dolfinopt.part.curves import MIRROR, Spline, direction
+from dolfinopt.part.free_outline import free_outline
+from dolfinopt.part.optimize import Problem, optimize_parts
+from dolfinopt.part.part import make_parts
+
+pytestmark = pytest.mark.serial
+
+SMALL = ("arms.cells=[100,6]", "simulation.sample=0.005", "arms.0.symmetric=true")
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A frame: its folder, scene, parts, and what shape optimisation makes of them."""
+    folder = folder_with(tmp_path_factory.mktemp("optimize") / "run", frame, *SMALL)
+    scene = scene_of(folder)
+    parts = make_parts(scene, folder)
+    lines = []
+    return folder, scene, parts, optimize_parts(scene, parts, STEPS, lines.append), lines
+
+
+def with_tables(scene, **changes):
+    tables = {key: getattr(scene, key).model_copy(update=one) for key, one in changes.items()}
+    return scene.model_copy(update=tables)
+
+
+def test_compliance_falls_at_no_more_volume(made):
+    _, _, parts, found, lines = made
+    assert found.after < 0.998 * found.before
+    # The volume is limited to that of the densities; curves end within 1e-3 of a limit.
+    assert found.parts[0].shape.area <= 1.001 * parts[0].domain.volume
+    assert found.iterations == STEPS == len(lines)
+    assert "limits met" in lines[-1] and "all limits kept" in found.sentence
+
+
+def test_what_is_not_free_stays_and_joints_stay_smooth(made):
+    before, after = made[2][0].shape, made[3].parts[0].shape
+    held = [piece.curve for piece in before.pieces if not piece.free]
+    assert held and [piece.curve for piece in after.pieces if not piece.free] == held
+    for loop in after.loops:
+        for k in range(len(loop)):
+            one, other = loop[k - 1].curve, loop[k].curve
+            assert np.abs(one.end - other.start).max() < 1e-12
+            if loop[k - 1].free and loop[k].free:  # halves of a periodic spline
+                assert direction(one, 1.0) @ direction(other, 0.0) > 1.0 - 1e-9
+    assert after.is_simple(1e-5)
+
+
+def test_symmetric_arm_stays_symmetric(made):
+    shape = made[3].parts[0].shape
+    points = np.vstack([c.points for c in shape.curves if isinstance(c, Spline)])
+    apart = np.linalg.norm(points[:, None] - points * MIRROR, axis=2).min(axis=1)
+    assert apart.max() < 1e-9
+
+
+def test_curves_follow_those_of_the_part(made):
+    part = made[2][0]
+    outline = free_outline(part)
+    assert outline.shape.area == pytest.approx(part.shape.area, rel=2e-3)
+    assert outline.is_valid and len(outline.shape.loops) == len(part.shape.loops)
+
+
+def test_area_by_moves_is_its_difference(made):
+    outline = free_outline(made[2][0])
+    moves = 1e-6 * np.random.default_rng(0).normal(size=outline.count)
+    ends = [outline.moved(sign * moves).shape.area for sign in (1.0, -1.0)]
+    # Area is quadratic in the moves: central differences are exact.
+    assert ends[0] - ends[1] == pytest.approx(2.0 * outline.area_by_s() @ moves, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["compliance", "mass"])
+def test_slopes_are_differences(made, kind):
+    """Along an even offset and an uneven one; the sides' bulge, a per cent or two, is left out."""
+    scene = with_tables(made[1], objective={"kind": kind}, constraints={"deviation": 0.1})
+    problem, outline = Problem(scene, {}), free_outline(made[2][0])
+    state = problem.evaluated({0: outline}, {})
+    slopes = problem.slopes(state)
+    uneven = 1.0 + 0.5 * np.sin(np.arange(outline.count))
+    for x in (np.ones(outline.count), uneven):
+        values = []
+        for sign in (1.0, -1.0):
+            moved = outline.moved(outline.filtered(1e-5 * sign * x))
+            bodies = {0: state.bodies[0].morphed(moved.shape)}
+            values.append(problem.evaluated({0: moved}, bodies).values)
+        change = values[0] - values[1]
+        assert change[[0, -1]] == pytest.approx(2e-5 * (slopes @ x)[[0, -1]], rel=3e-2)
+        # What is differentiated is the p-mean, whose ratio to the largest is held.
+        assert change[1] == pytest.approx(2e-5 * slopes[1] @ x, rel=0.3)
+
+
+def test_lightest_part_keeps_its_limit(made):
+    """From a limit that the part exceeds by 2 %: the limit holds on the fine mesh in the end."""
+    _, scene, parts, _, _ = made
+    problem = Problem(scene, {})
+    outlines = {0: free_outline(parts[0])}
+    deviation = problem.evaluated(outlines, {}).simulated.evaluation.max_deviation
+    posed = with_tables(
+        scene,
+        objective={"kind": "mass"},
+        constraints={"deviation": deviation / 1.02},
+        design={"volume_fraction": None},
+    )
+    found = optimize_parts(posed, parts, 12, lambda _: None)
+    assert [one.met for one in found.limits] == [True]
+    assert found.limits[0].value == pytest.approx(deviation / 1.02, rel=2e-2)
+
+
+def test_arcs_are_refused(made):
+    with pytest.raises(InputError, match="expected splines"):
+        run("part", made[0], "--curves", "arcs", "--optimize", "--no-plots", "--no-check")
+    assert not (made[0] / "part").exists()
+
+
+def test_command_writes_optimised_parts(made, tmp_path, capsys):
+    folder, _, _, found, _ = made
+    run("part", folder, "--optimize", "--iterations", STEPS, "--out", tmp_path, "--no-plots")
+    printed = capsys.readouterr().out
+    assert found.sentence in printed and "optimised part" in printed
+    figures = json.loads((tmp_path / "part.json").read_text())
+    assert figures["optimize"]["iterations"] == STEPS
+    row = figures["table"]["compliance"]
+    assert row["optimised part"] < row["part"]
+    assert row["optimised part"] == pytest.approx(found.after, rel=2e-2)  # mesh refined for stress
