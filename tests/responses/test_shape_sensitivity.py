@@ -5,6 +5,7 @@ The reference is the whole program on meshes whose nodes are moved.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,11 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
+from dolfinopt.arms.design_state import DesignState
 from dolfinopt.fem.geometric_stiffness import static_response
+from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.responses.evaluation import gradient
+from dolfinopt.responses.products import Products
 from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.responses.shape_sensitivity import by_nodes
 
@@ -157,6 +161,32 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
     found = node_test(scene, wave, size, cut=cut)
     assert found.slope != 0.0
     assert found.rate == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("kind", "part"),
+    [("effort", "places"), ("compliance", "interfaces"), ("stress", "volumes"),
+     ("stress", "stress"), ("compliance", "geometric_stiffness")],
+)  # fmt: skip
+def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
+    """Each part of the chain alone: remainders become of first order."""
+    monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    if part == "geometric_stiffness":
+
+        def none(shape: ShapeDerivative, *_: object) -> np.ndarray:
+            return np.zeros_like(shape.corners)
+
+        monkeypatch.setattr(ShapeDerivative, part, none)
+    else:
+
+        def without(state: DesignState, products: Products) -> np.ndarray:
+            return by_nodes(state, replace(products, **{part: None}))
+
+        monkeypatch.setattr("moved_nodes.by_nodes", without)
+    told = f"objective.kind={kind}", "payload.mass=0.1", KEPT, BENT, GRAVITY
+    scene = scene_of("triangles", told, shared_tmp_path)
+    assert node_test(scene, wave, 0.015).rate < 1.7
 
 
 @pytest.mark.serial
