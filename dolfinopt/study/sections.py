@@ -13,6 +13,7 @@ members on the limit itself.
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +42,7 @@ from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.schema import file_digest
 from dolfinopt.study.cases import Case, Outcome
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.studies import (
@@ -69,6 +71,7 @@ STEPS = 20  # simulations at most on the way to a limit
 STEP = 0.03  # relative change of a share from which the exponents are told
 MOVE, LEAST_MOVE = 0.25, 0.1  # largest change of ln s by one set of power laws, at first and last
 WORTH = 3e-3  # relative gain of mass below which the next set moves less
+SLIGHT = 0.01  # relative excess of a limit by the design up to which it is told, but no defeat
 # Judged by mass alone where these are all that is limited: they fall with the material.
 OF_MATERIAL = ("volume_fraction", "mass")
 
@@ -197,9 +200,14 @@ def limited(outcome: Outcome) -> dict[str, float]:
     for name, one in outcome.summary()["constraints"].items():
         if name.startswith(OF_MATERIAL):
             continue
-        gap = one["value"] / one["limit"] - 1.0
-        found[name] = math.log(max(1e-9, 1.0 + (-gap if one["bound"] == "least" else gap)))
+        found[name] = math.log(max(1e-9, 1.0 + _excess(one)))
     return found
+
+
+def _excess(limit: Mapping[str, Any]) -> float:
+    """Return the relative violation of an entry of a summary's constraints."""
+    gap = limit["value"] / limit["limit"] - 1.0
+    return float(-gap if limit["bound"] == "least" else gap)
 
 
 def _worst(outcome: Outcome) -> float:
@@ -261,11 +269,11 @@ def _next(excess: Mapping[float, float], low: float, high: float) -> float | Non
         excess: ln(1 + excess) by x so far.
         low, high: bounds of x.
     """
-    first, last = min(excess), max(excess)
+    first, most = min(excess), max(excess)
     up = min((at for at, value in excess.items() if value <= 0.0), default=None)
     if up is None:  # upwards, and from the most that there is down while that helps
-        if last < high:
-            return min(last + _stride(excess[last]), high)
+        if most < high:
+            return min(most + _stride(excess[most]), high)
         helps = excess[first] <= min(excess.values())
         return max(first - _stride(excess[first]), low) if helps and first > low else None
     if excess[up] >= -EXCESS or up == low:
@@ -277,10 +285,14 @@ def _next(excess: Mapping[float, float], low: float, high: float) -> float | Non
         return None
     if not math.isfinite(excess[down]):
         return 0.5 * (up + down)
-    # Half the tolerance below the limit: where the secant ends, the limit is held.
-    x = down + (up - down) * (excess[down] + 0.5 * EXCESS) / (excess[down] - excess[up])
-    margin = 0.02 * (up - down)
-    return min(max(x, down + margin), up - margin)
+    # The secant of the last two, to half the tolerance below the limit: there the limit is held.
+    before, last = list(excess)[-2:]
+    fall = excess[before] - excess[last]
+    if math.isfinite(fall) and fall != 0.0:
+        x = last + (last - before) * (excess[last] + 0.5 * EXCESS) / fall
+        if down < x < up:
+            return x
+    return 0.5 * (up + down)
 
 
 def _stride(excess: float) -> float:
@@ -348,7 +360,7 @@ class Row:
     Attributes:
         kind: of the section, or the design.
         made: how its sizes were chosen.
-        sizes: in mm, with the arms' names.
+        sizes: in mm, with the arms' names and what they are.
         outcome: of its simulation.
         lightest: whether the sizes are the least that hold the limits, if any do.
     """
@@ -400,13 +412,13 @@ def study_sections(
     Raises:
         InputError: the scene's arms cannot be replaced; nothing was computed.
     """
-    design = on_root(world, _checked, scene, designs)
+    label, design = on_root(world, _checked, scene, designs)
     kinds = IN_SPACE if scene.is_spatial else IN_PLANE
     every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds.items()]
     own = Case(scene, "simulate", design, DESIGN)
     done = run_cases([own], folder, world, shown=shown)
     computed = done.computed
-    rows = [Row(DESIGN, "as given" if designs else "optimised", "", done[own])]
+    rows = [Row(DESIGN, label, "", done[own])]
     if rows[0].outcome.failure:
         return Study(NAME, (), (), tuple(rows[0].outcome.failures), computed)
     asked: list[tuple[Members, str, Shares, bool]] = []
@@ -421,7 +433,7 @@ def study_sections(
     cases = on_root(world, lambda: [one.case(shares) for one, _, shares, _ in asked])
     done = run_cases(cases, folder, world, shown=shown)
     rows += [
-        Row(one.kind, made, one.sizes(shares), done[case], light)
+        Row(one.kind, made, f"{one.section.named}: {one.sizes(shares)}", done[case], light)
         for (one, made, shares, light), case in zip(asked, cases, strict=True)
     ]
     with together(world):
@@ -430,8 +442,8 @@ def study_sections(
     return Study(NAME, (found_table,), figures, failures, computed + done.computed)
 
 
-def _checked(scene: Scene, designs: Sequence[Path]) -> Design:
-    """Return the design; raise InputError where no member can take its arms' place."""
+def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
+    """Return the design and its label; raise InputError where no member can take an arm's place."""
     if not any(owner is not None for owner in scene.owners):
         raise InputError(f"{scene.source}: sections: expected arms with a design, found none")
     for arm in scene.arms:
@@ -442,7 +454,7 @@ def _checked(scene: Scene, designs: Sequence[Path]) -> Design:
             )
     if len(designs) > 1:
         raise InputError(f"--design: expected one file with compare sections, found {len(designs)}")
-    return [*given_designs(scene, designs).values()][-1]
+    return [*given_designs(scene, designs).items()][-1]
 
 
 def _searched(
@@ -509,7 +521,8 @@ def verdict(scene: Scene, rows: Sequence[Row]) -> str:
     design, *others = rows
     if not limited(design.outcome):
         return _by_objective(scene, design, others)
-    broken = [name for name, one in _limits(design.summary).items() if not one["met"]]
+    over = {name: _excess(one) for name, one in _limits(design.summary).items() if not one["met"]}
+    broken = [name for name, excess in over.items() if excess > SLIGHT]
     able = [row for row in others if row.lightest and row.holds]
     if not able:
         none = "o straight member within the arms' envelope holds the limits"
@@ -523,6 +536,8 @@ def verdict(scene: Scene, rows: Sequence[Row]) -> str:
     )
     if broken:
         return f"{text} without holding them ({', '.join(broken)}): the {best.kind} wins."
+    if over:
+        text += f" ({', '.join(f'{k} {100.0 * x:.2g} % over its limit' for k, x in over.items())})"
     return f"{text}: the {best.kind if best.mass < design.mass else DESIGN} wins."
 
 
@@ -585,3 +600,19 @@ def _cells(scene: Scene, row: Row) -> dict[str, Any]:
     if row.outcome.failure:
         cells["failed"] = row.outcome.failure
     return cells
+
+
+def sections_of(run: Path) -> Table | None:
+    """Return the table of RUN/sections, where a study has compared the run's design with members.
+
+    None where there is none, or of another design.
+    """
+    folder = run / NAME
+    try:
+        asked = json.loads((folder / f"{NAME}.json").read_text("utf-8"))["question"]
+        if asked["designs"] != [file_digest(run / "design.npz")]:
+            return None
+        title = (folder / f"{NAME}.md").read_text("utf-8").partition("\n")[0]
+        return Table(NAME, title, pd.read_csv(folder / f"{NAME}.csv", keep_default_na=False))
+    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return None
