@@ -299,12 +299,14 @@ def _before_after(before: Path, after: Path) -> Table:
 def _pages(table: Table, sides: list[Any]) -> dict[str, bytes]:
     """Return table and page of both runs by the names of their files (root only)."""
     from dolfinopt.study.before_after import before_after_page
+    from dolfinopt.study.sections import sections_of
 
     before, after = sides
+    sections = sections_of(after.folder)
     texts = {
         ".md": table.markdown(),
         ".csv": table.csv(),
-        ".html": before_after_page(before, after, table),
+        ".html": before_after_page(before, after, table, sections),
     }
     return {f"{table.name}{kind}": text.encode() for kind, text in texts.items()}
 

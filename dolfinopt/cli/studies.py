@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from dolfinopt.study.tables import Study
 
 PRESETS = ("payload", "flattening", "coordinates")
-COMPARED = {"objectives": "objective", "reductions": "reduction"}  # preset by the command's word
+# Preset by the command's word; members of uniform section are a study of their own.
+COMPARED = {"objectives": "objective", "reductions": "reduction"}
+SECTIONS = "sections"
 
 designs_option = click.option(
     "--design",
@@ -134,7 +136,7 @@ def sweep(
 
 @click.command()
 @scene_argument
-@click.argument("what", type=click.Choice(list(COMPARED)))
+@click.argument("what", type=click.Choice([*COMPARED, SECTIONS]))
 @click.option(
     "--coordinates",
     multiple=True,
@@ -149,19 +151,40 @@ def sweep(
     metavar="KIND",
     help="of the objectives, any number of times; default: all",
 )
+@click.option(
+    "--design",
+    "designs",
+    multiple=True,
+    metavar="FILE",
+    type=PATH,
+    help="design.npz that sections are compared with; default: the optimised design",
+)
 @study_command
 def compare(
-    scene: Scene, what: str, coordinates: tuple[int, ...], kinds: tuple[str, ...]
+    scene: Scene,
+    what: str,
+    coordinates: tuple[int, ...],
+    kinds: tuple[str, ...],
+    designs: tuple[Path, ...],
 ) -> Question:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
+
+    With sections: compare its design with straight tubes and bars, of the same mass and the
+    lightest that hold the limits.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
-    if coordinates and what == "objectives":
+    if designs and what != SECTIONS:
+        raise InputError("--design: expected only with compare SCENE sections")
+    if coordinates and what != "reductions":
         raise InputError("--coordinates: expected only with compare SCENE reductions")
     if kinds and what != "objectives":
         raise InputError("--kind: expected only with compare SCENE objectives")
+    if what == SECTIONS:
+        from dolfinopt.study.sections import NAME, study_sections
+
+        return NAME, designs, partial(study_sections, scene, designs), {}
     from dolfinopt.study.studies import study
 
     preset: Any = COMPARED[what]

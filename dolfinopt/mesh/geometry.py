@@ -53,6 +53,7 @@ from dolfinopt.scene.tables.arms import SIZE_PARAMETER
 
 if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.geometry import LinkCells
+    from dolfinopt.mesh.sections import Member
 
 # ONELAB parameters of meshes/*.geo, without the number that orders them.
 LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (m)"
@@ -822,7 +823,7 @@ def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners[:, 0], np.cross(corners[:, 1], corners[:, 2])
 
 
-def msh_bytes(mesh: Tetrahedra | LinkCells) -> bytes:
+def msh_bytes(mesh: Tetrahedra | LinkCells | Member) -> bytes:
     """Return the .msh file that `arms.mesh` reads back, on this process alone."""
     is_tetrahedron = mesh.cells.shape[1] == 4
     cell, side = (TETRAHEDRON, TRIANGLE) if is_tetrahedron else (HEXAHEDRON, QUADRILATERAL)

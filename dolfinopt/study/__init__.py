@@ -2,5 +2,6 @@
 
 Plans of labelled `cases` (`studies`, `uncertainty`) -> results kept by what they compute (`store`
 shares them out; `simulate` is what one rank does) -> one data frame -> tables and figures
-(`tables`, `figures`). `variants` changes scenes; `before_after` compares two runs of a machine.
+(`tables`, `figures`). `variants` changes scenes; `before_after` compares two runs of a machine,
+`sections` a design with straight tubes and bars.
 """

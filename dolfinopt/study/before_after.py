@@ -147,8 +147,16 @@ def read_side(
         raise _unreadable(path, error) from None
 
 
-def before_after_page(before: Side, after: Side, table: Table) -> str:
-    """Return the page of two runs of one machine, with the table of their figures."""
+def before_after_page(
+    before: Side, after: Side, table: Table, sections: Table | None = None
+) -> str:
+    """Return the page of two runs of one machine, with the table of their figures.
+
+    Args:
+        before, after: the runs.
+        table: see `before_after`.
+        sections: straight members beside the run after, see `sections.sections_of`.
+    """
     from dolfinopt.plots.solid_machine import solid_machine_figure
 
     sides, rows = {BEFORE: before, AFTER: after}, table.frame
@@ -170,6 +178,7 @@ def before_after_page(before: Side, after: Side, table: Table) -> str:
         links=list(_links(sides)),
         curves=list(_curves(sides, table)),
         table=table,
+        sections=sections,
         differing=differences(before.scene, after.scene),
         scene=after.scene,
     )

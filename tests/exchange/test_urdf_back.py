@@ -20,6 +20,7 @@ from dolfinopt.exchange.urdf.scene import read_origin
 from dolfinopt.exchange.urdf.write import NewLink, robot_text
 from dolfinopt.plots.style import new_figure
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.schema import file_digest
 from dolfinopt.study.before_after import before_after
 
 yourdfpy = pytest.importorskip("yourdfpy")
@@ -175,6 +176,12 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
               "--set", "joints.elbow.effort_limit=20",
               "--set", "joints.elbow.position_limits=[-1.0, 1.0]")  # fmt: skip
     run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
+    beside = tmp_path / "run" / "sections"
+    beside.mkdir()
+    question = {"designs": [file_digest(tmp_path / "run" / "design.npz")]}
+    (beside / "sections.json").write_text(json.dumps({"question": question}))
+    (beside / "sections.md").write_text("The lightest tube wins.\n")
+    (beside / "sections.csv").write_text("section,mass [kg]\nround tube,2.5\n")
     run("export", tmp_path / "run", "--urdf", "--before", tmp_path / "run")
     said = capsys.readouterr().out
     assert "kg, was 7.879 kg" in said and "largest tool deflection" in said
@@ -185,7 +192,9 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     page = Reader((tmp_path / "run" / "urdf" / "before_after.html").read_text())
     assert len(page.all("img")) == 3 + 1 + 6 and len(page.all("h1")) == 1  # deflection, drives
     assert all(len(one["alt"]) > 10 and one["src"][:5] == "data:" for one in page.all("img"))
-    assert len(page.all("tr")) == 1 + len(rows) and page.all("li") == []  # of one scene
+    assert len(page.all("tr")) == 1 + len(rows) + 2 and page.all("li") == []  # of one scene
+    written = (tmp_path / "run" / "urdf" / "before_after.html").read_text()
+    assert "The lightest tube wins." in written and "<td>round tube</td>" in written
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     check_limits(summary, tmp_path / "run" / "trajectory.csv")
     before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")

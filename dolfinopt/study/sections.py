@@ -1,0 +1,619 @@
+"""Straight members of uniform section in the place of a scene's designed arms, beside the design.
+
+Every section stands in the arms' envelope: with the design's mass in every arm, and, where the
+scene has limits, as light as they allow. A member is a scene of its own, with solid arms whose
+mesh lies in DIR/sections; it is simulated, judged and kept like any other case.
+
+The lightest members are found by their shares s of the most material that the envelope takes. Each
+limited value is taken for a power law of them, v = v0 prod_k s_k^a_k, with a from one simulation
+an arm; the mass is least where these hold their limits, and one factor of all shares then puts the
+members on the limit itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from mpi4py import MPI
+from scipy.optimize import brentq, minimize
+
+from dolfinopt.disk import make_folder, write_bytes
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.geometry import msh_bytes
+from dolfinopt.mesh.sections import (
+    FLAT_BAR,
+    I_SECTION,
+    RECTANGULAR_TUBE,
+    ROUND_TUBE,
+    SOLID_BAR,
+    Section,
+    member,
+)
+from dolfinopt.parallel import on_root, together
+from dolfinopt.responses.constraints import EXCESS
+from dolfinopt.responses.response import objective_of
+from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.schema import file_digest
+from dolfinopt.study.cases import Case, Outcome
+from dolfinopt.study.store import run_cases
+from dolfinopt.study.studies import (
+    COMPLIANCE,
+    DEVIATION,
+    Design,
+    deviation_panels,
+    given_designs,
+)
+from dolfinopt.study.tables import LineFigure, Study, Table
+
+NAME = "sections"  # of the study's files, and of the folder of the members' meshes
+DESIGN, SAME = "design", "same mass"
+IN_PLANE = {"solid bar": FLAT_BAR}
+IN_SPACE = {
+    "solid bar": SOLID_BAR,
+    "rectangular tube": RECTANGULAR_TUBE,
+    "round tube": ROUND_TUBE,
+    "I section": I_SECTION,
+}
+BAR_CELLS = (4, 8)  # of a bar in place of an arm from a file: over its smaller side, at most
+LEAST, MOST = 0.01, 0.95  # shares: thinner walls are foil, thicker ones leave a slit
+NEAREST, FARTHEST = 0.01, 0.5  # steps of the factor's logarithm to the other side of a limit
+CLOSE = 1e-6  # of the same: both sides are one
+STEPS = 20  # simulations at most on the way to a limit
+STEP = 0.03  # relative change of a share from which the exponents are told
+MOVE, LEAST_MOVE = 0.25, 0.1  # largest change of ln s by one set of power laws, at first and last
+WORTH = 3e-3  # relative gain of mass below which the next set moves less
+SLIGHT = 0.01  # relative excess of a limit by the design up to which it is told, but no defeat
+# Judged by mass alone where these are all that is limited: they fall with the material.
+OF_MATERIAL = ("volume_fraction", "mass")
+
+Shares = tuple[float, ...]  # of every designed arm, in the scene's order
+Search = Generator[list[Shares], list[Outcome], "tuple[Shares, bool] | None"]
+
+
+# -- members ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Members:
+    """Arms of one kind of section, in a folder.
+
+    Attributes:
+        scene: whose designed arms are replaced.
+        kind: of the section, in words.
+        section: itself.
+        folder: of their meshes.
+    """
+
+    scene: Scene
+    kind: str
+    section: Section
+    folder: Path
+
+    @property
+    def arms(self) -> tuple[int, ...]:
+        """Indices of the arms with a section of their own."""
+        owners = self.scene.owners
+        return tuple(k for k, owner in enumerate(owners) if owner == k)
+
+    def mass(self, arm: int, share: float) -> float:
+        """Return the mass of one arm, kg."""
+        one = self.scene.arms[arm]
+        density = self.scene.material_of(arm).density
+        return density * one.length * self.section.area(one.height, one.thickness, share)
+
+    def total_mass(self, shares: Shares) -> float:
+        """Return the mass of all arms, those that share another's design too, kg."""
+        owners = self.scene.owners
+        parts = zip(self.arms, shares, strict=True)
+        return sum(owners.count(k) * self.mass(k, share) for k, share in parts)
+
+    @property
+    def most(self) -> float:
+        """The largest share."""
+        return MOST if self.section.plane is not None else 1.0
+
+    def scaled(self, shares: Shares, x: float) -> Shares:
+        """Return the shares times exp(x), within the bounds."""
+        return tuple(round(min(max(math.exp(x) * s, LEAST), self.most), 9) for s in shares)
+
+    def of_mass(self, masses: Mapping[int, float]) -> Shares | None:
+        """Return the shares with which every arm has its mass, kg; None where one cannot."""
+        found = []
+        for k in self.arms:
+            gap = partial(lambda share, k: self.mass(k, share) - masses[k], k=k)
+            if gap(LEAST) > 0.0 or gap(self.most) < 0.0:
+                return None
+            found.append(float(brentq(gap, LEAST, self.most, xtol=1e-9)))
+        return tuple(found)
+
+    def sizes(self, shares: Shares) -> str:
+        """Return the sizes of every arm in words, in mm."""
+        texts = []
+        for k, share in zip(self.arms, shares, strict=True):
+            arm = self.scene.arms[k]
+            size = self.section.measures(arm.height, arm.thickness, share)
+            texts.append(f"{arm.name} " + " x ".join(f"{1e3 * one:.4g}" for one in size))
+        return ", ".join(texts)
+
+    def case(self, shares: Shares) -> Case:
+        """Return the simulation of the members; their meshes are written (root only)."""
+        data = self.scene.to_tree()
+        rows = {
+            k: self._row(k, share) for k, share in zip(self.arms, shares, strict=True)
+        }  # fmt: skip
+        for row, owner in zip(data["arms"], self.scene.owners, strict=True):
+            if owner is not None:
+                row.update(rows[owner])
+        data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
+        scene = scene_from_dict(data, self.scene.source)
+        return Case(scene, label=f"{self.kind}, {self.sizes(shares)} mm")
+
+    def _row(self, index: int, share: float) -> dict[str, Any]:
+        """Return the keys of an arm with its section."""
+        arm = self.scene.arms[index]
+        row: dict[str, Any] = dict.fromkeys(
+            ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive", "pattern",
+             "interface_offset")
+        )  # fmt: skip
+        row |= {"symmetric": False, "symmetric_z": False, "extruded": False, "regions": []}
+        if self.section.plane is None:
+            height, thickness = self.section.measures(arm.height, arm.thickness, share)
+            cells = arm.cells or _bar_cells(arm.length, height, thickness, arm.is_solid)
+            return row | {"height": height, "thickness": thickness, "cells": list(cells)}
+        mesh = member(self.section, arm.length, (arm.height, arm.thickness), share)
+        data = msh_bytes(mesh)
+        path = self.folder / f"{hashlib.sha256(data).hexdigest()[:16]}.msh"
+        if not path.exists():
+            make_folder(self.folder)
+            write_bytes(path, data)
+        _, height, thickness = map(float, mesh.extents)
+        own = {"height": height, "thickness": thickness, "cell_shape": "hexahedron"}
+        return row | own | {"mesh": str(path.absolute())}
+
+
+def _bar_cells(length: float, height: float, thickness: float, solid: bool) -> tuple[int, ...]:
+    """Return the cells of a bar in place of an arm from a file."""
+    small, most = BAR_CELLS
+    sides = (height, thickness) if solid else (height,)
+    least = min(sides)
+    across = tuple(min(most, round(small * side / least)) for side in sides)
+    return max(24, round(2.0 * length / max(sides))), *across
+
+
+# -- the lightest that hold the limits -----------------------------------------------------------
+
+
+def limited(outcome: Outcome) -> dict[str, float]:
+    """Return ln(1 + excess) of every limit that material helps to hold; <= 0 where it is held."""
+    if outcome.failure:
+        return {}
+    found = {}
+    for name, one in outcome.summary()["constraints"].items():
+        if name.startswith(OF_MATERIAL):
+            continue
+        found[name] = math.log(max(1e-9, 1.0 + _excess(one)))
+    return found
+
+
+def _excess(limit: Mapping[str, Any]) -> float:
+    """Return the relative violation of an entry of a summary's constraints."""
+    gap = limit["value"] / limit["limit"] - 1.0
+    return float(-gap if limit["bound"] == "least" else gap)
+
+
+def _worst(outcome: Outcome) -> float:
+    """Return the largest of `limited`; inf of a case that failed."""
+    return max(limited(outcome).values(), default=math.inf)
+
+
+def lightest(members: Members) -> Search:
+    """Search the lightest members that hold the limits; yield shares, take their outcomes.
+
+    Returns:
+        Shares, and whether they hold; of members that do not, those that come nearest. None where
+        no simulation succeeded.
+    """
+    count, move = len(members.arms), MOVE
+    found = yield from _on_limit(members, (members.most,) * count)
+    if found is None or not found[1]:
+        return found
+    best = found[0]
+    while count > 1 and move >= LEAST_MOVE:
+        stepped = [_stepped(members, best, k) for k in range(count)]
+        outcomes = yield [best, *stepped]
+        found = yield from _on_limit(members, _balanced(members, best, stepped, outcomes, move))
+        gain = 0.0
+        if found is not None and found[1]:
+            gain = 1.0 - members.total_mass(found[0]) / members.total_mass(best)
+            best = found[0] if gain > 0.0 else best
+        if gain < WORTH:  # the power laws hold over less than that, or there is no more to gain
+            move *= 0.5
+    return best, True
+
+
+def _on_limit(members: Members, shares: Shares) -> Search:
+    """Search the least factor of all shares with which the members hold the limits.
+
+    Args:
+        members: whose.
+        shares: with a factor of 1; those that reach a bound stay there.
+    """
+    low, high = (math.log(bound / one) for bound, one in
+                 ((LEAST, max(shares)), (members.most, min(shares))))  # fmt: skip
+    excess: dict[float, float] = {}
+    x: float | None = 0.0
+    while x is not None and len(excess) < STEPS:
+        [outcome] = yield [members.scaled(shares, x)]
+        excess[x] = _worst(outcome)
+        x = _next(excess, low, high)
+    held = [at for at, value in excess.items() if value <= 0.0]
+    if held:
+        return members.scaled(shares, min(held)), True
+    nearest = min(excess, key=lambda at: excess[at])
+    return (members.scaled(shares, nearest), False) if math.isfinite(excess[nearest]) else None
+
+
+def _next(excess: Mapping[float, float], low: float, high: float) -> float | None:
+    """Return where to look next for the least x that holds the limits; None: there is no more.
+
+    Args:
+        excess: ln(1 + excess) by x so far.
+        low, high: bounds of x.
+    """
+    first, most = min(excess), max(excess)
+    up = min((at for at, value in excess.items() if value <= 0.0), default=None)
+    if up is None:  # upwards, and from the most that there is down while that helps
+        if most < high:
+            return min(most + _stride(excess[most]), high)
+        helps = excess[first] <= min(excess.values())
+        return max(first - _stride(excess[first]), low) if helps and first > low else None
+    if excess[up] >= -EXCESS or up == low:
+        return None
+    if up == first:
+        return max(up - _stride(excess[up]), low)
+    down = max(at for at in excess if at < up)
+    if up - down < CLOSE:
+        return None
+    if not math.isfinite(excess[down]):
+        return 0.5 * (up + down)
+    # The secant of the last two, to half the tolerance below the limit: there the limit is held.
+    before, last = list(excess)[-2:]
+    fall = excess[before] - excess[last]
+    if math.isfinite(fall) and fall != 0.0:
+        x = last + (last - before) * (excess[last] + 0.5 * EXCESS) / fall
+        if down < x < up:
+            return x
+    return 0.5 * (up + down)
+
+
+def _stride(excess: float) -> float:
+    """Return how far x has to go to the limit or beyond: values fall with 1 / s or more steeply."""
+    return min(FARTHEST, max(NEAREST, 1.1 * abs(excess)))
+
+
+def _stepped(members: Members, shares: Shares, k: int) -> Shares:
+    """Return the shares with a little more in one arm, or less where there is no more."""
+    more = shares[k] * (1.0 + STEP)
+    changed = more if more <= members.most else shares[k] * (1.0 - STEP)
+    return (*shares[:k], round(changed, 9), *shares[k + 1 :])
+
+
+def _balanced(
+    members: Members,
+    shares: Shares,
+    stepped: Sequence[Shares],
+    outcomes: Sequence[Outcome],
+    move: float,
+) -> Shares:
+    """Return the shares of least mass by the power laws through the outcomes.
+
+    Args:
+        members: whose shares.
+        shares, stepped: of the outcomes: those to set out from, and with one arm's changed each.
+        outcomes: in this order.
+        move: largest change of a share's logarithm.
+    """
+    base, *changed = map(limited, outcomes)
+    names = [name for name in base if all(name in one for one in changed)]
+    if not names:
+        return shares
+    start = np.log(shares)
+    steps = [math.log(after[k] / shares[k]) for k, after in enumerate(stepped)]
+    slopes = np.array(
+        [[(one[name] - base[name]) / step for one, step in zip(changed, steps, strict=True)]
+         for name in names]
+    )  # fmt: skip
+    values = np.array([base[name] for name in names])
+    whole = members.total_mass(shares)
+    low, high = math.log(LEAST), math.log(members.most)
+    bounds = [(max(low, x - move), min(high, x + move)) for x in start]
+    found = minimize(
+        lambda x: members.total_mass(tuple(np.exp(x))) / whole,
+        start,
+        method="SLSQP",
+        bounds=bounds,
+        constraints={
+            "type": "ineq",
+            "fun": lambda x: -(values + slopes @ (x - start)),
+            "jac": lambda x: -slopes,
+        },
+    )
+    return tuple(float(one) for one in np.exp(found.x)) if found.success else shares
+
+
+# -- the study -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table.
+
+    Attributes:
+        kind: of the section, or the design.
+        made: how its sizes were chosen.
+        sizes: in mm, with the arms' names and what they are.
+        outcome: of its simulation.
+        lightest: whether the sizes are the least that hold the limits, if any do.
+    """
+
+    kind: str
+    made: str
+    sizes: str
+    outcome: Outcome
+    lightest: bool = False
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Its summary, empty where it failed."""
+        return {} if self.outcome.failure else self.outcome.summary()
+
+    @property
+    def mass(self) -> float:
+        """Of all arms with a design or a section, kg."""
+        return float(self.summary.get("designed_mass", math.nan))
+
+    @property
+    def holds(self) -> bool:
+        """Whether it holds every limit but that of the volume."""
+        limits = _limits(self.summary)
+        return not self.outcome.failure and all(one["met"] for one in limits.values())
+
+
+def _limits(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scene's limits and what becomes of them, without that of the volume."""
+    found = summary.get("constraints", {})
+    return {name: one for name, one in found.items() if not name.startswith("volume_fraction")}
+
+
+def study_sections(
+    scene: Scene,
+    designs: Sequence[Path],
+    folder: Path,
+    world: MPI.Comm,
+    *,
+    shown: bool = True,
+) -> Study:
+    """Compare straight members with the design (collective).
+
+    Args:
+        scene: whose designed arms are replaced, all by one kind of section.
+        designs: design.npz of the design; none: it is optimised.
+        folder, world, shown: see `store.run_cases`.
+
+    Raises:
+        InputError: the scene's arms cannot be replaced; nothing was computed.
+    """
+    label, design = on_root(world, _checked, scene, designs)
+    kinds = IN_SPACE if scene.is_spatial else IN_PLANE
+    every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds.items()]
+    own = Case(scene, "simulate", design, DESIGN)
+    done = run_cases([own], folder, world, shown=shown)
+    computed = done.computed
+    rows = [Row(DESIGN, label, "", done[own])]
+    if rows[0].outcome.failure:
+        return Study(NAME, (), (), tuple(rows[0].outcome.failures), computed)
+    asked: list[tuple[Members, str, Shares, bool]] = []
+    if limited(rows[0].outcome):
+        found, computed = _searched(every, folder, world, computed, shown)
+        asked += found
+    masses = rows[0].summary["mass"]
+    by_arm = {k: masses[arm.name] for k, arm in enumerate(scene.arms) if arm.name in masses}
+    for one in every:
+        if (shares := one.of_mass(by_arm)) is not None:
+            asked.append((one, SAME, shares, False))
+    cases = on_root(world, lambda: [one.case(shares) for one, _, shares, _ in asked])
+    done = run_cases(cases, folder, world, shown=shown)
+    rows += [
+        Row(one.kind, made, f"{one.section.named}: {one.sizes(shares)}", done[case], light)
+        for (one, made, shares, light), case in zip(asked, cases, strict=True)
+    ]
+    with together(world):
+        found_table, figures = report(scene, rows)
+    # A member that is too soft to be simulated is a finding, in its row, and no failure.
+    return Study(NAME, (found_table,), figures, (), computed + done.computed)
+
+
+def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
+    """Return the design and its label; raise InputError where no member can take an arm's place."""
+    if not any(owner is not None for owner in scene.owners):
+        raise InputError(f"{scene.source}: sections: expected arms with a design, found none")
+    for arm in scene.arms:
+        if arm.flexible and arm.interfaces:
+            raise InputError(
+                f"{scene.source}: arms.{arm.name}.interfaces: sections: expected one outboard "
+                "interface, found more; a straight member has one end"
+            )
+    if len(designs) > 1:
+        raise InputError(f"--design: expected one file with compare sections, found {len(designs)}")
+    return [*given_designs(scene, designs).items()][-1]
+
+
+def _searched(
+    every: Sequence[Members], folder: Path, world: MPI.Comm, computed: int, shown: bool
+) -> tuple[list[tuple[Members, str, Shares, bool]], int]:
+    """Return the lightest members of every kind; all kinds search at once (collective)."""
+    # Outcomes are the same on all ranks; what follows from them is the root's to say.
+    searches = {k: lightest(one) for k, one in enumerate(every)} if world.rank == 0 else {}
+    answers: dict[int, list[Outcome] | None] = dict.fromkeys(range(len(every)))
+    ended: dict[int, tuple[Shares, bool] | None] = {}
+    while True:
+
+        def advance() -> dict[int, list[Case]]:
+            cases = {}
+            for k, answer in answers.items():  # noqa: B023
+                try:
+                    wanted = searches[k].send(answer) if answer else next(searches[k])
+                    cases[k] = [every[k].case(shares) for shares in wanted]
+                except StopIteration as end:
+                    ended[k] = end.value
+            return cases
+
+        asked = on_root(world, advance)
+        if not asked:
+            break
+        done = run_cases([case for cases in asked.values() for case in cases], folder, world,
+                         shown=shown)  # fmt: skip
+        computed += done.computed
+        answers = {k: [done[case] for case in cases] for k, cases in asked.items()}
+    ended = on_root(world, lambda: ended)
+    found = []
+    for k, one in enumerate(every):
+        end = ended[k]
+        if end is not None:
+            shares, holds = end
+            found.append((one, "lightest" if holds else "nearest to the limits", shares, holds))
+    return found, computed
+
+
+# -- table, sentence, picture ----------------------------------------------------------------
+
+
+def report(scene: Scene, rows: Sequence[Row]) -> tuple[Table, tuple[LineFigure, ...]]:
+    """Return the table under the sentence that names the winner, and the deviations over time."""
+    text = [verdict(scene, rows), *_notes(scene, rows)]
+    table = Table("", " ".join(text), pd.DataFrame([_cells(scene, row) for row in rows]))
+    shown = [row for row in rows if not row.outcome.failure]
+    light = any(row.lightest for row in shown)
+    shown = [row for row in shown if row.kind == DESIGN or row.lightest or not light]
+    named = [
+        replace(row.outcome, case=replace(row.outcome.case, label=f"{row.kind}, {row.mass:.4g} kg"))
+        for row in shown
+    ]
+    title = "Deviation with straight members and with the design"
+    return table, (LineFigure("deviation", title, tuple(deviation_panels(named))),)
+
+
+def verdict(scene: Scene, rows: Sequence[Row]) -> str:
+    """Return the sentence that says who wins.
+
+    By mass where the scene limits what members do, the lightest that hold against the design;
+    otherwise by the objective, with the same mass.
+    """
+    design, *others = rows
+    if not limited(design.outcome):
+        return _by_objective(scene, design, others)
+    over = {name: _excess(one) for name, one in _limits(design.summary).items() if not one["met"]}
+    broken = [name for name, excess in over.items() if excess > SLIGHT]
+    able = [row for row in others if row.lightest and row.holds]
+    if not able:
+        none = "o straight member within the arms' envelope holds the limits"
+        if broken:
+            return f"N{none}, nor does the design ({', '.join(broken)}): nobody wins."
+        return f"N{none}, the design does with {design.mass:.4g} kg: the design wins."
+    best = min(able, key=lambda row: row.mass)
+    text = (
+        f"The lightest straight {best.kind} that holds the limits weighs {best.mass:.4g} kg, the "
+        f"design {design.mass:.4g} kg"
+    )
+    if broken:
+        return f"{text} without holding them ({', '.join(broken)}): the {best.kind} wins."
+    if over:
+        text += f" ({', '.join(f'{k} {100.0 * x:.2g} % over its limit' for k, x in over.items())})"
+    return f"{text}: the {best.kind if best.mass < design.mass else DESIGN} wins."
+
+
+def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
+    """Return the sentence where nothing but material is limited."""
+    able = [row for row in others if not row.outcome.failure]
+    if not able:
+        return "No straight member within the arms' envelope has the design's mass."
+    best = min(able, key=lambda row: row.outcome.objective)
+    values = best.outcome.objective, design.outcome.objective
+    name, unit = objective_of(scene).label, objective_of(scene).unit
+    return (
+        f"With the design's mass of {design.mass:.4g} kg the best straight member, a {best.kind}, "
+        f"has an objective ({name}) of {values[0]:.4g} {unit}, the design {values[1]:.4g} {unit}: "
+        f"the {best.kind if values[0] < values[1] else DESIGN} wins."
+    )
+
+
+def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
+    """Return what one has to know to read the table."""
+    notes = ["Members are straight from joint to joint, uniform, without flanges or bosses."]
+    if scene.is_spatial:
+        notes.append(
+            "Tubes and the I have the outer sides of the arm's envelope, their walls are what "
+            f"varies (a share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is "
+            "not judged."
+        )
+    else:
+        notes.append(
+            "In plane stress all parts are as thick as the arm, so that tubes and I sections are "
+            "none; the bar's height is what varies."
+        )
+    if len({owner for owner in scene.owners if owner is not None}) > 1:
+        notes.append("Every arm has its own size.")
+    kinds = IN_SPACE if scene.is_spatial else IN_PLANE
+    if missing := [kind for kind in kinds if kind not in {r.kind for r in rows if r.made == SAME}]:
+        notes.append(f"No {' or '.join(missing)} in the envelope has the design's mass.")
+    return notes
+
+
+def _cells(scene: Scene, row: Row) -> dict[str, Any]:
+    """Return a row by column."""
+    outcome, summary = row.outcome, row.summary
+    stress = summary.get("stress")
+    cells: dict[str, Any] = {
+        "section": row.kind,
+        "made": row.made,
+        "sizes [mm]": row.sizes,
+        "mass [kg]": row.mass,
+        f"objective [{objective_of(scene).unit}]": outcome.objective,
+        COMPLIANCE: outcome.compliance,
+        DEVIATION: 1e3 * outcome.max_deviation,
+        "settling [mm]": 1e3 * summary.get("settling", math.nan),
+        "stress [MPa]": math.nan if stress is None else 1e-6 * stress["value"],
+        "grayness [-]": outcome.grayness,
+    }
+    for name, one in _limits(summary).items():
+        sign = ">=" if one["bound"] == "least" else "<="
+        key = f"{name.replace('_', ' ')} {sign} {one['limit']:g} {one['unit']}"
+        cells[key] = f"{one['value']:.4g} {'met' if one['met'] else 'not met'}"
+    if row.outcome.failure:
+        cells["failed"] = row.outcome.failure
+    return cells
+
+
+def sections_of(run: Path) -> Table | None:
+    """Return the table of RUN/sections, where a study has compared the run's design with members.
+
+    None where there is none, or of another design.
+    """
+    folder = run / NAME
+    try:
+        asked = json.loads((folder / f"{NAME}.json").read_text("utf-8"))["question"]
+        if asked["designs"] != [file_digest(run / "design.npz")]:
+            return None
+        title = (folder / f"{NAME}.md").read_text("utf-8").partition("\n")[0]
+        return Table(NAME, title, pd.read_csv(folder / f"{NAME}.csv", keep_default_na=False))
+    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return None
