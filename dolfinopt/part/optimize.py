@@ -54,6 +54,7 @@ MORPHED = 4  # steps that one mesh follows
 SIDES = 1.0  # of the triangles over those of the fine mesh
 ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
 RESERVE = 2e-3  # relative, more than that
+STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
 
 Tell = Callable[[str], None]
@@ -134,6 +135,7 @@ def optimize_parts(
         missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
         tell("tightened by what the finer mesh shows: " + ", ".join(missing))
         problem = replace(problem, tightened={**problem.tightened, **missing})
+        state = problem.evaluated(state.outlines, {}, search.solutions)
     made, after, limits = found
     return Optimized(made, mesh_parts(made), done, before, after, limits, ending)
 
@@ -182,14 +184,29 @@ class State:
         outlines, bodies: by the arm's place in the chain.
         simulated: the machine.
         limits: of the scene, but for the volume's.
-        values: (1 + m,) what is minimised, and the relative constraints, volumes last.
+        smooth, held: (k,) smooth value of each of them, and its limit, tightened and scaled so that
+            the true value is limited.
+        shares: relative constraints of the volumes.
     """
 
     outlines: Mapping[int, FreeOutline]
     bodies: Mapping[int, BodyMesh]
     simulated: Simulated
     limits: tuple[Limit, ...]
-    values: np.ndarray
+    smooth: np.ndarray
+    held: np.ndarray
+    shares: np.ndarray
+
+    @property
+    def values(self) -> np.ndarray:
+        """What is minimised, and the relative constraints by their true values (1 + m,)."""
+        return self.against(self.held)
+
+    def against(self, held: np.ndarray) -> np.ndarray:
+        """Return the same by smooth values and the smooth limits of another state."""
+        sign = -1.0 if objective_of(self.simulated.scene).turned else 1.0
+        objective = sign * self.simulated.evaluation.objective
+        return np.concatenate([[objective], self.smooth / held - 1.0, self.shares])
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,24 +240,21 @@ class Problem:
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
         simulated = simulate_bodies(self.scene, parts, bodies, *start, **changes)
-        sign = -1.0 if objective_of(self.scene).turned else 1.0
-        limits = [
-            (one, value)
-            for one, value in zip(
-                limits_of(simulated.scene, simulated.evaluation),
-                simulated.evaluation.constraints,
-                strict=True,
-            )
-            if one.quantity not in ("volume_fraction", STRESS)
-        ]
+        found, rows = simulated.evaluation, []
+        every = limits_of(simulated.scene, found)
+        for one, value, limit in zip(every, found.constraints, found.smooth_limits, strict=True):
+            if one.quantity not in ("volume_fraction", STRESS):
+                rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
         if self.scene.constraints.stress is not None:
             stress, analysis = self._outline_stress(simulated, outlines)
-            value, limit = stress.measure(analysis).values[0], self.scene.constraints.stress
-            limits.append((Limit(STRESS, "", value, limit, "Pa"), value / limit - 1.0))
-        own = [self._factor(one) * (1.0 + value) - 1.0 for one, value in limits]
+            measured, limit = stress.measure(analysis), self.scene.constraints.stress
+            true, smooth = measured.values[0], measured.smooth[0]
+            one = Limit(STRESS, "", true, limit, "Pa")
+            rows.append((one, smooth, limit * smooth / true / self._factor(one)))
+        limits, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
         shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
-        values = np.array([sign * simulated.evaluation.objective, *own, *shares])
-        return State(outlines, bodies, simulated, tuple(one for one, _ in limits), values)
+        numbers = (np.array(one, dtype=float) for one in (smooths, held, shares))
+        return State(outlines, bodies, simulated, tuple(limits), *numbers)
 
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0)
@@ -254,7 +268,9 @@ class Problem:
         away = away_from_ends(shapes, apart)
         one = simulated
         given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
-        return OutlineStress(one.scene.objective, away, corner_stress), analysis_of(*given)
+        p = max(one.scene.objective.stress_exponent, STRESS_EXPONENT)
+        options = one.scene.objective.model_copy(update={"stress_exponent": p})
+        return OutlineStress(options, away, corner_stress), analysis_of(*given)
 
     def _volumes(
         self, outlines: Mapping[int, FreeOutline]
@@ -286,10 +302,8 @@ class Problem:
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
         if self.scene.constraints.stress is not None:
             stress, analysis = self._outline_stress(one, state.outlines)
-            smooth, (row_,) = stress.measure(analysis), stress.gradients(analysis)
-            (limit,) = (each for each in state.limits if each.quantity == STRESS)
-            scale = self._factor(limit) * limit.value / limit.limit / smooth.smooth[0]
-            rows.append({k: scale * g for k, g in row_.items()})
+            (row,) = stress.gradients(analysis)
+            rows.append({k: g / state.held[len(rows) - 1] for k, g in row.items()})
         parts = [self._by_x(state, rows)]
         volumes = self._volumes(state.outlines)
         if volumes:
@@ -382,7 +396,7 @@ class Search:
     def _step(self, slopes: np.ndarray) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         if self.morphed >= MORPHED or self._worst_triangle() < QUALITY:
-            self.state = self.problem.evaluated(self.state.outlines, {}, self._solutions())
+            self.state = self.problem.evaluated(self.state.outlines, {}, self.solutions)
             self.morphed = 0
             slopes = self.problem.slopes(self.state)
         before = self.state
@@ -395,7 +409,8 @@ class Search:
                 self.radius *= 0.5
                 continue
             promised = Promise(before.values + slopes @ (x - self.x), 0.0)
-            verdict = judge_step(stage, before.values, tried.values, promised, exact=True)
+            after_it = tried.against(before.held)
+            verdict = judge_step(stage, before.values, after_it, promised, exact=True)
             self.radius = min(1.0, verdict.factor * self.radius)
             if verdict.accepted:
                 self.x, self.mma, self.state = x, after, tried
@@ -443,11 +458,13 @@ class Search:
             bodies = {k: self.state.bodies[k].morphed(one.shape) for k, one in outlines.items()}
             if any(one.is_folded for one in bodies.values()):
                 bodies = {}
-            return self.problem.evaluated(outlines, bodies, self._solutions())
+            return self.problem.evaluated(outlines, bodies, self.solutions)
         except ConvergenceError:
             return None
 
-    def _solutions(self) -> Any:
+    @property
+    def solutions(self) -> Any:
+        """The motion of the last state, from which the next one's is found."""
         return self.state.simulated.trajectory.solutions
 
     def _worst_triangle(self) -> float:

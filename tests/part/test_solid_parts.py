@@ -418,7 +418,7 @@ def test_outlines_of_solids_are_refused(tmp_path):
     with pytest.raises(InputError, match="arm 'arm1' is a solid"):
         read_domains(solid_scene(), tmp_path, MPI.COMM_SELF)  # before anything is meshed
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
-    for option, words in (("--polish=2", "--polish"), ("--curves=arcs", "varies over the thick")):
+    for option, words in (("--optimize", "--optimize"), ("--curves=arcs", "varies over the thick")):
         with pytest.raises(InputError, match=words):
             run("part", folder, option)
     assert not (folder / "part").exists()
