@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.output.views import ArmView, gather_views
-from dolfinopt.part.boundary_stress import HOT
+from dolfinopt.part.body_mesh import BodyMesh
+from dolfinopt.part.boundary_stress import HOT, PartStress
 from dolfinopt.part.forms import (
     STRESS,
     Column,
+    Simulated,
     design_columns,
     largest_of,
     part_column,
@@ -263,6 +265,35 @@ def _told(peak: Peak, arm: str) -> str:
     return f"{1e-6 * peak.value:.4g} MPa in {arm} at ({place}) m and {peak.instant:.3f} s"
 
 
+def refined(
+    scene: Scene, parts: Mapping[int, Part], meshes: Meshes, before: Column
+) -> tuple[Simulated, Column, dict[int, PartStress], float, Mapping[int, BodyMesh]]:
+    """Return what parts do on meshes that are refined where their stress is largest.
+
+    Args:
+        scene, parts, meshes: as for `check_parts`.
+        before: what they do on the coarse meshes.
+
+    Returns:
+        The machine, its figures, its stress, the relative change of the largest one by the last
+        refinement, and the meshes.
+    """
+    bodies: Mapping[int, BodyMesh] = meshes.fine
+    places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
+    for round_ in range(ROUNDS + 1):
+        fine = simulate_bodies(scene, parts, bodies)
+        column, stress = part_column(scene, fine, parts)
+        change = relative_change(column.values[STRESS], before.values[STRESS])
+        if round_ == ROUNDS or not abs(change) > SETTLED_STRESS:
+            break
+        for place, one in stress.items():
+            owner = scene.owners[place]
+            if owner is not None and one.peak.value > HOT * column.values[STRESS]:
+                places[owner].append(one.hot)
+        before, bodies = column, finer_meshes(parts, places)
+    return fine, column, stress, change, bodies
+
+
 def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: Meshes) -> Check:
     """Simulate the densities of a run, the crisp design and the parts, on this rank alone.
 
@@ -276,21 +307,8 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
         ConvergenceError: the motion of the densities or of the parts cannot be simulated.
     """
     density, crisp = design_columns(scene, folder)
-    coarse = simulate_bodies(scene, parts, meshes.coarse)
-    before, _ = part_column(scene, coarse, parts)
-    coarse_column, bodies = before, meshes.fine
-    places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
-    for round_ in range(ROUNDS + 1):
-        fine = simulate_bodies(scene, parts, bodies)
-        column, stress = part_column(scene, fine, parts)
-        change = relative_change(column.values[STRESS], before.values[STRESS])
-        if round_ == ROUNDS or not abs(change) > SETTLED_STRESS:
-            break
-        for place, one in stress.items():
-            owner = scene.owners[place]
-            if owner is not None and one.peak.value > HOT * column.values[STRESS]:
-                places[owner].append(one.hot)
-        before, bodies = column, finer_meshes(parts, places)
+    coarse, _ = part_column(scene, simulate_bodies(scene, parts, meshes.coarse), parts)
+    fine, column, stress, change, bodies = refined(scene, parts, meshes, coarse)
     cells = {place: one.cells for place, one in stress.items()}
     worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value
@@ -299,7 +317,7 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
         density=density,
         crisp=crisp,
         part=column,
-        coarse=coarse_column,
+        coarse=coarse,
         stress_change=change,
         meshes=bodies,
         views=gather_views(fine.scene, fine.partition, fine.arms, fine.x_phys, cells),

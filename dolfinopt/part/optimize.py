@@ -33,6 +33,7 @@ from dolfinopt.part.boundary_stress import (
     away_from_ends,
     corner_stress,
 )
+from dolfinopt.part.check import refined
 from dolfinopt.part.forms import STRESS, Simulated, part_column, simulate_bodies
 from dolfinopt.part.free_outline import CHORD, FreeOutline, free_outline
 from dolfinopt.part.mesh import Meshes, body_mesh, mesh_parts
@@ -53,7 +54,7 @@ QUALITY = 0.15  # of a triangle, 1 where it is equilateral, below which the mesh
 MORPHED = 4  # steps that one mesh follows
 SIDES = 1.0  # of the triangles over those of the fine mesh
 ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
-RESERVE = 2e-3  # relative, more than that
+RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
 
@@ -154,10 +155,10 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
 
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[float, tuple[Limit, ...]]:
-    """Return objective and limits of parts on their fine meshes, stress that of the outline."""
-    fine = mesh_parts(parts).fine
-    state = simulate_bodies(scene, parts, fine)
-    column, _ = part_column(scene, state, parts)
+    """Return objective and limits of parts on refined meshes, stress that of the outline."""
+    meshes = mesh_parts(parts)
+    coarse, _ = part_column(scene, simulate_bodies(scene, parts, meshes.coarse), parts)
+    state, column, *_ = refined(scene, parts, meshes, coarse)
     return state.evaluation.objective, column.limits
 
 
@@ -257,7 +258,7 @@ class Problem:
         return State(outlines, bodies, simulated, tuple(limits), *numbers)
 
     def _factor(self, one: Limit) -> float:
-        return self.tightened.get(one.name, 1.0)
+        return self.tightened.get(one.name, 1.0 + RESERVE)
 
     def _outline_stress(
         self, simulated: Simulated, outlines: Mapping[int, FreeOutline]
