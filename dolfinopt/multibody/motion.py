@@ -182,7 +182,8 @@ def rests(
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration
-    return inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0).tolist()
+    instants = inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
+    return [float(t) for t in instants]
 
 
 def inverse(
