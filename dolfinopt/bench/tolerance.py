@@ -61,8 +61,8 @@ def random_case(scene: Scene, arms: Arms, number: int) -> tuple[Row, ElasticSyst
         if path == "arc":
             words |= {"motion.flattening": rng.uniform(), "motion.radius": rng.uniform(0.5, 1.5)}
         else:
-            ends = rng.uniform((-1.0, -0.5), (1.0, 1.0), (2, 2))
-            words |= {"motion.start": list(ends[0]), "motion.end": list(ends[1])}
+            for end in ("start", "end"):
+                words[f"motion.{end}"] = [float(x) for x in rng.uniform((-1.0, -0.5), (1.0, 1.0))]
         try:
             s = changed(scene, *(f"{key}={value}" for key, value in words.items()))
         except InputError:
