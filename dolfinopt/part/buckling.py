@@ -8,8 +8,9 @@ all loads grown by a factor, their directions kept, the lowest positive lambda o
 is the factor at which it is no longer stable. All finite elements of the part count: a strut
 between two holes buckles by itself, which no mode of the reduced model shows. The part is clamped
 at its inboard interface; the outboard one is rigid and moves freely, as in the reduction. Nothing
-else in the chain holds it: what is beyond loads it alone, so that a rod with pins at both ends has
-four times the factor found here. Buckling out of the plane is not looked at.
+else in the chain holds it: what is beyond only loads it, so that a uniform rod with pins at both
+ends, pressed there, has four times the factor found here. Buckling out of the plane is not
+looked at.
 
 Source: Cook, Malkus, Plesha & Witt, Concepts and Applications of Finite Element Analysis (2002),
 ch. 18; Wallrapp & Schwertassek (1991), doi:10.1002/nme.1620320818.
