@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 # method of second order leaves a third of it.
 SETTLED, SETTLED_STRESS = 1.5e-2, 0.1
 ROUNDS = 2  # refinements of the mesh where stress is largest, at most
+SAFE = 1.5  # buckling factor below which the program warns
 LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART, OPTIMISED = "density", "crisp", "part", "optimised part"
 
@@ -193,6 +194,13 @@ class Check:
                 f"stress of the part has no limit at {_told(self.singular, self.singular_arm)}: "
                 "at a re-entrant corner or the end of a rigid interface it grows with every "
                 "refinement; give it a radius, or judge it by the load of the joint"
+            )
+        buckling = self.part.buckling
+        if buckling is not None and buckling.factor < SAFE:
+            found.append(
+                f"{self.part.trajectory.scene.arms[buckling.place].name} buckles at "
+                f"{buckling.factor:.3g} times its loads at {buckling.instant:.3f} s: make its "
+                "struts shorter or thicker (design.minimum_member)"
             )
         if self.crisp is None:
             found.append(

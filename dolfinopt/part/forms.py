@@ -17,6 +17,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.body_mesh import BodyMesh
 from dolfinopt.part.boundary_stress import APART, PartStress, part_stress
+from dolfinopt.part.buckling import Buckling, lowest_buckling
 from dolfinopt.part.mesh import write_meshes
 from dolfinopt.part.part import Part
 from dolfinopt.part.scene_file import scene_data, toml_text
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from dolfinopt.responses.evaluation import Evaluation
 
 STRESS = "stress"
+BUCKLING = "buckling"
 PATIENCE = 20.0  # work of the crisp design's simulation before it is given up, over the densities'
 
 
@@ -52,6 +54,7 @@ class Column:
         stressed: name of the arm that has it.
         limits: the scene's constraints, without that of the volume, which all forms share.
         trajectory: its motion.
+        buckling: of plane parts; None of other forms.
     """
 
     values: Mapping[str, float]
@@ -59,6 +62,7 @@ class Column:
     stressed: str
     limits: tuple[Limit, ...]
     trajectory: Trajectory
+    buckling: Buckling | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +188,12 @@ def part_column(
     shapes = {k: part.shape for k, part in parts.items()}
     found = part_stress(one.arms, one.trajectory, shapes, apart)
     peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
-    return column_of(one, peak, arm), found
+    return column_of(one, peak, arm, lowest_buckling(one.arms, one.trajectory)), found
 
 
-def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
+def column_of(
+    one: Simulated, peak: Peak | None, arm: str, buckling: Buckling | None = None
+) -> Column:
     """Return the figures of a machine whose largest stress is known, with the arm that has it."""
     limits = [
         limit
@@ -200,7 +206,9 @@ def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
             for limit in limits
         ]
     values = dict(_values(one, float("nan") if peak is None else peak.value))
-    return Column(values, peak, arm, tuple(limits), one.trajectory)
+    if not one.scene.is_spatial:  # of densities it is not looked at
+        values[BUCKLING] = float("nan") if buckling is None else buckling.factor
+    return Column(values, peak, arm, tuple(limits), one.trajectory, buckling)
 
 
 def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
@@ -246,7 +254,7 @@ def units_of(scene: Scene, column: Column) -> dict[str, str]:
         "mass": "kg", "first_frequency": "Hz", "objective": objective_of(scene).unit,
         "compliance": "N m", "deviation": "m", "settling": "m", "orientation": "rad",
         "closure_force": "N",
-        STRESS: "Pa",
+        STRESS: "Pa", BUCKLING: "-",
     }  # fmt: skip
     drives = {f"drive_peak_{name}": unit for name, unit in drive_units(scene).items()}
     return {
