@@ -151,7 +151,7 @@ def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...
 def sample_cases(
     scene: Scene, samples: Sequence[tuple[str, ...]], label: str, design: Design
 ) -> list[Case]:
-    """Return the cases of one design: an interruption costs one, more samples leave them alone."""
+    """Return the cases of one design: an interruption costs one, more samples leave them be."""
     keys = {change.partition("=")[0] for one in samples for change in one}
     size = CHUNK if scales_bodies(scene, keys) else REDUCED
     return [
