@@ -13,7 +13,6 @@ from dolfinopt.bench.measure import Cells, Plan, in_processes, mpirun, timed
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.bench.programs import PlainStatics, pymoto_iteration
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.run import optimize
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import changed
@@ -27,18 +26,16 @@ PLAIN, PYMOTO = "plain DOLFINx, static, one arm", "pyMOTO, static, one arm"
 
 
 def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
-    """Optimise for the scene's iterations, at least two (collective); return on the root:
+    """Optimise for the scene's iterations, at least two (collective).
 
-    Median of their CPU seconds on the root, and of those on the wall, as no two iterations do the
-    same; iterations done; seconds of the whole, on the wall.
+    The root returns their median of CPU seconds and on the wall, how many, seconds of the whole.
     """
     clock: list[tuple[float, float]] = []
 
-    def report(row: HistoryRow) -> None:
-        clock.append((time.process_time(), perf_counter()))
-
     begun = perf_counter()
-    result = optimize(scene, world=comm, report=report)
+    result = optimize(
+        scene, world=comm, report=lambda _: clock.append((time.process_time(), perf_counter()))
+    )
     elapsed = perf_counter() - begun
     if comm.rank > 0:
         return []

@@ -1,8 +1,8 @@
 """The clock, and measurements in processes of their own: several ranks, a memory of their own.
 
-`python -m dolfinopt.bench.measure MODULE FUNCTION FILE`, also under mpirun, calls a function of
-MODULE with all ranks, the scene and the arguments in FILE; prints one line of JSON: what the root's
-returned, and the peak memory of all ranks, MB.
+`python -m dolfinopt.bench.measure MODULE FUNCTION GIVEN`, also under mpirun, calls a function of
+MODULE with all ranks, the scene and the arguments in GIVEN, JSON; prints what the root's returned,
+and the peak memory of all ranks, MB, as one line of JSON.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,9 +24,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm, build_arms, chain_of
+from dolfinopt.arms.arm import Arm, build_arms
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -64,8 +62,7 @@ def timed(
 ) -> tuple[float, float, Any]:
     """Call `repeats` times; return the least seconds of CPU and on the wall, and the last value.
 
-    CPU time of this process leaves out others on the machine; whatever disturbs a call makes it
-    longer. What takes more than `short` seconds is called once.
+    Whatever disturbs a call makes it longer. What takes more than `short` seconds is called once.
     """
     cpu = wall = math.inf
     for _ in range(repeats):
@@ -84,11 +81,6 @@ def arms_of(scene: Scene) -> Arms:
     return build_arms(scene, partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile())
 
 
-def bodies_of(scene: Scene, arms: Arms, x_phys: Densities) -> list[ShapeIntegrals]:
-    """Reduce the arms as `scene` asks for; return the bodies from the cart outwards."""
-    return chain_of(scene, {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()})
-
-
 # -- processes -------------------------------------------------------------------------------
 
 
@@ -102,34 +94,27 @@ def in_processes(
 ) -> tuple[Any, float]:
     """Return what function(comm, scene, *given) does there, and the peak memory, MB.
 
-    Raises:
-        ConvergenceError: the processes failed.
+    ConvergenceError where the processes fail.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "given.json"
-        path.write_text(json.dumps([scene.to_dict(), *given]), encoding="utf-8")
-        command = [sys.executable, "-m", __name__, function.__module__, function.__name__]
-        command = [str(mpirun()), "-n", str(ranks)] * (ranks > 1) + [*command, str(path)]
-        # os.environ is as Python found it: without what MPI added for this process alone.
-        environment = {**ENVIRONMENT, **os.environ, "OMP_NUM_THREADS": "1"}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", __name__, function.__module__, function.__name__]
+    command = [str(mpirun()), "-n", str(ranks)] * (ranks > 1) + command
+    words = [*command, json.dumps([scene.to_dict(), *given])]
+    # os.environ is as Python found it: without what MPI added for this process alone.
+    environment = {**ENVIRONMENT, **os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise ConvergenceError(f"{' '.join(command)}: {done.stderr.strip()[-2000:]}")
     found, memory = json.loads(done.stdout.strip().splitlines()[-1])
     return found, memory
 
 
-def _peak() -> float:
-    """Return this process's peak memory, MB; not that of its parent, which getrusage inherits."""
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    return float(status.partition("VmHWM:")[2].split()[0]) / 1024.0
-
-
-def _main(module: str, name: str, file: str) -> None:
+def _main(module: str, name: str, text: str) -> None:
     comm = MPI.COMM_WORLD
-    scene, *given = json.loads(Path(file).read_text(encoding="utf-8"))
+    scene, *given = json.loads(text)
     found = getattr(import_module(module), name)(comm, scene_from_dict(scene), *given)
-    memory = comm.allreduce(_peak())
+    # Not by getrusage, which inherits the peak of the parent; kB.
+    peak = Path("/proc/self/status").read_text(encoding="utf-8").partition("VmHWM:")[2].split()[0]
+    memory = comm.allreduce(float(peak) / 1024.0)
     if comm.rank == 0:
         print(json.dumps([found, memory]), flush=True)
 

@@ -10,7 +10,8 @@ import numpy as np
 from mpi4py import MPI
 from scipy.integrate import solve_ivp
 
-from dolfinopt.bench.measure import Arms, Densities, Plan, bodies_of, timed
+from dolfinopt.arms.arm import chain_of
+from dolfinopt.bench.measure import Arms, Densities, Plan, timed
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import build_system
@@ -38,7 +39,8 @@ USUAL, USUAL_TOLERANCE = "Radau, 4 stages", 1e-4  # a simulation as scenes have 
 
 def problem_of(scene: Scene, arms: Arms, x_phys: Densities) -> ElasticSystem:
     """Return the elastic rows of a scene's motion with these densities."""
-    found = build_system(scene, bodies_of(scene, arms, x_phys))
+    bodies = {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()}
+    found = build_system(scene, chain_of(scene, bodies))
     assert isinstance(found, ElasticSystem)
     return found
 
@@ -75,10 +77,10 @@ def jacobian(problem: ElasticSystem, t: float, y: np.ndarray) -> np.ndarray:
 
 
 def scipy_motion(method: str, tolerance: float, to: Reference) -> np.ndarray:
-    """Return q (n, N) by SciPy's `solve_ivp`, piece by piece between the breakpoints.
+    """Return q (n, N) by SciPy's `solve_ivp`, between breakpoints; ConvergenceError if it fails.
 
     In the arms' vibrations, where one absolute tolerance suits all: the relative one times the
-    largest value of q, and of its rate. ConvergenceError where SciPy gives up.
+    largest value of q, and of its rate.
     """
     modes, t = to.problem.preconditioner(), to.t
     problem, z = modes.system, modes.to_modes(to.q)

@@ -10,7 +10,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import tomllib
 from mpi4py import MPI
 from scipy.optimize import brentq
 
@@ -23,7 +22,7 @@ from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.responses.evaluation import evaluate
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import Scene, scene_from_dict, tomllib
 
 Table = dict[str, Any]
 

@@ -27,29 +27,19 @@ Frame: TypeAlias = pd.DataFrame
 
 @dataclass(frozen=True)
 class Diagram:
-    """One diagram: rows by steps, and curves over logarithmic axes.
+    """One diagram: rows by steps, and curves over logarithmic axes."""
 
-    Attributes:
-        name, title, note: of its files; above it; on what is measured.
-        columns: of the rows, with units, " | " between them.
-        steps: what is measured; the rows of each are kept when it is done.
-        x, y, by: columns: a panel for every y, a curve for every value of `by`.
-        each: columns; every combination of their values has panels of its own.
-        drawn: returns the frame that is drawn.
-        uses: packages whose versions, or absence, change the rows.
-    """
-
-    name: str
+    name: str  # of its files
     title: str
-    columns: str
-    steps: Callable[[Plan], Steps]
+    columns: str  # of the rows, with units, " | " between them
+    steps: Callable[[Plan], Steps]  # what is measured; rows of each are kept when it is done
     x: str
-    y: tuple[str, ...]
-    by: str
-    note: str
-    each: tuple[str, ...] = ()
-    drawn: Callable[[Frame], Frame] = Frame.copy
-    uses: tuple[str, ...] = ()
+    y: tuple[str, ...]  # columns, a panel each
+    by: str  # column: a curve for every value
+    note: str  # on what is measured
+    each: tuple[str, ...] = ()  # columns; every combination of values has panels of its own
+    drawn: Callable[[Frame], Frame] = Frame.copy  # returns the frame that is drawn
+    uses: tuple[str, ...] = ()  # packages whose versions, or absence, change the rows
 
     def frame(self, rows: Iterable[Row]) -> Frame:
         """Return rows under their columns."""
@@ -61,11 +51,8 @@ def write(diagram: Diagram, frame: Frame, folder: Path) -> str:
     table = Table(diagram.name, diagram.note, frame)
     write_text(folder / f"{diagram.name}.csv", table.csv())
     save(draw(figure_of(diagram, frame)), folder / f"{diagram.name}.png")
-    missing = [
-        f"Left out, not installed (pip install 'dolfinopt[bench]'): {package}."
-        for package in diagram.uses
-        if not version(package)
-    ]
+    left_out = "Left out, not installed (pip install 'dolfinopt[bench]'): {}."
+    missing = [left_out.format(package) for package in diagram.uses if not version(package)]
     head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)"]
     return "\n\n".join([*head, *missing, table.markdown()])
 
@@ -97,10 +84,7 @@ def fitted_power(points: Frame) -> float:
 
 
 def least_x(points: Frame, goal: float) -> float:
-    """Return the least x of a curve to y = `goal`, log over log, from coarse to fine; or the last.
-
-    The last one is a bound where the curve does not get there.
-    """
+    """Return the least x of a curve to y = `goal`, log over log; the last, a bound, if it fails."""
     x, y = np.log(points.to_numpy(dtype=float)).T
     y = np.minimum.accumulate(y)
     return float(np.exp(np.interp(-math.log(goal), -y, x)))

@@ -25,17 +25,15 @@ Iteration = Callable[[np.ndarray], tuple[float, np.ndarray]]
 class PlainStatics:
     """Compliance of a cantilever as DOLFINx's own demos would find it (collective).
 
-    One load at the end, linear elements, no filter. In the plane MUMPS' Cholesky factor; in space
-    conjugate gradients with GAMG, from zero.
+    Linear elements, no filter. In the plane MUMPS' Cholesky factor, in space CG with GAMG from 0.
     """
 
     def __init__(
         self, arm: ArmMesh, modulus: float, nu: float, area: float, tolerance: float = 1e-7
     ) -> None:
-        """Compile the forms of an arm that is clamped at its inboard facets.
+        """Compile the forms of an arm that is clamped at its inboard facets; 1 N over its end.
 
-        1 N is spread over the area of the end; in the plane the modulus is times the thickness, and
-        the area the height. The tolerance is that of conjugate gradients.
+        In the plane the modulus is times the thickness, and the area the height; CG's tolerance.
         """
         mesh, d, self.modulus, self.count = arm.mesh, arm.dim, modulus, arm.num_cells
         self.space = space = compat.lagrange_space(mesh, 1, components=d)
@@ -71,10 +69,7 @@ class PlainStatics:
         self._ksp.setTolerances(rtol=tolerance)
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the compliance and its derivative (n_cells,) by x; in space the cells' energies.
-
-        Assemble K, make the factor or the hierarchy, solve.
-        """
+        """Return the compliance and its derivative (n_cells,) by x; in space energies of cells."""
         self.x.x.array[: self.count] = x if self.in_plane else self.modulus * (FLOOR + x**PENALTY)
         compat.scatter_forward(self.x)
         self.K.zeroEntries()
@@ -95,10 +90,7 @@ class PlainStatics:
 
 
 def pymoto_iteration(scene: Scene, cells: tuple[int, int]) -> Iteration | None:
-    """Return the same of the scene's first arm in pyMOTO, with the solver it chooses; or None.
-
-    Source: pyMOTO, https://github.com/aatmdelissen/pyMOTO, version 1.5.
-    """
+    """Return the same by pyMOTO 1.5, https://github.com/aatmdelissen/pyMOTO; None: not there."""
     try:
         import pymoto as pym
     except ImportError:

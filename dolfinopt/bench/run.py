@@ -19,6 +19,10 @@ from dolfinopt.study.tables import Table
 
 Tell = Callable[[str], None]
 QUICKLY = ("arms.cells=[100,6]",)  # the scene of a quick bench
+HEAD = """# Run time against error
+
+Measured by `dolfinopt bench{}`: CPU seconds of this process, the least of the repeats, one \
+thread, unless a table says otherwise."""
 # The main one first; what takes long, or is about designs, only when it is named.
 DIAGRAMS = motion.DIAGRAM, iterations.DIAGRAM, elements.DIAGRAM, tolerance.DIAGRAM
 NAMED = optimiser.DIAGRAM, solid.DIAGRAM
@@ -37,15 +41,9 @@ def bench(
 ) -> list[str]:
     """Measure what is not measured yet, draw everything, write bench.md; return what failed.
 
-    Rows are kept in FOLDER/<name>.json as soon as they are there: a bench that was ended goes on
-    from the step it was at, and tries again what failed. The summary grows with every diagram.
-    `tell` takes a line for every step, `done` one for every diagram that is finished.
+    `tell` takes a line for every step, `done` one for every finished diagram.
     """
-    head = (
-        f"# Run time against error\n\nMeasured by `dolfinopt bench{' --quick' * plan.quick}`: CPU "
-        "seconds of this process, the least of the repeats, one thread, unless a table says "
-        "otherwise."
-    )
+    head = HEAD.format(" --quick" * plan.quick)
     frames: dict[str, Frame] = {}
     parts, failures = [], []
     for k, diagram in enumerate(diagrams, 1):
@@ -65,10 +63,9 @@ def bench(
 
 
 def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[list[Row], list[str]]:
-    """Return the rows of all steps, from FOLDER/<name>.json or measured, and what failed.
+    """Return the rows of all steps, kept in FOLDER/<name>.json or measured, and what failed.
 
-    Rows that another source of this package, or other versions of what they use, left there are
-    measured anew: they must not stand beside those of today's.
+    Those of another source of this package, or other versions of what they use, are not kept.
     """
     path, versions = folder / f"{diagram.name}.json", [version(one) for one in diagram.uses]
     asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]

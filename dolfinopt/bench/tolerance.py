@@ -39,8 +39,7 @@ LEAST_SWING = 10.0
 def random_case(scene: Scene, arms: Arms, number: int) -> tuple[Row, ElasticSystem]:
     """Draw a design and a motion; return the cells that its rows begin with, and its equations.
 
-    Kinds of design take turns; whatever else is drawn anew until the path is within reach and the
-    arms are stiff enough for it, see `LEAST_SWING`.
+    All is drawn anew until the path is within reach and the arms are stiff, see `LEAST_SWING`.
     """
     rng, kind = np.random.default_rng((SEED, number)), KINDS[number % len(KINDS)]
     while True:
@@ -76,10 +75,9 @@ def random_case(scene: Scene, arms: Arms, number: int) -> tuple[Row, ElasticSyst
 def random_design(kind: str, arm: Arm, rng: np.random.Generator) -> np.ndarray:
     """Return physical densities (n_cells,) of one of `KINDS`.
 
-    The upper and the lower sixth are nearly solid, as those of optimised designs, so that the arm
-    holds together; weak tips thin out over the outer 10 to 30 %, as modal truncation's optima do.
-    What varies is a normal random field of covariance exp(-d^2 / (2 l^2)) by random waves: Rahimi
-    & Recht, Random Features for Large-Scale Kernel Machines (2007).
+    The outer sixths are nearly solid and hold the arm together, as in optimised designs; weak tips
+    thin out over 10 to 30 %, as modal truncation's optima do. Between them a normal random field of
+    covariance exp(-d^2 / (2 l^2)), by random waves: Rahimi & Recht, Random Features (2007).
     """
     if kind == "uniform":
         return np.full(arm.mesh.num_cells, rng.uniform(0.3, 1.0))
@@ -101,11 +99,8 @@ def random_design(kind: str, arm: Arm, rng: np.random.Generator) -> np.ndarray:
 def reference(problem: ElasticSystem, start: Solution) -> Solution:
     """Return the motion to a hundredth of the finest tolerance, by its own steps and order.
 
-    Steps are doubled until the estimate is below the goal, from one more than the solution has: not
-    by the expected order, so that what it has overlooked has another chance to show.
-
-    Raises:
-        ConvergenceError: that many steps are not enough, or Newton fails.
+    Steps are doubled, not chosen by the expected order, from one more than the solution has, so
+    that what it has overlooked can show. ConvergenceError where `MOST_STEPS` are not enough.
     """
     goal, count = TOLERANCES[-1] / FINER, len(start.a) + 1
     while count <= MOST_STEPS:
@@ -117,11 +112,7 @@ def reference(problem: ElasticSystem, start: Solution) -> Solution:
 
 
 def compared(cells: Row, problem: ElasticSystem) -> Rows:
-    """Yield a row for every tolerance: the case's estimated and true error, inf where it failed.
-
-    Raises:
-        ConvergenceError: there is no reference.
-    """
+    """Yield a row for every tolerance: the case's estimated and true error, inf where it failed."""
     t = np.linspace(0.0, problem.breakpoints[-1], INSTANTS)
     cold = STAGES, Profile(), None
     runs = {tol: attempted(radau.integrate, problem, tol, *cold) for tol in TOLERANCES}
@@ -142,7 +133,8 @@ def _steps(plan: Plan) -> Steps:
     def rows(number: int) -> Rows:
         return compared(*random_case(scene, arms, number))
 
-    yield from ((f"case {k + 1} of {count}", partial(rows, k)) for k in range(count))
+    for k in range(count):
+        yield f"case {k + 1} of {count}", partial(rows, k)
 
 
 DIAGRAM = Diagram(

@@ -1,24 +1,13 @@
 """The paper's figures 3 to 15: its cases, what comes out of them, figures, data and page.
 
-Every row of the table is one design in one scene:
-
-| column | meaning |
-|---|---|
-| table | "objectives", "reductions", "coordinates", "payload", "path" |
-| label | what the design was made for or with |
-| kind | of its objective, or the reduction method; "" for neither |
-| x | number of coordinates, or value of the swept key; nan for neither |
-| made_for | value of the swept key that the design was made for; nan for none |
-| case, made | what is simulated; the optimisation that made the design, else `case` |
-
-`add_outcomes` adds compliance (N m), deviation (largest, m), grayness, iterations, note (how it
-ended), own (compliance as the design's own model sees it, N m) and apart: of "reductions" the part
-of the cells on the other side of one half than in the design made with the most Craig-Bampton
-coordinates, of "coordinates" the largest distance of the deviation from that with the most, over
-the latter's largest. What failed has nan.
-
-The figures bear the paper's numbers; where several show one thing, which of them shows what is our
-choice.
+Every row of the table is one design in one scene: its table, label, kind (of the objective or the
+reduction), x (coordinates, or the swept value), the value that it was made for, the case that is
+simulated, and the one that made the design. `add_outcomes` adds compliance (N m), deviation
+(largest, m), grayness, iterations, note (how it ended), own (compliance as the design's own model
+sees it, N m) and apart: of "reductions" the part of the cells on the other side of one half than in
+the design made with the most Craig-Bampton coordinates, of "coordinates" the largest distance of
+the deviation from that with the most, over the latter's largest. What does not apply, or failed,
+is nan. The figures bear the paper's numbers; which of several shows what is our choice.
 """
 
 from __future__ import annotations
@@ -27,6 +16,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -39,24 +29,16 @@ from dolfinopt.dynamics.build import check_motion
 from dolfinopt.output.folders import prepare_folder
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene.load import Scene, load_scene
-from dolfinopt.study import studies
+from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.studies import QUANTITIES
 from dolfinopt.study.tables import Figure, LineFigure, Panel, Table, embedded, html_page
-from dolfinopt.study.variants import (
-    OBJECTIVES,
-    changed,
-    differences,
-    reduced,
-    reference_scene,
-    with_objective,
-)
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-CRAIG_BAMPTON, MODAL = METHODS = ("craig-bampton", "modal")
+CRAIG_BAMPTON, _ = METHODS = ("craig-bampton", "modal")
 INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
 # The paper's design: load cases of the motion, frozen while it is improved.
 DYNAMIC = ("esl", "gradient=esl", "worst=compliance")
@@ -64,14 +46,9 @@ DYNAMIC = ("esl", "gradient=esl", "worst=compliance")
 FORCE_ALONE = ("static compliance, force alone", ("static", "loads=[[0, 1, 0]]"))
 CUT_OFF = "attached=none"  # no mass at the ends: the optimiser would cut the arms off
 # Objectives: label, kind, and the settings that make it.
-VARIANTS = (*(one for one in OBJECTIVES if CUT_OFF not in one[1]), FORCE_ALONE)
-SHOWN = (  # in figure 3
-    "dynamic loads (esl)",
-    "static compliance",
-    "static compliance, force alone",
-    "eigenfrequency, rigid bodies attached",
-    "eigenfrequency, point masses attached",
-)
+VARIANTS = (*(one for one in variants.OBJECTIVES if CUT_OFF not in one[1]), FORCE_ALONE)
+STATIC = [label for label, (kind, *_) in VARIANTS if kind in ("static", "eigenfrequency")]
+SHOWN = [VARIANTS[0][0], *STATIC]  # in figure 3
 SWEEPS = {  # table: key, axis, what a value is called
     "payload": ("payload.mass", "payload [kg]", "{:g} kg"),
     "path": ("motion.flattening", "flattening s [-]", "s = {:g}"),
@@ -81,8 +58,7 @@ LINEAR = ("simulation.stiffening=false", "arms.element=linear")
 # With the paper's filter, 0.75 of a coarse cell, the arms would hang together by corners of cells.
 COARSE = ("arms.cells=[100,6]", "optimizer.max_iterations=60", "design.filter_radius=0.02")
 COLUMNS = ["table", "label", "kind", "x", "made_for", "case", "made"]
-MEASURED = [*COLUMNS[:5], "compliance", "deviation", "grayness", "iterations", "note", "own"]
-MEASURED += ["apart"]
+MEASURED = [*COLUMNS[:5], *"compliance deviation grayness iterations note own apart".split()]
 
 Row: TypeAlias = tuple[str, str, str, float, float, Case, Case]
 Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what has their data
@@ -91,8 +67,7 @@ Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what h
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden.
 
-    Raises:
-        InputError: there is no such key, or it does not allow the value.
+    InputError where there is no such key, or it does not allow the value.
     """
     scene = load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
     check_motion(scene)
@@ -109,40 +84,28 @@ def cell_sizes(scene: Scene) -> dict[int, float]:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything the paper asks of a scene.
-
-    Attributes:
-        scene: the paper's.
-        variants: objectives, see `VARIANTS`.
-        optimised, swept: coordinates that designs are made with, and simulated with.
-        masses, payloads: kg, simulated and made for.
-        flattenings, paths: of the path, simulated and made for.
-    """
+    """Everything the paper asks of a scene."""
 
     scene: Scene
     variants: tuple[tuple[str, tuple[str, ...]], ...] = VARIANTS
-    optimised: tuple[int, ...] = (4, 48)
-    swept: tuple[int, ...] = (4, 6, 8, 12, 16, 24, 48, 100)
-    masses: tuple[float, ...] = tuple(4.0 + 0.5 * k for k in range(9))
-    payloads: tuple[float, ...] = (4.0, 6.0, 8.0)
-    flattenings: tuple[float, ...] = tuple(0.125 * k for k in range(9))
-    paths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    optimised: tuple[int, ...] = (4, 48)  # coordinates that designs are made with
+    swept: tuple[int, ...] = (4, 6, 8, 12, 16, 24, 48, 100)  # and simulated with
+    masses: tuple[float, ...] = tuple(4.0 + 0.5 * k for k in range(9))  # kg, simulated
+    payloads: tuple[float, ...] = (4.0, 6.0, 8.0)  # kg, made for
+    flattenings: tuple[float, ...] = tuple(0.125 * k for k in range(9))  # simulated
+    paths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)  # made for
 
     @property
     def optimum(self) -> Case:
         """The paper's design."""
-        return Case(with_objective(self.scene, *DYNAMIC), "optimize", label=OPTIMUM)
+        return Case(variants.with_objective(self.scene, *DYNAMIC), "optimize", label=OPTIMUM)
 
     @cached_property
     def table(self) -> pd.DataFrame:
         """All cases, see the module."""
-        rows = [
-            *self._objectives(),
-            *self._reductions(),
-            *self._coordinates(),
-            *self._sweep("payload", self.masses, self.payloads),
-            *self._sweep("path", self.flattenings, self.paths),
-        ]
+        rows = [*self._objectives(), *self._reductions()]
+        rows += self._sweep("payload", self.masses, self.payloads)
+        rows += self._sweep("path", self.flattenings, self.paths)
         return pd.DataFrame(rows, columns=COLUMNS)
 
     def _objectives(self) -> Iterator[Row]:
@@ -150,20 +113,17 @@ class Plan:
         initial = Case(self.scene, label=INITIAL)
         yield "objectives", INITIAL, "", math.nan, math.nan, initial, initial
         for label, settings in self.variants:
-            scene = with_objective(self.scene, *settings)
+            scene = variants.with_objective(self.scene, *settings)
             case = Case(scene, "optimize", label=label)
             yield "objectives", label, scene.objective.kind, math.nan, math.nan, case, case
 
     def _reductions(self) -> Iterator[Row]:
-        """Yield designs made with either reduction, in the reference model."""
-        reference = reference_scene(self.scene)
+        """Yield designs made with either reduction, in the reference model; two with all others."""
+        reference = variants.reference_scene(self.scene)
         for method, count, scene in self._reduced(self.optimised):
             made = Case(scene, "optimize", label=f"{method} {count}")
             again = Case(reference, "simulate", made, f"{made.label} in the reference")
             yield "reductions", made.label, method, count, math.nan, again, made
-
-    def _coordinates(self) -> Iterator[Row]:
-        """Yield the initial and the optimised design with either method and more coordinates."""
         for label, design in ((INITIAL, None), (OPTIMUM, self.optimum)):
             for method, count, scene in self._reduced(self.swept):
                 case = Case(scene, "simulate", design, f"{label}, {method} {count}")
@@ -172,24 +132,21 @@ class Plan:
     def _reduced(self, counts: Sequence[int]) -> Iterator[tuple[str, int, Scene]]:
         """Yield the scene with either method; small arms have no more than their coordinates."""
         most = min([arm.n_reducible for arm in self.scene.arms if arm.n_reducible] + [max(counts)])
-        for method in METHODS:
-            for count in dict.fromkeys(min(n, most) for n in counts):
-                yield method, count, reduced(self.scene, method, count)
+        for method, count in product(METHODS, dict.fromkeys(min(n, most) for n in counts)):
+            yield method, count, variants.reduced(self.scene, method, count)
 
-    def _sweep(
-        self, table: str, values: Sequence[float], optimised: Sequence[float]
-    ) -> Iterator[Row]:
+    def _sweep(self, table: str, values: Iterable[float], own: Iterable[float]) -> Iterator[Row]:
         """Yield the initial design, on paths solid arms, and designs made for some values."""
         key, _, words = SWEEPS[table]
-        scenes = {value: changed(self.scene, f"{key}={value}") for value in values}
+        scenes = {value: variants.changed(self.scene, f"{key}={value}") for value in values}
         designs: list[tuple[str, float, Case | None]] = [(INITIAL, math.nan, None)]
         designs += [(SOLID, math.nan, None)] * (table == "path")
-        for value in optimised:
+        for value in own:
             label = f"made for {words.format(value)}"
             designs.append((label, value, Case(scenes[value], "optimize", label=label)))
         for label, made_for, design in designs:
             for value, one in scenes.items():
-                there = changed(one, "design.initial=1.0") if label == SOLID else one
+                there = variants.changed(one, "design.initial=1.0") if label == SOLID else one
                 case = Case(there, "simulate", design, f"{label}, {words.format(value)}")
                 yield table, label, "", value, made_for, case, design or case
 
@@ -197,9 +154,7 @@ class Plan:
 # -- results ---------------------------------------------------------------------------------
 
 
-def reproduce(
-    plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True
-) -> tuple[pd.DataFrame, Outcomes]:
+def reproduce(plan: Plan, folder: Path, world: MPI.Comm) -> tuple[pd.DataFrame, Outcomes]:
     """Return the plan's table with results, and all outcomes; the same on all ranks (collective).
 
     What is done already is kept in DIR `folder`. InputError where the scene does not allow what the
@@ -208,7 +163,7 @@ def reproduce(
     with together(world):
         cases = [*plan.table.case, *plan.table.made]
     on_root(world, prepare_folder, folder)
-    outcomes = run_cases(cases, folder, world, shown=shown)
+    outcomes = run_cases(cases, folder, world)
     return on_root(world, add_outcomes, plan.table, outcomes), outcomes
 
 
@@ -228,14 +183,15 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
         rows = results[results.table == name]
         for _, group in rows.groupby(rows.label if name == "coordinates" else rows.table):
             finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
-            results.loc[group.index, "apart"] = [distance(outcomes[c], finest) for c in group.made]
+            pairs = [(outcomes[case], finest) for case in group.made]
+            results.loc[group.index, "apart"] = [
+                math.nan if a.failure or b.failure else distance(a, b) for a, b in pairs
+            ]
     return results
 
 
 def _cells_apart(one: Outcome, other: Outcome) -> float:
     """Return the part of the cells on the other side of one half; both have the same cells."""
-    if one.failure or other.failure:
-        return math.nan
     with np.load(one.design) as a, np.load(other.design) as b:
         keys = [key for key in a.files if key.endswith("/density")]
         return float(np.mean([((a[key] > 0.5) != (b[key] > 0.5)).mean() for key in keys]))
@@ -243,8 +199,6 @@ def _cells_apart(one: Outcome, other: Outcome) -> float:
 
 def _distance(one: Outcome, other: Outcome) -> float:
     """Return how far two deviations are apart at most, relative to the other's largest."""
-    if one.failure or other.failure:
-        return math.nan
     a, b = one.deviation()[1], other.deviation()[1]
     return float(np.abs(a - b).max() / b.max())
 
@@ -269,38 +223,33 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     results = results.assign(deviation=1e3 * results.deviation)
     results = results.rename(columns=dict(zip(("compliance", "deviation"), QUANTITIES)))
     by = dict(iter(results.groupby("table")))
-    objectives, reductions, coordinates = (
-        by[name] for name in ("objectives", "reductions", "coordinates")
-    )
+    objectives, reductions, coordinates = by["objectives"], by["reductions"], by["coordinates"]
 
     def good(cases: Iterable[Case]) -> list[Outcome]:
         return [outcome for case in cases if not (outcome := outcomes[case]).failure]
 
     optimum = coordinates[coordinates.label == OPTIMUM]
-    ends = [
-        case for _, one in optimum.groupby("kind", sort=False) for case in one.case.iloc[[0, -1]]
-    ]
+    by_kind = optimum.groupby("kind", sort=False)
+    ends = [case for _, one in by_kind for case in one.case.iloc[[0, -1]]]
     again = [replace(outcomes[c], case=made) for c, made in zip(reductions.case, reductions.made)]
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
     objective, grayness = studies.convergence(good(reductions.made))
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
+    by_count = tuple(
+        Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
+        for label, one in coordinates.astype({"x": int}).groupby("label", sort=False)
+    )
     lines = {
         3: _over_time("Deviation of the end-effector by objective", *shown),
-        5: _plot("Convergence of the compliance by reduction", [objective]),
-        6: _plot("Convergence of the grayness by reduction", [grayness]),
-        7: _plot(
-            "Compliance against the number of coordinates",
-            [
-                Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
-                for label, one in coordinates.astype({"x": int}).groupby("label", sort=False)
-            ],
-        ),
+        5: LineFigure("", "Convergence of the compliance by reduction", (objective,)),
+        6: LineFigure("", "Convergence of the grayness by reduction", (grayness,)),
+        7: LineFigure("", "Compliance against the number of coordinates", by_count),
         8: _over_time("Deviation of the optimised design by reduction", good(dict.fromkeys(ends))),
         9: _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
-        **_sweep(by["payload"], "payload", 10),
-        **_sweep(by["path"], "path", 12),
     }
+    swept = product(SWEEPS, QUANTITIES)
+    lines |= {n: _sweep(by[name], name, what) for n, (name, what) in enumerate(swept, 10)}
     figures: Figures = {number: (figure, figure) for number, figure in lines.items()}
     title = "Designs by objective"
     names = {"label": "made for", "grayness": "grayness [-]", "note": "ended by"}
@@ -316,60 +265,42 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     return dict(sorted(figures.items()))
 
 
-def _plot(title: str, panels: Iterable[Panel]) -> LineFigure:
-    return LineFigure("", title, tuple(panels))
-
-
 def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
     """Return deviations over time; empty axes where nothing could be simulated."""
     panels = [panel for outcomes in found for panel in studies.deviation_panels(outcomes)]
-    return _plot(title, panels or [Panel("", "time [s]", "deviation [mm]", ())])
+    return LineFigure("", title, tuple(panels) or (Panel("", "time [s]", "deviation [mm]", ()),))
 
 
-def _sweep(rows: pd.DataFrame, name: str, number: int) -> dict[int, LineFigure]:
-    """Return compliance and deviation; the initial design has a scale of its own."""
-    axis, figures = SWEEPS[name][1], {}
-    for k, quantity in enumerate(QUANTITIES):
-        lines = studies.lines_by(rows, "label", "x", quantity)
-        panels = [Panel("", axis, quantity, group) for group in (lines[:1], lines[1:])]
-        what, by = (text.partition(" [")[0] for text in (quantity, axis))
-        figures[number + k] = _plot(f"{what.capitalize()} against {by}", panels)
-    return figures
+def _sweep(rows: pd.DataFrame, name: str, quantity: str) -> LineFigure:
+    """Return a quantity over the swept value; the initial design has a scale of its own."""
+    axis, lines = SWEEPS[name][1], studies.lines_by(rows, "label", "x", quantity)
+    panels = tuple(Panel("", axis, quantity, group) for group in (lines[:1], lines[1:]))
+    what, by = (text.partition(" [")[0] for text in (quantity, axis))
+    return LineFigure("", f"{what.capitalize()} against {by}", panels)
 
 
 def write_report(
-    plan: Plan,
-    results: pd.DataFrame,
-    outcomes: Outcomes,
-    checks: Sequence[Any],
-    folder: Path,
-    *,
-    plots: bool = True,
-) -> None:
+    plan: Plan, results: pd.DataFrame, outcomes: Outcomes, checks: Sequence[Any], folder: Path,
+    *, plots: bool = True,
+) -> None:  # fmt: skip
     """Write figNN.csv, measured.json and, with plots, figNN.png and report.html (root only)."""
     figures = all_figures(results, outcomes)
     records = results[MEASURED].to_json(orient="records", double_precision=15, indent=1)
     write_text(folder / "measured.json", records + "\n")
     for number, (_, data) in figures.items():
         write_text(folder / f"fig{number:02d}.csv", data.csv())
-    if plots:
-        from dolfinopt.study.figures import draw_all
+    if not plots:
+        return
+    from dolfinopt.study.figures import draw_all
 
-        named = {f"fig{number:02d}": figure for number, (figure, _) in figures.items()}
-        files = draw_all(named, folder)
-        differing = differences(load_paper(), plan.scene).items()
-        content = html_page(
-            "report.html",
-            checks=checks,
-            figures=[
-                (number, figure.title, embedded(file.read_bytes()))
-                for (number, (figure, _)), file in zip(figures.items(), files)
-            ],
-            tables=[data for _, data in figures.values() if isinstance(data, Table)],
-            cases=outcomes.by_case,
-            overridden=[
-                f"{key} = {ours} in place of {theirs}" for key, (theirs, ours) in differing
-            ],
-            failures=outcomes.failures,
-        )
-        write_text(folder / "report.html", content)
+    files = draw_all({f"fig{number:02d}": one for number, (one, _) in figures.items()}, folder)
+    pictures = [
+        (number, figure.title, embedded(file.read_bytes()))
+        for (number, (figure, _)), file in zip(figures.items(), files)
+    ]
+    tables = [data for _, data in figures.values() if isinstance(data, Table)]
+    differing = variants.differences(load_paper(), plan.scene).items()
+    overridden = [f"{key} = {ours} in place of {theirs}" for key, (theirs, ours) in differing]
+    more = {"cases": outcomes.by_case, "failures": outcomes.failures, "overridden": overridden}
+    page = html_page("report.html", checks=checks, figures=pictures, tables=tables, **more)
+    write_text(folder / "report.html", page)

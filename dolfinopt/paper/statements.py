@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,7 @@ import numpy as np
 import pandas as pd
 
 from dolfinopt.paper.reproduction import INITIAL, METHODS, OPTIMUM, SOLID, cross_values, loss
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from dolfinopt.scene.load import tomllib
 
 MANY = 3.0  # from here on "n times" reads better than per cent
 TABLE = tomllib.loads((Path(__file__).parent / "statements.toml").read_text(encoding="utf-8"))
@@ -27,10 +22,7 @@ TEXTS = ("name", "statement", "paper", "found", "criterion", "reason", "demand")
 
 @dataclass(frozen=True)
 class Check:
-    """One statement of the paper and what is found here, see the table.
-
-    It holds by its criterion, or does not for a reason; the demand of `--check` stands or does not.
-    """
+    """One statement of the paper, see the table: it holds or not; the demand stands or not."""
 
     name: str
     statement: str
@@ -59,13 +51,14 @@ def check_paper(results: pd.DataFrame) -> list[Check]:
     environment.filters |= {"mm": mm, "percent": percent, "Nm": "{:.4g} N m".format}
     environment.filters["listed"] = lambda x: "; ".join(f"{k} {percent(x[k])}" for k in x)
     values = TOLERANCE | quantities(results)
+
+    def verdict(text: str) -> bool:
+        return bool(environment.compile_expression(text, False)(values))
+
     checks = []
     for one in TABLE["statement"]:
         texts = {k: environment.from_string(one.get(k, "")).render(values).strip() for k in TEXTS}
-        holds, stands = (
-            bool(environment.compile_expression(one.get(key, "true"), False)(values))
-            for key in ("holds", "stands")
-        )
+        holds, stands = verdict(one["holds"]), verdict(one.get("stands", "true"))
         checks.append(Check(**texts, holds=holds, stands=stands, figures=tuple(one["figures"])))
     return checks
 
@@ -94,13 +87,13 @@ def quantities(results: pd.DataFrame) -> dict[str, Any]:
     by = dict(iter(results.groupby("table")))
     curves, reductions = by["coordinates"], by["reductions"].sort_values("x").astype({"x": int})
     cms, modal = (reductions[reductions.kind == method] for method in METHODS)
-    return {
-        **_of_objectives(by["objectives"]),
-        **{"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]},
-        **{"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]},
+    ends = {"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]}
+    ends |= {"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]}
+    return ends | {
         "cms_change": abs(cms.compliance.iloc[0] / cms.compliance.iloc[-1] - 1.0),
         "before": _of_coordinates(curves[curves.label == INITIAL]),
         "after": _of_coordinates(curves[curves.label == OPTIMUM]),
+        **_of_objectives(by["objectives"]),
         **_of_payloads(by["payload"]),
         **_of_paths(by["path"]),
     }

@@ -13,7 +13,6 @@ from dolfinopt.reduction.free_arm import by_frame_fields, frame_fields
 from dolfinopt.reduction.gramian import balanced
 from dolfinopt.reduction.krylov import krylov, krylov_adjoint
 from dolfinopt.reduction.modal import craig_bampton, craig_bampton_adjoint, modal, modal_adjoint
-from dolfinopt.reduction.subspace import BasisErrors, basis_errors, mac
 
 
 @dataclass(frozen=True)
@@ -41,15 +40,12 @@ __all__ = [
     "METHODS",
     "AdjointFields",
     "Basis",
-    "BasisErrors",
     "Method",
     "Options",
     "balanced",
-    "basis_errors",
     "by_frame_fields",
     "craig_bampton",
     "frame_fields",
     "krylov",
-    "mac",
     "modal",
 ]

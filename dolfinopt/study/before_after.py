@@ -29,7 +29,6 @@ Summary = Mapping[str, Any]  # content of summary.json
 Image = dict[str, Any]  # see `tables.embedded`
 BEFORE, AFTER = "before", "after"
 LOOKS = {BEFORE: look(1), AFTER: look(0)}  # as an initial and an optimised design
-MM = 1e3  # of a metre
 
 
 # -- table -----------------------------------------------------------------------------------
@@ -43,8 +42,7 @@ def compare_runs(before: Path, after: Path) -> Table:
 def _summary(run: Path) -> Summary:
     path = run / "summary.json"
     try:
-        found: Summary = json.loads(path.read_text(encoding="utf-8"))
-        return found
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise _unreadable(path, error) from None
 
@@ -56,8 +54,7 @@ def _unreadable(path: Path, error: Exception) -> InputError:
 def before_after(before: Summary, after: Summary) -> Table:
     """Return mass, deflection, frequencies and drive forces of two runs of one machine.
 
-    Raises:
-        InputError: they have other arms or drives.
+    InputError where they have other arms or drives.
     """
     for key, what in (("mass", "arms"), ("drive_peak", "drives")):
         names = [list(one.get(key) or {}) for one in (before, after)]
@@ -101,26 +98,17 @@ def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the two runs, in space.
+    """One of the two runs, in space."""
 
-    Attributes:
-        folder, scene, summary: of the run, the folder as the user named it.
-        views: of all arms, in the scene's order.
-        mechanism: of its bodies.
-        t, q_r: (n,) s; (n, joints) rad or m.
-        deviation: (n,) of the tool from where rigid links carry it, m.
-        drive_forces: (n,) by the drive's name, N or N m.
-    """
-
-    folder: Path
+    folder: Path  # as the user named it
     scene: Scene
     summary: Summary
-    views: list[ArmView]
+    views: list[ArmView]  # of all arms, in the scene's order
     mechanism: SpatialMechanism
-    t: np.ndarray
-    q_r: np.ndarray
-    deviation: np.ndarray
-    drive_forces: Mapping[str, np.ndarray]
+    t: np.ndarray  # (n,) s
+    q_r: np.ndarray  # (n, joints) rad or m
+    deviation: np.ndarray  # (n,) of the tool from where rigid links carry it, m
+    drive_forces: Mapping[str, np.ndarray]  # (n,) by the drive's name, N or N m
 
 
 def read_side(
@@ -128,8 +116,7 @@ def read_side(
 ) -> Side:
     """Return a finished run with its motion, see `Side`; `bodies` of the arms that it designs.
 
-    Raises:
-        InputError: it has no summary.json or trajectory.npz, or another machine's.
+    InputError where it has no summary.json or trajectory.npz, or another machine's.
     """
     from dolfinopt.arms.arm import chain_of
     from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
@@ -150,12 +137,9 @@ def read_side(
 def before_after_page(
     before: Side, after: Side, table: Table, sections: Table | None = None
 ) -> str:
-    """Return the page of two runs of one machine, with the table of their figures.
+    """Return the page of two runs of one machine, with the table of `before_after`.
 
-    Args:
-        before, after: the runs.
-        table: see `before_after`.
-        sections: straight members beside the run after, see `sections.sections_of`.
+    `sections` are straight members beside the run after, see `sections.sections_of`.
     """
     from dolfinopt.plots.solid_machine import solid_machine_figure
 
@@ -199,7 +183,7 @@ def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
 def _curves(sides: Mapping[str, Side], table: Table) -> Iterator[tuple[str, str, Image]]:
     """Yield title, figures in words, and picture of deflection and drive forces over time."""
     title, figure = "deflection of the tool", "largest tool deflection"
-    deflections = {label: MM * side.deviation for label, side in sides.items()}
+    deflections = {label: 1e3 * side.deviation for label, side in sides.items()}
     words = _words(table, "largest", figure)
     yield title, words, _plot(sides, title, f"{title} [mm]", deflections)
     for drive, unit in drive_units(sides[AFTER].scene).items():

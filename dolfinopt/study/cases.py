@@ -36,24 +36,15 @@ class Case:
     """One thing to compute. Two cases are equal when they compute the same.
 
     The key is a hash of the scene's content, of the design and of the program that computes, never
-    of a name, a path or a date.
-
-    Attributes:
-        scene: complete; its name does not matter.
-        action: "optimize" finds a design, "simulate" moves a given one, "sample" moves it at
-            several samples of the scene's values.
-        design: given; that of an optimising case, of a file, or None, the initial one.
-        label: what progress and messages call it.
-        samples: what each sample changes, "key.path=value" each.
-        first: number of the first sample, for messages.
+    of a name, a path or a date. A design is found, moved, or moved at samples of scene values.
     """
 
-    scene: Scene
+    scene: Scene  # complete; its name does not matter
     action: Action = "simulate"
-    design: Case | Path | None = None
-    label: str = field(default="", compare=False)
-    samples: tuple[tuple[str, ...], ...] = ()
-    first: int = field(default=0, compare=False)
+    design: Case | Path | None = None  # given; of an optimising case, of a file, or the initial one
+    label: str = field(default="", compare=False)  # what progress and messages call it
+    samples: tuple[tuple[str, ...], ...] = ()  # what each changes, "key.path=value" each
+    first: int = field(default=0, compare=False)  # number of the first sample, for messages
 
     @cached_property
     def key(self) -> str:
@@ -107,21 +98,11 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came out of a case, read back from its folder. What it does not have is nan.
-
-    Attributes:
-        case, folder: which, and where its files are.
-        failure: message, "" where it succeeded.
-        objective, compliance, max_deviation, max_deviation_time, grayness, iterations,
-            stop_reason: of the summary; SI units.
-        seconds: that it took.
-        samples: compliance, max_deviation and max_deviation_time (n,) of samples.
-        messages: of the samples that failed, by number.
-    """
+    """What came out of a case: figures of its summary in SI units, nan for what it has not."""
 
     case: Case
-    folder: Path
-    failure: str = ""
+    folder: Path  # of its files
+    failure: str = ""  # message, "" where it succeeded
     objective: float = math.nan
     compliance: float = math.nan
     max_deviation: float = math.nan
@@ -130,8 +111,8 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)
-    messages: Mapping[int, str] = field(default_factory=dict)
+    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `store.SAMPLED`
+    messages: Mapping[int, str] = field(default_factory=dict)  # of samples that failed, by number
 
     def __str__(self) -> str:
         if self.failure:
@@ -169,8 +150,7 @@ class Outcome:
 
     def summary(self) -> dict[str, Any]:
         """Return the content of summary.json."""
-        found: dict[str, Any] = json.loads((self.folder / "summary.json").read_text("utf-8"))
-        return found
+        return dict(json.loads((self.folder / "summary.json").read_text("utf-8")))
 
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""

@@ -83,10 +83,7 @@ def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") ->
 
 
 def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
-    """Return the panels below each other, each with its legend below: legible on a phone.
-
-    Their left edges are one line.
-    """
+    """Return the panels below each other, flush, each with its legend: legible on a phone."""
     panels = figure.panels
     styles = styles or common_looks([figure])
     heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
@@ -136,8 +133,7 @@ def matrix_figure(figure: FrameFigure) -> Figure:
 
     Columns: "made for ...", what designs i were made for; their values, one for each j; panel.
     """
-    panels = list(figure.frame.groupby("panel", sort=False))
-    made = figure.frame.columns[0]
+    panels, made = list(figure.frame.groupby("panel", sort=False)), figure.frame.columns[0]
     count = len(panels[0][1])
     side = max(3.6, 0.62 * count + 1.6)
     drawn, grid = _grid(figure.title, (1, len(panels)), (side, side))

@@ -32,15 +32,9 @@ def simulate_scenarios(
     """Simulate one design in many scenes, on this rank alone; of one that fails yield its error.
 
     Arms are meshed, assembled and factorised once; neighbours with the same basis share it and are
-    simulated in one batch, whose time and counts the first of them bears.
-
-    Args:
-        scenes: that differ in `cases.SCENARIO` alone; neighbours also in what `Case.batch_key`
-            allows.
-        design: design.npz, or None, the initial one.
-
-    Raises:
-        InputError: the design does not fit the arms.
+    simulated in one batch, whose time and counts the first of them bears. Scenes differ in
+    `cases.SCENARIO` alone, neighbours also in what `Case.batch_key` allows. No design.npz is the
+    initial design; InputError where one does not fit the arms.
     """
     profile = Profile()
     partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
@@ -86,8 +80,7 @@ def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
 def with_sample(scene: Scene, changes: Sequence[str], number: int) -> Scene:
     """Return the scene with a sample's values, "key.path=value" each.
 
-    Raises:
-        InputError: the scene cannot have them; names the sample's number.
+    InputError where the scene cannot have them; it names the sample's number.
     """
     with variants.asked_by(f"--random, sample {number} ({', '.join(changes)})"):
         return variants.changed(scene, *changes)
@@ -96,15 +89,10 @@ def with_sample(scene: Scene, changes: Sequence[str], number: int) -> Scene:
 def simulate_samples(
     nominal: Simulated | ConvergenceError | None, scenes: Sequence[Scene], design: Path | None
 ) -> Iterator[Trajectory | ConvergenceError]:
-    """Simulate a design in scenes, on this rank alone.
+    """Simulate a design (design.npz, or None, the initial one) in scenes, on this rank alone.
 
-    Every sample starts from the nominal scene's solution: its bits depend on no other sample.
-
-    Args:
-        nominal: the design in the nominal scene, whose bodies are scaled; None: they are reduced
-            anew in every scene.
-        scenes: the samples'.
-        design: design.npz, or None, the initial one.
+    The bodies are scaled from those of `nominal`, the design in the nominal scene, and every sample
+    starts from its solution: the bits depend on no other sample. None: they are reduced anew.
     """
     if nominal is None:
         for scene in scenes:

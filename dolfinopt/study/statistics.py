@@ -41,22 +41,14 @@ SAMPLES_A_TERM = 3
 
 @dataclass(frozen=True)
 class Distribution:
-    """How one input is distributed, cut off where it has bounds.
+    """How one input is distributed, cut off at `low` and `high`."""
 
-    Attributes:
-        text: as the user wrote it, e.g. "normal:6:0.3".
-        law: SciPy's frozen distribution.
-        bounded: whether it has bounds of its own.
-        low, high: where it is cut off.
-        breakpoint: where the density's slope jumps.
-    """
-
-    text: str
-    law: Any = field(compare=False)
-    bounded: bool
+    text: str  # as the user wrote it, e.g. "normal:6:0.3"
+    law: Any = field(compare=False)  # SciPy's frozen distribution
+    bounded: bool  # whether it has bounds of its own
     low: float = -math.inf
     high: float = math.inf
-    breakpoint: float | None = None
+    breakpoint: float | None = None  # where the density's slope jumps
 
     @property
     def cut_off(self) -> float:
@@ -66,8 +58,7 @@ class Distribution:
     def within(self, low: float, high: float) -> Distribution:
         """Return the distribution cut off at bounds.
 
-        Raises:
-            InputError: it has bounds of its own that reach beyond, or nothing lies between them.
+        InputError where bounds of its own reach beyond, or half of it does.
         """
         least, most = self.law.support()
         if self.bounded and (least < low or most > high):
@@ -119,31 +110,22 @@ class Distribution:
 # By name: parameters and what they must fulfil, in words and as a function; SciPy's law of them.
 LAWS: dict[str, tuple[str, Callable[..., bool], Callable[..., Any]]] = {
     "normal": ("MEAN:DEVIATION with DEVIATION > 0", lambda m, s: s > 0.0, stats.norm),
-    "uniform": (
-        "LOW:HIGH with LOW < HIGH",
-        lambda a, b: a < b,
-        lambda a, b: stats.uniform(a, b - a),
-    ),
+    "uniform": ("LOW:HIGH with LOW < HIGH", lambda a, b: a < b,
+                lambda a, b: stats.uniform(a, b - a)),
     "triangular": (
         "LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
         lambda a, b, c: a <= b <= c and a < c,
         lambda a, b, c: stats.triang((b - a) / (c - a), a, c - a),
     ),
-    "lognormal": (
-        "MEDIAN:SIGMA with both > 0",
-        lambda m, s: m > 0.0 and s > 0.0,
-        lambda m, s: stats.lognorm(s, scale=m),
-    ),
-}
+    "lognormal": ("MEDIAN:SIGMA with both > 0", lambda m, s: m > 0.0 and s > 0.0,
+                  lambda m, s: stats.lognorm(s, scale=m)),
+}  # fmt: skip
 
 
 def parse_distribution(text: str) -> Distribution:
     """Return the distribution that a text like "normal:6:0.3" means, see `LAWS`.
 
-    SIGMA is the standard deviation of the logarithm.
-
-    Raises:
-        InputError: it means none.
+    SIGMA is the standard deviation of the logarithm. InputError where it means none.
     """
     name, *words = (part.strip() for part in text.split(":"))
     if name not in LAWS:
@@ -246,18 +228,12 @@ def quantile(values: np.ndarray, share: float) -> Estimate:
 
 @dataclass(frozen=True)
 class Indices:
-    """Shares of the variance, one an input.
+    """Shares of the variance, one an input."""
 
-    Attributes:
-        first, total: of the input alone; of it alone and together with others.
-        degree: of the polynomial they were taken from; 0 without one.
-        unexplained: share of the variance that the polynomial misses, found by leaving one out.
-    """
-
-    first: tuple[Estimate, ...]
-    total: tuple[Estimate, ...]
-    degree: int = 0
-    unexplained: float = math.nan
+    first: tuple[Estimate, ...]  # of the input alone
+    total: tuple[Estimate, ...]  # of it alone and together with others
+    degree: int = 0  # of the polynomial they were taken from; 0 without one
+    unexplained: float = math.nan  # share that the polynomial misses, found by leaving one out
 
 
 def saltelli_indices(values: np.ndarray, dimensions: int, seed: int) -> Indices:

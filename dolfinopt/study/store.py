@@ -40,13 +40,8 @@ from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.scene.load import Scene
+from dolfinopt.study import simulate
 from dolfinopt.study.cases import Case, Outcome, Outcomes
-from dolfinopt.study.simulate import (
-    scales_bodies,
-    simulate_samples,
-    simulate_scenarios,
-    with_sample,
-)
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
 SUMMARY, HISTORY = "summary.json", "history.csv"
@@ -60,14 +55,11 @@ Job = Sequence[Sequence[Case]]
 
 @dataclass(frozen=True)
 class _Place:
-    """Folder of all cases, and of this run: jobs taken, why cases failed, what is not complete.
-
-    Of the cases that are `untold` this rank tells when they have ended, whoever does them.
-    """
+    """Folder of all cases, and of this run: jobs taken, why cases failed, what is not complete."""
 
     cases: Path
     work: Path
-    untold: list[Case] = field(default_factory=list)
+    untold: list[Case] = field(default_factory=list)  # this rank tells when they end, by any rank
 
     def __getitem__(self, case: Case) -> Path:
         return self.cases / case.key
@@ -105,11 +97,8 @@ def run_cases(
 
     A case that fails to converge is reported in its outcome, and so are those that need its
     design; it is tried again in the next run. Ranks share a file system; `shown`: the root tells
-    of every case on its standard error.
-
-    Raises:
-        InputError: a scene or design cannot be used, the others stay unfinished; another run works
-            in the folder DIR, or it cannot be written.
+    of every case on its standard error. InputError where a scene or design cannot be used, the
+    others stay unfinished; another run works in the folder DIR, or it cannot be written.
     """
     both = (one for case in cases for one in (case.design, case))
     wanted = list(dict.fromkeys(one for one in both if isinstance(one, Case)))
@@ -245,7 +234,7 @@ def _optimise(case: Case, place: _Place) -> None:
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
-    found = simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
+    found = simulate.simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
     for batch in job:
         place.check()
         for case in batch:
@@ -269,13 +258,15 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
     for case in cases:
         place.check()
         begun, scene = time.perf_counter(), case.scene
-        scenes = [with_sample(scene, one, k) for k, one in enumerate(case.samples, case.first)]
+        scenes = [
+            simulate.with_sample(scene, one, k) for k, one in enumerate(case.samples, case.first)
+        ]
         keys = (change.partition("=")[0] for one in case.samples for change in one)
-        scaled = scales_bodies(scene, keys)
+        scaled = simulate.scales_bodies(scene, keys)
         if scaled and nominal is None:
-            (nominal,) = simulate_scenarios([scene], design)
+            (nominal,) = simulate.simulate_scenarios([scene], design)
         rows, messages = [], {}
-        found = simulate_samples(nominal if scaled else None, scenes, design)
+        found = simulate.simulate_samples(nominal if scaled else None, scenes, design)
         for number, trajectory in enumerate(found, case.first):
             if isinstance(trajectory, ConvergenceError):
                 messages[number] = str(trajectory)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import product
@@ -76,17 +76,11 @@ MADE = "made for it"  # the design that was optimised for the scenario it is sim
 
 @dataclass(frozen=True)
 class Plan:
-    """Cases to do, and what to make of them; pickled from the root to all ranks.
+    """Cases to do, and what to make of them; pickled from the root to all ranks."""
 
-    Attributes:
-        name: of the study's files.
-        rows: labels by column and the case of each; cases that these need may be left out.
-        report: returns tables and figures of the frame of all rows, see `tabulated`.
-    """
-
-    name: str
-    rows: Sequence[tuple[Mapping[str, Any], Case]]
-    report: Callable[[pd.DataFrame], Report]
+    name: str  # of the study's files
+    rows: Sequence[tuple[Mapping[str, Any], Case]]  # labels by column, and the case of each
+    report: Callable[[pd.DataFrame], Report]  # of the frame of all rows, see `tabulated`
 
 
 def study(
@@ -168,36 +162,33 @@ def _plan(
     keys = [one.key for one in asked]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--vary {twice[0]} twice; give all its values in one")
-    if preset in ("objective", "reduction", "coordinates"):
-        command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
-        for one in asked:
-            if preset == "objective" or one.key != COORDINATES:
-                only = "none" if preset == "objective" else f"only {COORDINATES}"
-                raise InputError(f"--vary {one.text}: expected {only} with {command}")
-        if preset != "coordinates" and designs:
-            raise InputError(f"--design: expected none with {command}, which makes its own")
-        if reoptimize:
-            raise InputError(f"--reoptimize: not with {command}; see compare reductions")
-        if preset == "objective":
-            return objective_plan(scene, kinds)
-        counts = asked[0].whole_numbers if asked else None
-        if preset == "reduction":
-            return reduction_plan(scene, counts)
-        return coordinates_plan(scene, designs, counts)
     if preset is None and not asked:
         raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
-    if preset is not None and (own := parse_vary(RANGES[preset])).key not in keys:
-        asked.insert(0, own)
-    return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
+    if preset is None or preset in RANGES:
+        if preset is not None and (own := parse_vary(RANGES[preset])).key not in keys:
+            asked.insert(0, own)
+        return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
+    command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
+    if others := [one.text for one in asked if preset == "objective" or one.key != COORDINATES]:
+        only = "none" if preset == "objective" else f"only {COORDINATES}"
+        raise InputError(f"--vary {others[0]}: expected {only} with {command}")
+    if preset != "coordinates" and designs:
+        raise InputError(f"--design: expected none with {command}, which makes its own")
+    if reoptimize:
+        raise InputError(f"--reoptimize: not with {command}; see compare reductions")
+    if preset == "objective":
+        return objective_plan(scene, kinds)
+    counts = asked[0].whole_numbers if asked else None
+    if preset == "reduction":
+        return reduction_plan(scene, counts)
+    return coordinates_plan(scene, designs, counts)
 
 
 def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
     """Return the files' designs by label, or else the initial and the optimised one.
 
     Where the scene leaves nothing to optimise, as that of parts does, the solid arms alone.
-
-    Raises:
-        InputError: a design cannot be read, or does not fit the scene's arms.
+    InputError where a design cannot be read, or does not fit the scene's arms.
     """
     if designs:
         for path in designs:
@@ -253,11 +244,10 @@ def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
 
 def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
     """Return the designs beside one another, each with its results."""
-    designs = [
-        (f"{o.case.label}: {o.compliance:.4g} N m, {1e3 * o.max_deviation:.4g} mm", o.case.scene,
-         o.design)
-        for o in found
-    ]  # fmt: skip
+    designs = []
+    for one in found:
+        figures = f"{one.compliance:.4g} N m, {1e3 * one.max_deviation:.4g} mm"
+        designs.append((f"{one.case.label}: {figures}", one.case.scene, one.design))
     return DesignFigure(name, title, tuple(designs))
 
 
@@ -274,10 +264,6 @@ def magnitudes(
     return [[item for item in items if item in group] for group in groups]
 
 
-def _good(found: Iterable[Outcome]) -> list[Outcome]:
-    return [outcome for outcome in found if not outcome.failure]
-
-
 # -- sweeps: one value, a grid of two, or more beside one another ------------------------------
 
 
@@ -286,8 +272,7 @@ def sweep_plan(
 ) -> Plan:
     """Plan one key, two in a grid, or more, each alone.
 
-    Raises:
-        InputError: no given design fits the values, or they do nothing to it.
+    InputError where no given design fits the values, or they do nothing to it.
     """
     for one in asked:
         idle = one.key.partition(".")[0] in FOR_OPTIMISATION and one.key != "design.initial"
@@ -444,8 +429,7 @@ def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
 def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
     """Plan a design for every objective that the scene allows, or for some kinds, see `posed`.
 
-    Raises:
-        InputError: the scene cannot have one of these kinds.
+    InputError where the scene cannot have one of these kinds.
     """
     cases = [Case(scene, label="initial design")]
     cases += [Case(posed(scene, kind), "optimize", label=kind) for kind in kinds]
@@ -464,7 +448,8 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     whole = pd.concat([frame[["label", *QUANTITIES, "at [s]"]], measures, frame[rest]], axis=1)
     title = "Designs optimised for every objective, simulated in the scene."
     table = Table("", title, whole.rename(columns={"label": "objective"}))
-    return [table], [design_figure("designs", "Designs by objective", _good(frame["outcome"]))]
+    good = [outcome for outcome in frame["outcome"] if not outcome.failure]
+    return [table], [design_figure("designs", "Designs by objective", good)]
 
 
 def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, float]:
@@ -485,14 +470,11 @@ def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, fl
 
 def coordinates_plan(scene: Scene, designs: Sequence[Path], counts: Sequence[int] | None) -> Plan:
     """Plan given designs, simulated with every method and number of coordinates."""
-    rows = [
-        (
-            {"design": label, **_reduction(other)},
-            Case(other, "simulate", design, f"{label}, {reduction_name(other)}"),
-        )
-        for label, design in given_designs(scene, designs).items()
-        for other in reductions(scene, counts, SWEPT)
-    ]
+    rows: Rows = []
+    scenes = reductions(scene, counts, SWEPT)
+    for (label, design), other in product(given_designs(scene, designs).items(), scenes):
+        case = Case(other, "simulate", design, f"{label}, {reduction_name(other)}")
+        rows.append(({"design": label, **_reduction(other)}, case))
     return Plan("coordinates", rows, _coordinates)
 
 
@@ -540,19 +522,16 @@ def _reductions(frame: pd.DataFrame, called: str) -> Report:
     }
     rest = {name: own[name] for name in ("grayness [-]", "iterations", "seconds")}
     title = f"Designs optimised with every reduction, simulated with {called}"
-    table = Table(
-        "", f"{title} as well.", pd.DataFrame(known | compared | rest | {"ended by": ended})
-    )
+    whole = pd.DataFrame(known | compared | rest | {"ended by": ended})
     pairs = zip(own["outcome"], again["outcome"], strict=True)
     simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
-    return [table], [design_figure("designs", title, simulated)] * bool(simulated)
+    figures: list[Figure] = [design_figure("designs", title, simulated)] * bool(simulated)
+    return [Table("", f"{title} as well.", whole)], figures
 
 
 def convergence(found: Sequence[Outcome]) -> tuple[Panel, Panel]:
     """Return objective and grayness against the iteration."""
-    rows = [
-        {"made": outcome.case.label, **vars(row)} for outcome in found for row in outcome.history()
-    ]
+    rows = [{"made": one.case.label, **vars(row)} for one in found for row in one.history()]
     frame = pd.DataFrame(rows, columns=["made", *(one.name for one in fields(HistoryRow))])
     unit = {"compliance": "N m s", "deviation": "m", "eigenfrequency": "s2"}
     kind = found[0].case.scene.objective.kind if found else ""

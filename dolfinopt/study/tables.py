@@ -26,19 +26,12 @@ LONGEST = 120  # characters of a study's name, which file names begin with
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A data frame with a title.
+    """A data frame with a title, a sentence."""
 
-    Attributes:
-        name: of its file, "" for the study's main table.
-        title: a sentence.
-        frame: columns with units; nan is left empty in files.
-        long: too long to be read, for a CSV file alone.
-    """
-
-    name: str
+    name: str  # of its file, "" for the study's main table
     title: str
-    frame: pd.DataFrame
-    long: bool = False
+    frame: pd.DataFrame  # columns with units; nan is left empty in files
+    long: bool = False  # too long to be read, for a CSV file alone
 
     def markdown(self) -> str:
         """Return the table in Markdown, four digits a number."""
@@ -75,23 +68,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """Curves over one pair of axes, which are labelled with their units.
-
-    Attributes:
-        title, x_label, y_label: above and beside it.
-        lines: curves.
-        x_log2: numbers that are doubled rather than added to, as those of coordinates.
-        y_log: logarithmic y although the values span no decade; False: never logarithmic.
-        log: both axes logarithmic.
-    """
+    """Curves over one pair of axes, which are labelled with their units."""
 
     title: str
     x_label: str
     y_label: str
     lines: tuple[Line, ...]
-    x_log2: bool = False
-    y_log: bool | None = None
-    log: bool = False
+    x_log2: bool = False  # numbers that are doubled rather than added to, as those of coordinates
+    y_log: bool | None = None  # although the values span no decade; False: never logarithmic
+    log: bool = False  # both axes
 
 
 @dataclass(frozen=True)
@@ -106,10 +91,9 @@ class LineFigure:
         """Return all curves: a row a point."""
         points = [
             (panel.title, line.label, float(x), float(y))
-            for panel in self.panels
-            for line in panel.lines
+            for panel in self.panels for line in panel.lines
             for x, y in zip(line.x, line.y, strict=True)
-        ]
+        ]  # fmt: skip
         labels = {(panel.x_label, panel.y_label) for panel in self.panels}
         axes = labels.pop() if len(labels) == 1 else ("x", "y")
         return Table("", "", pd.DataFrame(points, columns=["panel", "line", *axes])).csv()
@@ -142,21 +126,13 @@ Figure = LineFigure | DesignFigure | FrameFigure
 
 @dataclass(frozen=True)
 class Study:
-    """What a study found.
+    """What a study found."""
 
-    Attributes:
-        name: of its files.
-        tables: the main one first.
-        figures: to draw.
-        failures: one line each.
-        computed: cases that were not there before.
-    """
-
-    name: str
-    tables: tuple[Table, ...]
+    name: str  # of its files
+    tables: tuple[Table, ...]  # the main one first
     figures: tuple[Figure, ...]
-    failures: tuple[str, ...]
-    computed: int
+    failures: tuple[str, ...]  # one line each
+    computed: int  # cases that were not there before
 
     def markdown(self) -> str:
         """Return all tables but the long ones."""

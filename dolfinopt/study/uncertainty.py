@@ -50,17 +50,13 @@ INTERVAL = f"{100.0 * stats.CONFIDENCE:g} % confidence intervals"
 class Sampling:
     """How samples are drawn and what is made of them.
 
-    Attributes:
-        samples: that the statistics rest on.
-        seed: of all that is random.
-        sampler: see `statistics.unit_points`.
-        indices: "polynomial": Sobol' indices of one fitted to the samples; "saltelli": of the
-            simulations themselves, d / 2 times as many more for d inputs.
+    Sobol' indices are of a polynomial fitted to the samples, or ("saltelli") of the simulations
+    themselves, d / 2 times as many more for d inputs.
     """
 
-    samples: int = 1000
-    seed: int = 1
-    sampler: stats.Sampler = "sobol"
+    samples: int = 1000  # that the statistics rest on
+    seed: int = 1  # of all that is random
+    sampler: stats.Sampler = "sobol"  # see `statistics.unit_points`
     indices: Literal["polynomial", "saltelli"] = "polynomial"
 
     def points(self, dimensions: int) -> np.ndarray:
@@ -105,11 +101,8 @@ def study_random(
     Args:
         scene: with the nominal values; its scenarios are left out.
         random: texts "key.path=distribution", see `statistics.parse_distribution`.
-        designs, folder, world, shown: see `studies.study`.
+        designs, folder, world, shown: see `studies.study`; InputError as there.
         sampling: how many samples, and how they are drawn.
-
-    Raises:
-        InputError: something asked for is not possible.
     """
     plan = on_root(world, _plan, scene, tuple(random), tuple(designs), sampling)
     return carry_out(plan, folder, world, shown=shown)
@@ -140,13 +133,13 @@ def _plan(
     samples = sample_texts(keys, values)
     for index in (*values.argmin(axis=0), *values.argmax(axis=0)):  # refused, it is so there mostly
         with_sample(nominal, samples[1 + index], 1 + index)
-    cases = [
-        case
+    rows = [
+        ({"design": label}, case)
         for label, design in given_designs(scene, designs).items()
         for case in sample_cases(nominal, samples, label, design)
     ]
     report = partial(_report, inputs=inputs, values=values, sampling=sampling)
-    return Plan(random_name(random), [({"design": case.label}, case) for case in cases], report)
+    return Plan(random_name(random), rows, report)
 
 
 def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
@@ -158,10 +151,7 @@ def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...
 def sample_cases(
     scene: Scene, samples: Sequence[tuple[str, ...]], label: str, design: Design
 ) -> list[Case]:
-    """Return the cases of one design: an interruption costs one of them.
-
-    Further samples leave those that are complete as they are.
-    """
+    """Return the cases of one design: an interruption costs one, more samples leave them be."""
     keys = {change.partition("=")[0] for one in samples for change in one}
     size = CHUNK if scales_bodies(scene, keys) else REDUCED
     return [
@@ -173,9 +163,8 @@ def sample_cases(
 def parse_input(scene: Scene, text: str) -> Input:
     """Return what "key.path=distribution" asks for, cut off where the key's range ends.
 
-    Raises:
-        InputError: there is no such key or distribution, the key is no number, has no influence
-            or changes the arms' size; or the distribution has bounds that leave its range.
+    InputError where there is no such key or distribution, the key is no number, has no influence
+    or changes the arms' size; or the distribution has bounds that leave its range.
     """
     key, equals, law = (part.strip() for part in text.partition("="))
     if not key or not equals:
@@ -269,19 +258,14 @@ def _samples(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -
 
 
 def _input_table(inputs: Sequence[Input]) -> Table:
-    rows = [
-        {
-            "input": one.axis,
-            "distribution": one.distribution.text,
-            "nominal": one.number,
-            "mean": one.distribution.mean,
-            "standard deviation": one.distribution.deviation,
-            "cut off [%]": round(100.0 * one.distribution.cut_off, 6),
-        }
-        for one in inputs
-    ]
+    rows = []
+    for one in inputs:
+        law = one.distribution
+        cut = round(100.0 * law.cut_off, 6)
+        rows.append((one.axis, law.text, one.number, law.mean, law.deviation, cut))
+    columns = "input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"
     title = "Random values, independent of one another, cut off where the key's range ends."
-    return Table("inputs", title, pd.DataFrame(rows))
+    return Table("inputs", title, pd.DataFrame(rows, columns=columns))
 
 
 def _statistics_table(samples: pd.DataFrame, used: int) -> Table:

@@ -83,11 +83,7 @@ def axis_of(key: str) -> str:
 
 
 def parse_vary(text: str) -> Vary:
-    """Return what "key.path=start:stop:count" or "key.path=a,b,c" asks for.
-
-    Raises:
-        InputError: it is neither.
-    """
+    """Return what "key.path=start:stop:count" or "key.path=a,b,c" asks for, else InputError."""
     key, _, values = (part.strip() for part in text.partition("="))
     parts, is_range = [part.strip() for part in re.split("[:,]", values)], ":" in values
     shape = len(parts) == 3 and parts[2].isdigit() and "," not in values if is_range else True
@@ -116,8 +112,7 @@ def _is_number(text: str) -> bool:
 def changed(scene: Scene, *overrides: str) -> Scene:
     """Return the scene with some values changed, each "key.path=value".
 
-    Raises:
-        InputError: there is no such key, or it does not allow the value.
+    InputError where there is no such key, or it does not allow the value.
     """
     from dolfinopt.dynamics.build import check_forces, check_motion
 
@@ -160,10 +155,7 @@ def _values(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 def with_objective(scene: Scene, kind: str, *settings: str) -> Scene:
     """Return the scene with another objective and options of it, each "key=value".
 
-    Options that nothing uses any more are left out.
-
-    Raises:
-        InputError: the scene cannot have it.
+    Options that nothing uses any more are left out; InputError where the scene cannot have it.
     """
     tree = scene.to_tree()
     tree["objective"] |= {"kind": kind}
@@ -176,9 +168,7 @@ def posed(scene: Scene, kind: str) -> Scene:
 
     What falls with the mass needs the scene's limits and takes as much material as they ask for;
     what falls with stiffness has the volume for its limit, by default half of it, and no other.
-
-    Raises:
-        InputError: the scene cannot have that objective.
+    InputError where the scene cannot have that objective.
     """
     tree = scene.to_tree()
     tree["objective"] |= {"kind": kind, "direction": None}
@@ -205,8 +195,7 @@ def _drop_unused(tree: dict[str, Any]) -> None:
 def reduced(scene: Scene, method: str, coordinates: int) -> Scene:
     """Return the scene with another reduction; options of its own method are kept.
 
-    Raises:
-        InputError: the arms have fewer degrees of freedom, or the method needs more coordinates.
+    InputError where the arms have fewer degrees of freedom, or the method needs more coordinates.
     """
     options = Reduction.model_fields
     settings = []
@@ -225,8 +214,7 @@ def reference_scene(scene: Scene) -> Scene:
 def reductions(scene: Scene, counts: Sequence[int] | None, usual: Sequence[int]) -> list[Scene]:
     """Return the scene with every method and number of coordinates that it can have.
 
-    Raises:
-        InputError: one that was asked for, `counts`, is possible with no method.
+    InputError where one that was asked for, `counts`, is possible with no method.
     """
     scenes: list[Scene] = []
     refusals: dict[int, InputError] = {}
