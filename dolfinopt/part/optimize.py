@@ -112,8 +112,13 @@ def optimize_parts(
 
     Raises:
         ConvergenceError: the machine with the parts cannot be simulated.
-        InputError: parts have no free curves.
+        InputError: parts have no free curves, or arms repeat each other's design.
     """
+    for k, pattern in scene.patterns.items():
+        raise InputError(
+            f"--optimize: arm {scene.arms[k].name!r} repeats {scene.arms[pattern].name!r} "
+            "(arms.pattern), and every part would get a shape of its own; leave --optimize out"
+        )
     outlines = {k: free_outline(part) for k, part in parts.items()}
     if not any(one.count for one in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")

@@ -124,6 +124,13 @@ def test_arcs_are_refused(made):
     assert not (made[0] / "part").exists()
 
 
+def test_arms_that_repeat_a_design_are_refused(made):
+    _, scene, parts, _, _ = made
+    arms = scene.arms[0], scene.arms[1].model_copy(update={"pattern": "arm1"})
+    with pytest.raises(InputError, match=r"arm2.*arm1.*arms\.pattern"):
+        optimize_parts(scene.model_copy(update={"arms": arms}), parts)
+
+
 def test_command_writes_optimised_parts(made, tmp_path, capsys):
     folder, _, _, found, _ = made
     run("part", folder, "--optimize", "--iterations", STEPS, "--out", tmp_path, "--no-plots")
