@@ -56,8 +56,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from dolfinopt.part.check import Check
-    from dolfinopt.part.part import Part
-    from dolfinopt.part.solid_part import SolidPart
+    from dolfinopt.part.plane.part import Part
+    from dolfinopt.part.solid.part import SolidPart
 
 Densities = Mapping[str, np.ndarray]
 

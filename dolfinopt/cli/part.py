@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.part.check import Check
-    from dolfinopt.part.mesh import Meshes
     from dolfinopt.part.optimize import Optimized
-    from dolfinopt.part.part import Part
-    from dolfinopt.part.solid_mesh import SolidMeshes
-    from dolfinopt.part.solid_part import SolidPart
+    from dolfinopt.part.plane.mesh import Meshes
+    from dolfinopt.part.plane.part import Part
+    from dolfinopt.part.solid.mesh import SolidMeshes
+    from dolfinopt.part.solid.part import SolidPart
     from dolfinopt.scene.load import Scene
 
 
@@ -100,9 +100,9 @@ def part(
     """
     world = start()
     from dolfinopt.parallel import on_root, together
-    from dolfinopt.part.files import file_names
-    from dolfinopt.part.mesh import mesh_parts
-    from dolfinopt.part.part import make_parts
+    from dolfinopt.part.files.folder import file_names
+    from dolfinopt.part.plane.mesh import mesh_parts
+    from dolfinopt.part.plane.part import make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
     target = out or folder / "part"
@@ -165,7 +165,7 @@ def _write(
 ) -> None:
     """Write the files and say what was made (root only)."""
     from dolfinopt.output.folders import prepare_folder
-    from dolfinopt.part.files import write_parts
+    from dolfinopt.part.files.folder import write_parts
 
     def pictures(folder: Path) -> None:
         from dolfinopt.plots.design import parts_figure
@@ -221,8 +221,8 @@ def make_solids(
         plots: whether to draw them.
     """
     from dolfinopt.parallel import together
-    from dolfinopt.part.solid_files import file_names
-    from dolfinopt.part.solid_part import make_solid_parts
+    from dolfinopt.part.files.solid_folder import file_names
+    from dolfinopt.part.solid.part import make_solid_parts
 
     claim(world, target, overwrite, file_names(scene), scene=scene)
     with _stages(world) as say:
@@ -258,7 +258,7 @@ def _stages(world: MPI.Comm) -> Iterator[Say]:
 
 def _meshes(parts: Parts, check: bool, say: Say) -> SolidMeshes | None:
     """Return the meshes of all parts; None, and a warning, where one cannot be meshed."""
-    from dolfinopt.part.solid_mesh import mesh_solid_parts
+    from dolfinopt.part.solid.mesh import mesh_solid_parts
 
     say("meshes")
     try:
@@ -272,7 +272,7 @@ def _checked_solid(
     scene: Scene, folder: Path, parts: Parts, meshes: SolidMeshes, say: Say
 ) -> Check | None:
     """Return what the parts do; None, and a warning, where that cannot be simulated."""
-    from dolfinopt.part.solid_check import check_solid_parts
+    from dolfinopt.part.check import check_solid_parts
 
     try:
         return check_solid_parts(scene, folder, parts, meshes, say)
@@ -292,7 +292,7 @@ def _write_solid(
 ) -> None:
     """Write the files (root only)."""
     from dolfinopt.output.folders import prepare_folder
-    from dolfinopt.part.solid_files import write_solid_parts
+    from dolfinopt.part.files.solid_folder import write_solid_parts
 
     def pictures(folder: Path) -> None:
         from dolfinopt.plots.solid_design import solid_parts_figure

@@ -383,8 +383,8 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
 
 def _surface(title: str, frame: np.ndarray, corners: np.ndarray, density: np.ndarray) -> bytes:
     """Return an arm's design as STL in its link's frame, in metres."""
-    from dolfinopt.part.isosurface import design_surface
-    from dolfinopt.part.solid import triangle_bytes
+    from dolfinopt.part.files.triangles import triangle_bytes
+    from dolfinopt.part.solid.surface import design_surface
 
     try:
         found = design_surface(corners, density).corners

@@ -1,9 +1,6 @@
-"""From density to part: the outline of every arm, its curves, and the files for the workshop.
+"""From density to part: the outline or surface of every arm, what it does, files for the workshop.
 
-domain: what is given of an arm. outline: where its material ends, a polygon at a level of the
-density (levels, search, polygons). smooth: lines, arcs and splines along that polygon (trace,
-pieces, fit, mirror, area, arcs), which are a shape. files: STEP, DXF, SVG and STL of shapes.
-part: all of it for the arms of a run. isosurface: surfaces of solids' designs.
-solid_part: parts of solid arms (solid_domain, solid_level, smooth_surface, solid_widths),
-solid_files: their STL and 3MF; solid_check: what they do in the machine (solid_mesh, solid_stress).
+plane, solid: parts of plates and of solid arms, from their design to their mesh and its stress.
+check: the machine with the parts beside the one with the densities. buckling: of plane parts.
+optimize: the scene's objective within its limits, by the parts' free curves. files: all formats.
 """

@@ -23,10 +23,10 @@ def parts_of(
 ) -> dict[int, Any]:
     """Return the parts by their place among the arms, see `part.make_parts` (collective)."""
     if scene.is_spatial:
-        from dolfinopt.part.solid_part import make_solid_parts
+        from dolfinopt.part.solid.part import make_solid_parts
 
         return dict(make_solid_parts(scene, folder, world, tool_radius, tolerance, arcs))
-    from dolfinopt.part.part import make_parts
+    from dolfinopt.part.plane.part import make_parts
 
     return dict(make_parts(scene, folder, tool_radius, tolerance, arcs, world))
 
@@ -34,12 +34,12 @@ def parts_of(
 def check_of(scene: Scene, folder: Path, parts: dict[int, Any]) -> Check:
     """Return what the parts do in the machine, on this rank alone."""
     if scene.is_spatial:
-        from dolfinopt.part.solid_check import check_solid_parts
-        from dolfinopt.part.solid_mesh import mesh_solid_parts
+        from dolfinopt.part.check import check_solid_parts
+        from dolfinopt.part.solid.mesh import mesh_solid_parts
 
         return check_solid_parts(scene, folder, parts, mesh_solid_parts(parts))
     from dolfinopt.part.check import check_parts
-    from dolfinopt.part.mesh import mesh_parts
+    from dolfinopt.part.plane.mesh import mesh_parts
 
     return check_parts(scene, folder, parts, mesh_parts(parts))
 
@@ -47,10 +47,10 @@ def check_of(scene: Scene, folder: Path, parts: dict[int, Any]) -> Check:
 def names_of(scene: Scene) -> list[str]:
     """Return the names of all files."""
     if scene.is_spatial:
-        from dolfinopt.part.solid_files import file_names
+        from dolfinopt.part.files.solid_folder import file_names
 
         return file_names(scene)
-    from dolfinopt.part.files import file_names as plates
+    from dolfinopt.part.files.folder import file_names as plates
 
     return plates(scene)
 
@@ -58,12 +58,12 @@ def names_of(scene: Scene) -> list[str]:
 def write_of(folder: Path, scene: Scene, parts: dict[int, Any]) -> None:
     """Write the files of all parts but for pictures, on this rank alone."""
     if scene.is_spatial:
-        from dolfinopt.part.solid_files import write_solid_parts
-        from dolfinopt.part.solid_mesh import mesh_solid_parts
+        from dolfinopt.part.files.solid_folder import write_solid_parts
+        from dolfinopt.part.solid.mesh import mesh_solid_parts
 
         write_solid_parts(folder, scene, parts, mesh_solid_parts(parts, coarse=False).fine)
         return
-    from dolfinopt.part.files import write_parts
-    from dolfinopt.part.mesh import mesh_parts
+    from dolfinopt.part.files.folder import write_parts
+    from dolfinopt.part.plane.mesh import mesh_parts
 
     write_parts(folder, scene, parts, mesh_parts(parts).fine)

@@ -26,19 +26,17 @@ from dolfinopt.optimization.acceptance import Promise, judge_step
 from dolfinopt.optimization.measured import LIMIT_PRICE
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import Stage
-from dolfinopt.part.body_mesh import BodyMesh, triangle_areas
-from dolfinopt.part.boundary_stress import (
+from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_bodies
+from dolfinopt.part.plane.free_outline import CHORD, FreeOutline, free_outline
+from dolfinopt.part.plane.mesh import BodyMesh, Meshes, body_mesh, mesh_parts, triangle_areas
+from dolfinopt.part.plane.outline import thinnest_member
+from dolfinopt.part.plane.part import Part
+from dolfinopt.part.plane.stress import (
     APART,
     OutlineStress,
     away_from_ends,
     corner_stress,
 )
-from dolfinopt.part.check import refined
-from dolfinopt.part.forms import STRESS, Simulated, part_column, simulate_bodies
-from dolfinopt.part.free_outline import CHORD, FreeOutline, free_outline
-from dolfinopt.part.mesh import Meshes, body_mesh, mesh_parts
-from dolfinopt.part.part import Part
-from dolfinopt.part.widths import thinnest_member
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.part.part import Part
+    from dolfinopt.part.plane.part import Part
 
 REGION = {"solid": ORANGE, "void": BLUE}  # borders of what stays solid and void
 STRESS_COLOURS = "YlOrRd"  # nothing is light, the largest dark

@@ -15,7 +15,7 @@ import pyvista
 
 from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.output.views import AROUND, ArmView
-from dolfinopt.part.isosurface import Surface, surface_at
+from dolfinopt.part.solid.surface import Surface, surface_at
 from dolfinopt.plots.design import (
     MEGA,
     MILLI,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.part.solid_part import SolidPart
+    from dolfinopt.part.solid.part import SolidPart
 
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies

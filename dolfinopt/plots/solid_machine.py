@@ -14,7 +14,7 @@ from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.multibody.spatial.end_effector import Frames, body_frames
 from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
 from dolfinopt.output.views import ArmView
-from dolfinopt.part.isosurface import Surface
+from dolfinopt.part.solid.surface import Surface
 from dolfinopt.plots.animation import FRAMES, frame_numbers, round_magnification
 from dolfinopt.plots.machine import poses_along
 from dolfinopt.plots.solid_design import (

@@ -8,7 +8,7 @@ from machines import controlled, loop
 from mpi4py import MPI
 from runs import refusal, run
 
-from dolfinopt.part.scene_file import toml_text
+from dolfinopt.part.files.scene_file import toml_text
 
 WORLD = MPI.COMM_WORLD
 QUICK = ["--set", "simulation.tolerance=1e-3"]

@@ -14,12 +14,10 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.views import canonical_order
 from dolfinopt.part import check as checks
-from dolfinopt.part import forms
 from dolfinopt.part.buckling import Buckling
-from dolfinopt.part.check import check_parts
-from dolfinopt.part.forms import crisp
-from dolfinopt.part.mesh import mesh_parts
-from dolfinopt.part.part import make_parts
+from dolfinopt.part.check import check_parts, crisp
+from dolfinopt.part.plane.mesh import mesh_parts
+from dolfinopt.part.plane.part import make_parts
 
 pytestmark = pytest.mark.serial
 
@@ -157,7 +155,7 @@ def test_crisp_design_keeps_the_volume():
 def test_crisp_design_that_void_alone_holds_is_not_simulated(made, monkeypatch):
     """A gap of one column between two halves: told by its cells, without a motion."""
     folder, scene = made[0], scene_of(made[0])
-    _, arms = forms._built(scene)
+    _, arms = checks._built(scene)
     x = {k: (np.abs(arm.mesh.centroid[:, 0] - 0.4) > 0.011) * 1.0 for k, arm in arms.items()}
     assert not arms[0].substructure.joins(x[0] > 0.0)
     assert arms[0].substructure.joins(np.ones(arms[0].mesh.num_cells, dtype=bool))
@@ -167,14 +165,14 @@ def test_crisp_design_that_void_alone_holds_is_not_simulated(made, monkeypatch):
         simulated.append(one)
         return None
 
-    monkeypatch.setattr(forms, "crisp", lambda *_: x[0])
-    monkeypatch.setattr(forms, "_design_column", column)
-    monkeypatch.setattr(forms, "_simulated", lambda *given: given)
-    forms.design_columns(scene, folder)
+    monkeypatch.setattr(checks, "crisp", lambda *_: x[0])
+    monkeypatch.setattr(checks, "_design_column", column)
+    monkeypatch.setattr(checks, "_simulated", lambda *given: given)
+    checks.design_columns(scene, folder)
     assert len(simulated) == 1
 
 
 def test_crisp_design_whose_motion_takes_too_long_is_given_up(made, monkeypatch):
-    monkeypatch.setattr(forms, "PATIENCE", 0.01)
-    density, none = forms.design_columns(scene_of(made[0]), made[0])
+    monkeypatch.setattr(checks, "PATIENCE", 0.01)
+    density, none = checks.design_columns(scene_of(made[0]), made[0])
     assert density is not None and none is None

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import shapely
 
-from dolfinopt.part.curves import Arc, Line, Spline, curvature, direction, sampled
-from dolfinopt.part.fit import fit
-from dolfinopt.part.least_squares import Target
-from dolfinopt.part.recognise import loops, recognise
+from dolfinopt.part.plane.curves import Arc, Line, Spline, curvature, direction, sampled
+from dolfinopt.part.plane.domain import loops, recognise
+from dolfinopt.part.plane.fit import Target, fit
 
 pytestmark = pytest.mark.serial
 

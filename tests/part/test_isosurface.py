@@ -10,8 +10,8 @@ from solids import sixths
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.part.isosurface import design_surface
-from dolfinopt.part.solid import triangle_bytes
+from dolfinopt.part.files.triangles import triangle_bytes
+from dolfinopt.part.solid.surface import design_surface
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial

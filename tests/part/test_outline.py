@@ -10,11 +10,10 @@ from scipy.spatial import cKDTree
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
-from dolfinopt.part import outline
-from dolfinopt.part.curves import Arc, Line, direction
-from dolfinopt.part.outline import draw_outline
-from dolfinopt.part.part import make_part
-from dolfinopt.part.search import search
+from dolfinopt.part.plane import outline
+from dolfinopt.part.plane.curves import Arc, Line, direction
+from dolfinopt.part.plane.outline import draw_outline, search
+from dolfinopt.part.plane.part import make_part
 
 pytestmark = pytest.mark.serial
 

@@ -10,11 +10,12 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
-from dolfinopt.part import boundary_stress, solid_stress
-from dolfinopt.part.boundary_stress import OutlineStress
-from dolfinopt.part.forms import simulate_bodies
-from dolfinopt.part.mesh import mesh_parts
-from dolfinopt.part.part import make_parts
+from dolfinopt.part.check import simulate_bodies
+from dolfinopt.part.plane import stress as plane_stress
+from dolfinopt.part.plane.mesh import mesh_parts
+from dolfinopt.part.plane.part import make_parts
+from dolfinopt.part.plane.stress import OutlineStress
+from dolfinopt.part.solid import stress as solid_stress
 from dolfinopt.responses.response import Analysis
 
 pytestmark = pytest.mark.serial
@@ -41,7 +42,7 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     plane, kind = base != "spatial_arm", "objective.kind=stress"
     told = (f"arms.mesh='{tmp_path}/bar.geo'", *PLANE) if plane else SPACE
     scene = do.load_scene(ROOT / "demos" / f"{base}.toml", (*ROUGHLY, *told, kind))
-    stress = boundary_stress.corner_stress if plane else solid_stress.corner_stress
+    stress = plane_stress.corner_stress if plane else solid_stress.corner_stress
 
     def away(index: int, places: np.ndarray, margin: float) -> np.ndarray:
         x = places[:, 0] / scene.arms[index].length
@@ -66,10 +67,10 @@ def test_largest_is_that_of_the_part(tmp_path) -> None:
     parts = make_parts(scene, folder)
     state = simulate_bodies(scene, parts, mesh_parts(parts).coarse)
     shapes = {k: part.shape for k, part in parts.items()}
-    apart = {k: boundary_stress.APART * part.domain.cell for k, part in parts.items()}
-    known = boundary_stress.part_stress(state.arms, state.trajectory, shapes, apart)
-    away = boundary_stress.away_from_ends(shapes, apart)
-    response = OutlineStress(scene.objective, away, boundary_stress.corner_stress)
+    apart = {k: plane_stress.APART * part.domain.cell for k, part in parts.items()}
+    known = plane_stress.part_stress(state.arms, state.trajectory, shapes, apart)
+    away = plane_stress.away_from_ends(shapes, apart)
+    response = OutlineStress(scene.objective, away, plane_stress.corner_stress)
     designs = {k: arm.current for k, arm in state.arms.items()}
     place = state.scene, state.partition, designs, state.trajectory
     found = response.measure(Analysis(*place, do.Profile()))

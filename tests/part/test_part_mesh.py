@@ -7,11 +7,9 @@ from runs import scene
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
-from dolfinopt.part.body_mesh import triangle_areas
-from dolfinopt.part.boundary_stress import corner_stress, singular_points
-from dolfinopt.part.curves import Arc, Line, Spline
-from dolfinopt.part.mesh import body_mesh, write_mesh
-from dolfinopt.part.shape import Piece, Shape
+from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, Spline
+from dolfinopt.part.plane.mesh import body_mesh, triangle_areas, write_mesh
+from dolfinopt.part.plane.stress import corner_stress, singular_points
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial

@@ -15,21 +15,27 @@ from scipy.ndimage import gaussian_filter
 from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
 
 import dolfinopt as do
-import dolfinopt.part.solid_mesh as solid_mesh_module
-import dolfinopt.part.solid_part as solid_part_module
+import dolfinopt.part.solid.mesh as solid_mesh_module
+import dolfinopt.part.solid.part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.part.domain import read_domains
-from dolfinopt.part.isosurface import Surface, cut, eighths, halved, nodal_densities, outside
-from dolfinopt.part.smooth_surface import crossings, distance_to_faces
-from dolfinopt.part.solid import MM, triangle_bytes
-from dolfinopt.part.solid_domain import domain_in_scene, solid_domain
-from dolfinopt.part.solid_mesh import mesh_size, solid_mesh
-from dolfinopt.part.solid_part import make_solid_part
-from dolfinopt.part.solid_widths import rasterised
-from dolfinopt.part.step import solid_text
-from dolfinopt.part.three_mf import three_mf_bytes
+from dolfinopt.part.files.step import solid_text
+from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.part.plane.domain import read_domains
+from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
+from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
+from dolfinopt.part.solid.part import make_solid_part, rasterised
+from dolfinopt.part.solid.surface import (
+    Surface,
+    crossings,
+    cut,
+    distance_to_faces,
+    eighths,
+    halved,
+    nodal_densities,
+    outside,
+)
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
@@ -369,7 +375,7 @@ def checked(tmp_path_factory):
                "constraints.deviation=0.001")  # fmt: skip
     folder = finished(tmp_path_factory.mktemp("solids") / "run", (windows,), *changes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dolfinopt.part.solid_mesh.ACROSS", 1.0)  # large cells take little time
+        patch.setattr("dolfinopt.part.solid.mesh.ACROSS", 1.0)  # large cells take little time
         run("part", folder)
     return folder, json.loads((folder / "part" / "part.json").read_text())
 
@@ -409,7 +415,7 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
     assert parts["link1"].volume == pytest.approx(figures["arms"]["link1"]["volume"], rel=1e-9)
     assert (tmp_path / "parts" / "link1.step").exists()
     told = {}
-    monkeypatch.setattr("dolfinopt.part.solid_check.check_solid_parts",
+    monkeypatch.setattr("dolfinopt.part.check.check_solid_parts",
                         lambda *given: told.update(given=given) or "check")  # fmt: skip
     assert model.check_parts(design) == "check" and told["given"][2].keys() == {1}
 

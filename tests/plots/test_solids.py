@@ -13,7 +13,7 @@ from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.spatial.end_effector import body_frames
 from dolfinopt.output.views import AROUND, ArmView, designed
-from dolfinopt.part.isosurface import surface_at
+from dolfinopt.part.solid.surface import surface_at
 from dolfinopt.plots import animation, solid_design, solid_machine
 from dolfinopt.plots.design import design_figure, stress_figure
 

@@ -1,0 +1,1 @@
+"""Files of parts: STEP, DXF, SVG, STL, 3MF, and the scene with the parts in it."""

@@ -1,0 +1,1 @@
+"""Parts of plates: outline, curves, mesh, stress, and the free outline as variables."""

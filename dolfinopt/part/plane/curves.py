@@ -1,0 +1,457 @@
+"""Plane curves over t in [0, 1] (lines, arcs, cubic B-splines), and shapes closed by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import BSpline
+
+DEGREE = 3
+# Gauss points on [0, 1], exact for polynomials of degree five: area under a cubic.
+_GAUSS = 0.5 + 0.5 * np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
+_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+MIRROR = np.array([1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """The straight line from `start` to `end`, each (2,), m."""
+
+    start: np.ndarray
+    end: np.ndarray
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return the points (n, 2) at parameters (n,), m."""
+        t = np.asarray(t, dtype=float)[:, None]
+        return (1.0 - t) * self.start + t * self.end  # both ends to the bit
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        """Return the derivative (n, 2) by t, m."""
+        return np.broadcast_to(self.end - self.start, (len(t), 2))
+
+    def parameters(self, tolerance: float) -> np.ndarray:
+        """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
+        return np.array([0.0, 1.0])
+
+    @property
+    def area(self) -> float:
+        """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
+        return 0.5 * _cross(self.start, self.end)
+
+    def reversed(self) -> Line:
+        """Return the same curve from end to start."""
+        return Line(self.end, self.start)
+
+    def mirrored(self) -> Line:
+        """Return the mirror image about y = 0, run through in the same sense."""
+        return Line(self.start * MIRROR, self.end * MIRROR)
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """An arc of a circle; a whole one where the sweep is 2 pi.
+
+    Attributes:
+        centre: (2,) m.
+        radius: m.
+        begin: angle of the start, rad.
+        sweep: by which it turns, positive to the left, rad.
+    """
+
+    centre: np.ndarray
+    radius: float
+    begin: float
+    sweep: float
+
+    @property
+    def is_circle(self) -> bool:
+        """Whether it is a whole circle."""
+        return abs(self.sweep) >= 2.0 * np.pi * (1.0 - 1e-12)
+
+    @property
+    def start(self) -> np.ndarray:
+        """Its first point (2,), m."""
+        return self.at(np.zeros(1))[0]
+
+    @property
+    def end(self) -> np.ndarray:
+        """Its last point (2,), m."""
+        return self.at(np.ones(1))[0]
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return the points (n, 2) at parameters (n,), m."""
+        angle = self.begin + self.sweep * np.asarray(t, dtype=float)
+        return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        """Return the derivative (n, 2) by t, m."""
+        angle = self.begin + self.sweep * np.asarray(t, dtype=float)
+        return self.radius * self.sweep * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+
+    def parameters(self, tolerance: float) -> np.ndarray:
+        """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
+        step = 2.0 * np.arccos(max(1.0 - tolerance / self.radius, 0.5))
+        # A multiple of four: a whole circle reaches its extremes.
+        return np.linspace(0.0, 1.0, 4 * int(np.ceil(abs(self.sweep) / step / 4.0)) + 1)
+
+    @property
+    def area(self) -> float:
+        """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
+        chord = _cross(self.centre, self.end - self.start)
+        return 0.5 * (self.radius**2 * self.sweep + chord)
+
+    def reversed(self) -> Arc:
+        """Return the same curve from end to start."""
+        return Arc(self.centre, self.radius, self.begin + self.sweep, -self.sweep)
+
+    def mirrored(self) -> Arc:
+        """Return the mirror image about y = 0, run through in the same sense."""
+        return Arc(self.centre * MIRROR, self.radius, -self.begin, -self.sweep)
+
+
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """A cubic B-spline that begins at its first control point and ends at its last.
+
+    Attributes:
+        knots: (n + 4,), 0 and 1 four times each at the ends.
+        points: (n, 2) control points, m.
+    """
+
+    knots: np.ndarray
+    points: np.ndarray
+
+    @property
+    def start(self) -> np.ndarray:
+        """Its first point (2,), m."""
+        return self.points[0]
+
+    @property
+    def end(self) -> np.ndarray:
+        """Its last point (2,), m."""
+        return self.points[-1]
+
+    @property
+    def breaks(self) -> np.ndarray:
+        """Where its polynomials meet, ends included."""
+        return np.unique(self.knots)
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return the points (n, 2) at parameters (n,), m."""
+        whole = BSpline.construct_fast(self.knots, self.points, DEGREE)
+        return whole(np.asarray(t, dtype=float))
+
+    def derivative(self, t: np.ndarray, order: int = 1) -> np.ndarray:
+        """Return a derivative (n, 2) by t, m."""
+        knots = self.knots[order:-order]
+        slope = BSpline.construct_fast(knots, self.derived(order), DEGREE - order)
+        return slope(np.asarray(t, dtype=float))
+
+    def derived(self, order: int) -> np.ndarray:
+        """Return the control points (n - order, 2) of a derivative by t, m.
+
+        Its knots are the curve's without so many at each end.
+        """
+        knots, points = self.knots, self.points
+        for degree in range(DEGREE, DEGREE - order, -1):
+            width = knots[degree + 1 : -1] - knots[1 : -degree - 1]
+            points = degree * np.diff(points, axis=0) / width[:, None]
+            knots = knots[1:-1]
+        return points
+
+    def parameters(self, tolerance: float) -> np.ndarray:
+        """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
+        ends = self.breaks
+        bends = np.linalg.norm(self.derivative(_inside(ends), 2).reshape(-1, 2, 2), axis=2)
+        # A second derivative is linear between breaks: largest at one of them.
+        count = np.ceil(np.diff(ends) * np.sqrt(bends.max(axis=1) / (8.0 * tolerance)))
+        number = np.maximum(count, 1).astype(int)
+        place = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+        step = np.repeat(np.diff(ends) / number, number)
+        return np.append(np.repeat(ends[:-1], number) + place * step, 1.0)
+
+    @property
+    def area(self) -> float:
+        """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
+        ends = self.breaks
+        t = (ends[:-1, None] + np.diff(ends)[:, None] * _GAUSS).ravel()
+        weights = (np.diff(ends)[:, None] * _WEIGHTS).ravel()
+        p, d = self.at(t), self.derivative(t)
+        return 0.5 * float(weights @ (p[:, 0] * d[:, 1] - p[:, 1] * d[:, 0]))
+
+    def reversed(self) -> Spline:
+        """Return the same curve from end to start."""
+        return Spline(1.0 - self.knots[::-1], self.points[::-1])
+
+    def mirrored(self) -> Spline:
+        """Return the mirror image about y = 0, run through in the same sense."""
+        return Spline(self.knots, self.points * MIRROR)
+
+    def bezier(self) -> np.ndarray:
+        """Return the control points (n, 4, 2) of its polynomials one by one, m."""
+        ends = self.breaks
+        width = np.diff(ends)[:, None]
+        p = self.at(ends)
+        d = self.derivative(_inside(ends)).reshape(-1, 2, 2)
+        a, b = p[:-1], p[1:]
+        return np.stack([a, a + width * d[:, 0] / 3.0, b - width * d[:, 1] / 3.0, b], axis=1)
+
+    def part(self, first: float, last: float) -> Spline:
+        """Return the piece between two parameters, first < last."""
+        ends = self.breaks
+        inner = ends[(ends > first + 1e-12) & (ends < last - 1e-12)]
+        knots = np.concatenate([[first] * 4, inner, [last] * 4])
+        # It is a spline of these knots itself: interpolation in as many points gives it exactly.
+        t = np.array([knots[k + 1 : k + 4].mean() for k in range(len(knots) - 4)])
+        t = np.clip(t, first, last)  # a mean of equal numbers may differ from them
+        basis = BSpline.design_matrix(t, knots, DEGREE).toarray()
+        points = np.linalg.solve(basis, self.at(t))
+        return Spline((knots - first) / (last - first), points)
+
+
+Curve = Line | Arc | Spline
+
+
+def sampled(curves: list[Curve], tolerance: float) -> np.ndarray:
+    """Return points (n, 2) along curves that follow one another, chords within a distance, m.
+
+    The last point is left out where it is the first.
+    """
+    points = np.concatenate([c.at(c.parameters(tolerance))[:-1] for c in curves])
+    last = curves[-1].end
+    if np.linalg.norm(last - curves[0].start) > 1e-9 * np.ptp(points, axis=0).max():
+        points = np.vstack([points, last])
+    return points
+
+
+def curvature(curve: Curve, t: np.ndarray) -> np.ndarray:
+    """Return the curvature (n,) at parameters, positive where it turns to the left, 1/m."""
+    if isinstance(curve, Line):
+        return np.zeros(len(t))
+    if isinstance(curve, Arc):
+        return np.full(len(t), np.sign(curve.sweep) / curve.radius)
+    d, dd = curve.derivative(t), curve.derivative(t, 2)
+    speed = np.maximum(np.linalg.norm(d, axis=1), np.finfo(float).tiny)
+    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3
+
+
+def direction(curve: Curve, t: float) -> np.ndarray:
+    """Return the unit tangent (2,) at a parameter."""
+    d = curve.derivative(np.array([t]))[0]
+    size = np.linalg.norm(d)
+    if size == 0.0:  # a spline whose first control points coincide
+        d = (
+            curve.at(np.array([min(t + 1e-3, 1.0)]))[0]
+            - curve.at(np.array([max(t - 1e-3, 0.0)]))[0]
+        )
+        size = np.linalg.norm(d)
+    return d / size
+
+
+def angle_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle between two unit vectors (2,), rad."""
+    return float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
+
+
+def _inside(ends: np.ndarray) -> np.ndarray:
+    """Return both ends of every piece, a hair inside: where a derivative may jump."""
+    hair = 1e-9 * np.diff(ends)
+    return np.stack([ends[:-1] + hair, ends[1:] - hair], axis=1).ravel()
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One curve of a part's outline, material to its left.
+
+    Attributes:
+        curve: m.
+        label: "inboard", "outboard" or "".
+        free: False where it lies on a curve of the arm.
+        fixed: (2,) whether its first and its last control point stay where they are when the area
+            is corrected; the next one too where the direction is given.
+        run: (n, 2) what it was fitted to, m; None where it is exact.
+    """
+
+    curve: Curve
+    label: str = ""
+    free: bool = False
+    fixed: tuple[bool, bool] = (True, True)
+    run: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The closed outline of a part.
+
+    Attributes:
+        loops: the outer one first, counterclockwise, then the holes, clockwise.
+        offset: by which free curves were moved for the area, m.
+        apart: distance of free arcs from the splines in whose place they are, and of these from
+            the outline, m; 0 where free curves are splines.
+    """
+
+    loops: tuple[tuple[Piece, ...], ...]
+    offset: float = 0.0
+    apart: float = 0.0
+
+    @property
+    def pieces(self) -> list[Piece]:
+        """All pieces."""
+        return [piece for loop in self.loops for piece in loop]
+
+    @property
+    def curves(self) -> list[Curve]:
+        """All curves."""
+        return [piece.curve for piece in self.pieces]
+
+    @property
+    def area(self) -> float:
+        """Area within the outer loop less that of the holes, m2."""
+        return sum(curve.area for curve in self.curves)
+
+    @property
+    def control_points(self) -> int:
+        """Number of the splines' control points."""
+        return sum(len(c.points) for c in self.curves if isinstance(c, Spline))
+
+    @cached_property
+    def distance(self) -> float:
+        """Largest distance of free curves from what they were fitted to, m."""
+        return self.apart or max(
+            (_piece_apart(p) for p in self.pieces if p.run is not None), default=0.0
+        )
+
+    @cached_property
+    def concave_radius(self) -> float:
+        """Smallest radius of concave places on free curves, m; infinity without any."""
+        least = np.inf
+        for piece in self.pieces:
+            if piece.free:
+                t = np.linspace(0.0, 1.0, 33 if isinstance(piece.curve, Arc) else 2001)[1:-1]
+                bend = -curvature(piece.curve, t).min()
+                least = min(least, 1.0 / bend if bend > 0.0 else np.inf)
+        return float(least)
+
+    def is_simple(self, tolerance: float) -> bool:
+        """Return whether no curve crosses another one, as polygons within a distance see it."""
+        import shapely
+
+        outer, *holes = self.polygons(tolerance)
+        return bool(shapely.is_valid(shapely.Polygon(outer, holes)))
+
+    def polygons(self, tolerance: float) -> list[np.ndarray]:
+        """Return the corners (n, 2) of every loop, chords within a distance of the curves, m."""
+        return [sampled([p.curve for p in loop], tolerance) for loop in self.loops]
+
+
+def _piece_apart(piece: Piece) -> float:
+    """Return the Hausdorff distance of a piece from the polyline it was fitted to, m."""
+    import shapely
+
+    assert piece.run is not None
+    size = float(np.ptp(piece.run, axis=0).max())
+    points = np.vstack([sampled([piece.curve], 1e-5 * size), piece.curve.end])
+    line, run = shapely.LineString(points), shapely.LineString(piece.run)
+    there = shapely.distance(shapely.points(points), run).max()
+    back = shapely.distance(shapely.points(piece.run), line).max()
+    return float(max(there, back))
+
+
+SAMPLES = 9  # points of a spline at which a pair of arcs is compared with it
+DEEPEST = 14  # bisections of a spline
+STRAIGHT = 1e-9  # height of an arc over its chord, relative, below which it is a line
+
+
+def with_arcs(shape: Shape, tolerance: float) -> Shape:
+    """Return the shape with lines and arcs within a distance, m, of its splines."""
+    loops = tuple(
+        tuple(
+            replace(piece, curve=one, run=None)
+            for piece in loop
+            for one in (
+                biarcs(piece.curve, tolerance) if isinstance(piece.curve, Spline) else [piece.curve]
+            )
+        )
+        for loop in shape.loops
+    )
+    return Shape(loops, apart=shape.distance + tolerance)
+
+
+def biarcs(spline: Spline, tolerance: float) -> list[Curve]:
+    """Return lines and arcs along a spline, with its directions at their joints.
+
+    Pairs of arcs with equal handles between points of the spline; where a pair leaves the tolerance
+    the spline is divided there. Source: Bolton, Computer-Aided Design 7 (1975) 89-92.
+
+    Args:
+        spline: m.
+        tolerance: m.
+    """
+    return _between(spline, 0.0, 1.0, tolerance, 0)
+
+
+def _between(spline: Spline, a: float, b: float, tolerance: float, depth: int) -> list[Curve]:
+    start, end = spline.at(np.array([a, b]))
+    pair = _pair(start, direction(spline, a), end, direction(spline, b))
+    if (
+        pair is not None
+        and _pair_apart(spline.at(np.linspace(a, b, SAMPLES)[1:-1]), pair) <= tolerance
+    ):
+        return pair
+    if depth == DEEPEST:
+        return [Line(start, end)]
+    middle = 0.5 * (a + b)
+    return [
+        *_between(spline, a, middle, tolerance, depth + 1),
+        *_between(spline, middle, b, tolerance, depth + 1),
+    ]
+
+
+def _pair(p: np.ndarray, t: np.ndarray, q: np.ndarray, u: np.ndarray) -> list[Curve] | None:
+    """Return arcs from p, direction t, to q, direction u; None where they would turn back."""
+    v, both = q - p, t + u
+    a, b, c = 2.0 * (1.0 - float(t @ u)), 2.0 * float(v @ both), float(v @ v)
+    if c == 0.0:
+        return None
+    # a d^2 + b d = c, in the form that does not cancel.
+    root = np.sqrt(b * b + 4.0 * a * c)
+    if b + root <= 0.0:
+        return None
+    handle = 2.0 * c / (b + root)
+    joint = 0.5 * (p + q + handle * (t - u))
+    first, second = _arc(p, t, joint), _arc(q, -u, joint)
+    sweeps = [abs(one.sweep) for one in (first, second) if isinstance(one, Arc)]
+    return None if max(sweeps, default=0.0) > 0.75 * np.pi else [first, second.reversed()]
+
+
+def _arc(start: np.ndarray, along: np.ndarray, end: np.ndarray) -> Curve:
+    """Return the arc, or line, that leaves a point in a direction and ends at another one."""
+    w = end - start
+    normal = np.array([-along[1], along[0]])
+    height = float(normal @ w)
+    if abs(height) <= STRAIGHT * np.linalg.norm(w):
+        return Line(start, end)
+    radius = float(w @ w) / (2.0 * height)  # to the left where it is positive
+    centre = start + radius * normal
+    begin = float(np.arctan2(start[1] - centre[1], start[0] - centre[0]))
+    sweep = 2.0 * float(np.arctan2(height, along @ w))
+    return Arc(centre, abs(radius), begin, sweep)
+
+
+def _pair_apart(points: np.ndarray, pair: list[Curve]) -> float:
+    """Return the largest distance of points from a pair of lines or arcs, as whole ones, m."""
+    away = []
+    for one in pair:
+        if isinstance(one, Arc):
+            away.append(np.abs(np.linalg.norm(points - one.centre, axis=1) - one.radius))
+        else:
+            d = direction(one, 0.0)
+            off = points - one.start
+            away.append(np.abs(off[:, 0] * d[1] - off[:, 1] * d[0]))
+    return float(np.min(away, axis=0).max())

@@ -1,0 +1,510 @@
+"""What is given of a plane arm: where material may be and must be, and how dense the design is.
+
+Regions of the arm (all of it, what stays solid, what stays void) are known by the exact curves
+around them. A mesh knows a bore as a polygon with corners on the circle: runs of its nodes that lie
+on one line or circle within rounding become that line or arc again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from dolfinopt.errors import InputError
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, sampled
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+    from shapely import Geometry
+
+    from dolfinopt.mesh.arm_mesh import ArmMesh
+
+
+SAME = 2e-8  # distance from a line or circle, of the extent: Gmsh's points, files of eight digits
+SHARPEST = np.radians(40.0)  # turn from side to side up to which a polygon may stand for a curve
+FEWEST = 6  # points of an arc: a circle goes through any three
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """A curve of a boundary and what it belongs to: "inboard", "outboard" or ""."""
+
+    curve: Curve
+    label: str
+
+
+def loops(sides: np.ndarray) -> list[np.ndarray]:
+    """Chain directed sides (n, 2) of node numbers to closed loops of nodes."""
+    ahead: dict[int, list[int]] = {}
+    for a, b in sides:
+        ahead.setdefault(int(a), []).append(int(b))
+    found = []
+    while ahead:
+        first = next(iter(ahead))
+        loop, node = [], first
+        while node in ahead:
+            loop.append(node)
+            after = ahead[node]
+            node_after = after.pop()
+            if not after:
+                del ahead[node]
+            node = node_after
+        found.append(np.array(loop))
+    return found
+
+
+def recognise(points: np.ndarray, labels: np.ndarray, extent: float) -> list[Edge]:
+    """Return the curves behind a closed polygon, in its order.
+
+    Args:
+        points: (n, 2) its corners, m.
+        labels: (n,) of the side from each corner to the next; curves do not go beyond a label.
+        extent: size of the whole mesh, m; `SAME` is relative to it.
+    """
+    near = SAME * extent
+    n = len(points)
+    if (labels == labels[0]).all() and (circle := _circle(points, near, closed=True)) is not None:
+        return [Edge(circle, str(labels[0]))]
+    before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    turn = np.arctan2(cross, (before * after).sum(axis=1))
+    stops = (np.abs(turn) > SHARPEST) | (labels != np.roll(labels, 1))
+    first = int(np.argmax(stops))
+    if not stops.any():  # somewhere within a curve: begin where that ends
+        around = points[np.arange(n + 1) % n]
+        while first < n - 1:
+            sides, _ = _longest(around[first:], near)
+            first += sides
+            if sides > 1:
+                break
+        first %= n
+    order = (first + np.arange(n + 1)) % n
+    points, labels = points[order], labels[order]
+    halt = np.append(stops[order[:-1]], True)
+    halt[0] = False
+    edges: list[Edge] = []
+    spans: list[tuple[int, int]] = []
+    i = 0
+    while i < n:
+        limit = i + 1 + int(np.argmax(halt[i + 1 :]))
+        j, curve = _longest(points[i : limit + 1], near)
+        edges.append(Edge(curve, str(labels[i])))
+        spans.append((i, i + j))
+        i += j
+    return _closed(_smoothed(points, halt, edges, spans), near)
+
+
+def _longest(points: np.ndarray, near: float) -> tuple[int, Curve]:
+    """Return how many sides from the first point on make one line or arc, and that curve."""
+
+    def reach(fits: bool, count: int) -> int:
+        """Return the largest number of points that a line or circle goes through."""
+        low, high = count, len(points)
+        while low < high:
+            middle = (low + high + 1) // 2
+            found = _circle(points[:middle], near) if fits else _straight(points[:middle], near)
+            low, high = (middle, high) if found else (low, middle - 1)
+        return low
+
+    straight = reach(False, 2)
+    if straight == 2 and len(points) >= FEWEST and _circle(points[:FEWEST], near) is not None:
+        count = reach(True, FEWEST)
+        arc = _circle(points[:count], near)
+        assert arc is not None
+        return count - 1, arc
+    return straight - 1, Line(points[0], points[straight - 1])
+
+
+def _straight(points: np.ndarray, near: float) -> bool:
+    along = points[-1] - points[0]
+    size = np.linalg.norm(along)
+    if size == 0.0:
+        return False
+    off = points - points[0]
+    return bool(np.abs(off[:, 0] * along[1] - off[:, 1] * along[0]).max() <= near * size)
+
+
+def _circle(points: np.ndarray, near: float, closed: bool = False) -> Arc | None:
+    """Return the circle through points that follow one another on it, None where there is none."""
+    if len(points) < (8 if closed else FEWEST):
+        return None
+    middle = points.mean(axis=0)
+    size = np.ptp(points, axis=0).max()
+    local = (points - middle) / size
+    system = np.column_stack([2.0 * local, np.ones(len(local))])
+    (x, y, rest), *_ = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)
+    centre, square = np.array([x, y]), rest + x * x + y * y
+    if square <= 0.0 or square > 1e8:
+        return None
+    radius = np.sqrt(square)
+    off = np.linalg.norm(local - centre, axis=1) - radius
+    if np.abs(off).max() * size > near:
+        return None
+    angle = np.arctan2(*(local - centre).T[::-1])
+    steps = np.diff(np.append(angle, angle[0]) if closed else angle)
+    steps = (steps + np.pi) % (2.0 * np.pi) - np.pi
+    if not ((steps > 0.0).all() or (steps < 0.0).all()) or np.abs(steps).max() > SHARPEST:
+        return None
+    sweep = float(steps.sum())
+    if closed:
+        sweep = float(2.0 * np.pi * np.sign(sweep))
+    return Arc(middle + size * centre, float(size * radius), float(angle[0]), sweep)
+
+
+def _smoothed(
+    points: np.ndarray, halt: np.ndarray, edges: list[Edge], spans: list[tuple[int, int]]
+) -> list[Edge]:
+    """Put splines in place of three and more single sides that turn gently."""
+    found: list[Edge] = []
+    k = 0
+    while k < len(edges):
+        last = k
+        while (
+            spans[k][1] - spans[k][0] == 1
+            and last + 1 < len(edges)
+            and spans[last + 1][1] - spans[last + 1][0] == 1
+            and not halt[spans[last + 1][0]]
+        ):
+            last += 1
+        if last - k >= 2:
+            run = points[spans[k][0] : spans[last][1] + 1]
+            found.append(Edge(_through(run), edges[k].label))
+        else:
+            found += edges[k : last + 1]
+        k = last + 1
+    return found
+
+
+def _through(points: np.ndarray) -> Spline:
+    """Return a spline through points, parametrised by the chords."""
+    t = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    # Not-a-knot ends; its second derivative is free there.
+    spline = make_interp_spline(t / t[-1], points, k=DEGREE)
+    return Spline(spline.t, spline.c)
+
+
+def _closed(edges: list[Edge], near: float) -> list[Edge]:
+    """Join first and last curve where one goes on as the other: the polygon began within it."""
+    if len(edges) < 2 or edges[0].label != edges[-1].label:
+        return edges
+    first, last = edges[0].curve, edges[-1].curve
+    if isinstance(first, Line) and isinstance(last, Line):
+        if _straight(np.array([last.start, first.start, first.end]), near):
+            return [Edge(Line(last.start, first.end), edges[0].label), *edges[1:-1]]
+    if isinstance(first, Arc) and isinstance(last, Arc):
+        apart = np.linalg.norm(first.centre - last.centre) + abs(first.radius - last.radius)
+        if apart < 10.0 * near and first.sweep * last.sweep > 0.0:
+            whole = Arc(last.centre, last.radius, last.begin, last.sweep + first.sweep)
+            return [Edge(whole, edges[0].label), *edges[1:-1]]
+    return edges
+
+
+def snapped(edge: Edge, axes: np.ndarray, extent: float) -> Edge:
+    """Return the edge with a circle about one of the axes (n, 2) exactly about it."""
+    curve = edge.curve
+    if isinstance(curve, Arc):
+        for axis in axes:
+            if np.linalg.norm(curve.centre - axis) < SAME * extent:
+                curve = Arc(axis, curve.radius, curve.begin, curve.sweep)
+    return Edge(curve, edge.label)
+
+
+INBOARD, OUTBOARD = "inboard", "outboard"
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A part of the plane by the closed loops of curves around it."""
+
+    loops: Sequence[Sequence[Edge]]
+
+    @property
+    def edges(self) -> list[Edge]:
+        """All curves."""
+        return [edge for loop in self.loops for edge in loop]
+
+    def area_inside(self, tolerance: float) -> Geometry:
+        """Return the region as polygons whose sides stay within a distance of the curves, m."""
+        import shapely
+
+        rings = [sampled([edge.curve for edge in loop], tolerance) for loop in self.loops]
+        lines = [shapely.LinearRing(ring) for ring in rings]
+        # Even-odd: a loop within another one is a hole.
+        whole = shapely.Polygon()
+        for line in sorted(lines, key=lambda one: -shapely.Polygon(one).area):
+            whole = whole.symmetric_difference(shapely.Polygon(line))
+        return whole
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of a mesh as polygons.
+
+    Attributes:
+        nodes: (n_cells, 3 or 4) counterclockwise around each cell.
+        points: (n_nodes, 2) m.
+        facets: (n_cells, 3 or 4) the facet from each node to the next.
+    """
+
+    nodes: np.ndarray
+    points: np.ndarray
+    facets: np.ndarray
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners (n_cells, 3 or 4, 2) around each cell, m."""
+        return self.points[self.nodes]
+
+    def rim(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sides (n, 2, 2) that only one cell has, m, and which cell (n,)."""
+        cell, place = np.nonzero(np.bincount(self.facets.ravel())[self.facets] == 1)
+        after = (place + 1) % self.nodes.shape[1]
+        ends = [self.points[self.nodes[cell, k]] for k in (place, after)]
+        return np.stack(ends, axis=1), cell
+
+
+def region_of(mesh: ArmMesh, cells: Cells, chosen: np.ndarray) -> Region:
+    """Return the region of the chosen cells (n_cells,), circles about joint axes exactly so."""
+    extent = float(np.ptp(cells.points, axis=0).max())
+    axes = np.array([[0.0, 0.0], mesh.outboard_point])
+    return Region(
+        [
+            [snapped(edge, axes, extent) for edge in recognise(cells.points[loop], labels, extent)]
+            for loop, labels in _boundary(mesh, cells, chosen)
+        ]
+    )
+
+
+def cells_of(mesh: ArmMesh) -> Cells:
+    """Return the cells of a mesh that is whole on this rank."""
+    nodes = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
+    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
+    points = mesh.mesh.geometry.x[:, :2]
+    if nodes.shape[1] == 3:  # facets lie opposite to corners
+        around, after = [0, 1, 2], [2, 0, 1]
+    else:  # a tensor product; facets 01, 02, 13, 23
+        around, after = [0, 1, 3, 2], [0, 2, 3, 1]
+    nodes, facets = nodes[:, around], facets[:, after]
+    corner = points[nodes]
+    ahead = np.roll(corner, -1, axis=1)
+    turned = (corner[..., 0] * ahead[..., 1] - corner[..., 1] * ahead[..., 0]).sum(axis=1) < 0.0
+    back = np.arange(nodes.shape[1])[::-1]
+    nodes = np.where(turned[:, None], nodes[:, back], nodes)
+    facets = np.where(turned[:, None], facets[:, np.roll(back, -1)], facets)
+    return Cells(nodes, points, facets)
+
+
+def _boundary(
+    mesh: ArmMesh, cells: Cells, chosen: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the loops of nodes around the chosen cells, and what each side belongs to."""
+    ends = np.stack([cells.nodes, np.roll(cells.nodes, -1, axis=1)], axis=2)[chosen].reshape(-1, 2)
+    facet = cells.facets[chosen].ravel()
+    once = np.bincount(facet)[facet] == 1
+    ends, facet = ends[once], facet[once]
+    label = np.full(len(facet), "", dtype="<U8")
+    label[np.isin(facet, mesh.inboard_facets)] = INBOARD
+    label[np.isin(facet, mesh.outboard_facets)] = OUTBOARD
+    of = {(int(a), int(b)): name for (a, b), name in zip(ends, label, strict=True)}
+    found = []
+    for loop in loops(ends):
+        sides = zip(loop, np.roll(loop, -1), strict=True)
+        found.append((loop, np.array([of[int(a), int(b)] for a, b in sides])))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """One arm before its outline is drawn.
+
+    Attributes:
+        name: of the arm.
+        corners: (n_cells, 3 or 4, 2) around each cell, m.
+        centroid: (n_cells, 2) m.
+        area: (n_cells,) m2.
+        x_phys: (n_cells,) physical densities.
+        field: (n_cells,) what is smooth from cell to cell and falls where x_phys does: the
+            filtered densities before they are projected, or x_phys itself.
+        crisp: whether `field` is a projected design, which leaps from cell to cell.
+        links: (n, 2, 2) m, lines between the centroids of solid cells of a projected design that
+            share a corner at least, where one of them is in a member no wider than a cell.
+        contacts: number of corners in which two solid cells touch that share nothing else.
+        rim, rim_cells: (n, 2, 2) m, the sides of cells on the arm's outline, counterclockwise
+            around the cell; (n,) which cell.
+        outline: the arm's own, bores included.
+        solid, void: where material stays, and where there is none.
+        grid: numbers of cells (along, across) where they form one.
+        length, thickness: m.
+        symmetric: about y = 0.
+        minimum_member: smallest width of members that the scene asks for, m; 0: none.
+    """
+
+    name: str
+    corners: np.ndarray
+    centroid: np.ndarray
+    area: np.ndarray
+    x_phys: np.ndarray
+    field: np.ndarray
+    crisp: bool
+    links: np.ndarray
+    contacts: int
+    rim: np.ndarray
+    rim_cells: np.ndarray
+    outline: Region
+    solid: Region
+    void: Region
+    grid: tuple[int, int] | None
+    length: float
+    thickness: float
+    symmetric: bool
+    minimum_member: float
+
+    @property
+    def cell(self) -> float:
+        """Size of a cell: the root of the median area, m."""
+        return float(np.sqrt(np.median(self.area)) * (1.0 if self.corners.shape[1] == 4 else 1.5))
+
+    @property
+    def extent(self) -> float:
+        """The larger side of the box around the arm, m."""
+        return float(np.ptp(self.corners.reshape(-1, 2), axis=0).max())
+
+    @property
+    def height(self) -> float:
+        """The arm's size across, m."""
+        return float(np.ptp(self.corners[..., 1]))
+
+    @property
+    def volume(self) -> float:
+        """The material's volume over the thickness, m2."""
+        return float(self.x_phys @ self.area)
+
+    @property
+    def grayness(self) -> float:
+        """Mean of 4 x (1 - x) over the area."""
+        return float(4.0 * self.x_phys * (1.0 - self.x_phys) @ self.area / self.area.sum())
+
+    @property
+    def gray_share(self) -> float:
+        """Share of the material in cells of densities between 0.1 and 0.9."""
+        gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
+        return float((self.x_phys * self.area)[gray].sum() / self.volume)
+
+
+def read_domains(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, Domain]:
+    """Return this rank's share of the arms with a design of their own (collective).
+
+    Each arm is whole on one rank, so that its domain is the same on any number of them.
+
+    Returns:
+        Domains by their place in the chain.
+
+    Raises:
+        InputError: the folder holds no design, or one that does not fit the scene's arms; on all
+            ranks.
+    """
+    from dolfinopt.mesh.arm_mesh import arm_mesh
+    from dolfinopt.mesh.budget import check_budget
+    from dolfinopt.output.design import read_smooth_design
+    from dolfinopt.parallel import partition_arms, together
+
+    for k in scene.cell_counts:
+        if scene.arms[k].is_solid:
+            raise InputError(
+                f"{folder}: arm {scene.arms[k].name!r} is a solid: parts are outlines of arms in "
+                "plane stress, cells = [along, across]; surfaces of solids: `dolfinopt part`"
+            )
+    check_budget(world, scene)
+    partition = partition_arms(world, scene.cell_counts, whole=True)
+    patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
+    with together(world):
+        meshes = {
+            k: arm_mesh(partition.comm, scene.arms[k], patterns.get(k)) for k in partition.arms
+        }
+    designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
+    with together(world):
+        return {k: domain_of(scene, k, mesh, *designs[k]) for k, mesh in meshes.items()}
+
+
+def domain_of(
+    scene: Scene, index: int, mesh: ArmMesh, x_phys: np.ndarray, field: np.ndarray | None = None
+) -> Domain:
+    """Return an arm with a design.
+
+    Args:
+        scene: of the arm.
+        index: its place in the chain.
+        mesh: whole on this rank.
+        x_phys: (n_cells,) physical densities.
+        field: (n_cells,) filtered densities; None: not known.
+    """
+    entry, like = scene.arms[index], scene.arms[scene.patterns.get(index, index)]
+    cells = cells_of(mesh)
+    rim, rim_cells = cells.rim()
+    return Domain(
+        name=entry.name,
+        corners=cells.corners,
+        centroid=mesh.centroid,
+        area=mesh.area,
+        x_phys=x_phys,
+        field=x_phys if field is None else field,
+        crisp=field is None and bool(scene.design.projection),
+        links=_links(cells.nodes, mesh.centroid, x_phys, bool(scene.design.projection)),
+        contacts=_contacts(cells.nodes, x_phys > 0.5),
+        rim=rim,
+        rim_cells=rim_cells,
+        outline=region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool)),
+        solid=region_of(mesh, cells, mesh.passive),
+        void=region_of(mesh, cells, mesh.void),
+        grid=None if entry.cells is None else entry.cells[:2],
+        length=entry.length,
+        thickness=entry.thickness,
+        symmetric=like.symmetric,
+        minimum_member=scene.design.minimum_member,
+    )
+
+
+def _contacts(nodes: np.ndarray, solid: np.ndarray) -> int:
+    """Return how many nodes are all that two solid cells beside void share."""
+    import scipy.sparse as sp
+
+    chosen = nodes[solid]
+    cells = np.repeat(np.arange(len(chosen)), chosen.shape[1])
+    touch = sp.csc_matrix((np.ones(chosen.size), (cells, chosen.ravel())))
+    pairs = touch[:, np.diff(touch.indptr) == 2].indices.reshape(-1, 2)
+    if not len(pairs):
+        return 0
+    rows = touch.tocsr()
+    shared = rows[pairs[:, 0]].multiply(rows[pairs[:, 1]]).sum(axis=1)
+    return int((np.asarray(shared) == 1.0).sum())
+
+
+def _links(
+    nodes: np.ndarray, centroid: np.ndarray, x_phys: np.ndarray, projected: bool
+) -> np.ndarray:
+    """Return the lines along which a projected design hangs together, see `Domain`."""
+    import scipy.sparse as sp
+
+    if not projected:
+        return np.empty((0, 2, 2))
+    cells = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    touch = sp.csr_matrix((np.ones(nodes.size), (cells, nodes.ravel())))
+    shared = sp.triu(touch @ touch.T, 1).tocoo()
+    # Triangles that share a corner alone are linked by those between them.
+    near = shared.data >= (1 if nodes.shape[1] == 4 else 2)
+    a, b = shared.row[near], shared.col[near]
+    solid = x_phys > 0.5
+    # Wider than a cell is a member with a node that no void cell touches.
+    inner = np.ones(int(nodes.max()) + 1, dtype=bool)
+    inner[nodes[~solid]] = False
+    thin = ~inner[nodes].any(axis=1)
+    linked = solid[a] & solid[b] & (thin[a] | thin[b])
+    return np.stack([centroid[a[linked]], centroid[b[linked]]], axis=1)

@@ -1,0 +1,496 @@
+"""The free outline of a part as variables: normal moves of control points, smooth along it.
+
+Closed free loops are periodic uniform cubic B-splines, open free runs uniform ones that keep two
+control points at either end, so that their ends and directions stay. Control points stand about a
+cell apart. They move along the outward normals by s = F x with
+
+    F = (W + r^2 K)^-1 W,
+
+W the lengths of outline that belong to the control points and K the stiffness of a string through
+them: moves are smooth over the length r. Source: Lazarov & Sigmund (2011), doi:10.1002/nme.3072.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.spatial import cKDTree
+
+from dolfinopt.errors import InputError
+from dolfinopt.part.plane.curves import DEGREE, MIRROR, Line, Piece, Shape, Spline
+from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
+from dolfinopt.part.plane.part import Part
+
+if TYPE_CHECKING:
+    from shapely import Geometry, Polygon
+
+
+SPACING = 1.2  # of control points, cells of the design
+REACH = 2.0  # length r over which moves are smooth, cells
+LEAST_POINTS = 8  # control points of a closed run; an open one has 3 more than it has spans
+SAMPLES = 8  # points for every control point that a run is fitted to
+STIFF = 1e-4  # of second differences of control points, where they are fitted
+CHORD = 0.005  # distance of polygons from the curves, cells
+NEAREST = 200  # places around each that may be the other side of a member or a gap
+WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
+ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
+EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
+LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
+WIDENED, WIDENINGS = 0.06, 12  # cells by which thin members grow at a time, and how often
+BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
+_GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
+
+
+@cache
+def _curves_of(count: int, closed: bool) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return knots and T of every clamped spline that a run consists of: its points are T P."""
+    if not closed:
+        inner = np.linspace(0.0, 1.0, count - DEGREE + 1)[1:-1]
+        return ((np.concatenate([np.zeros(4), inner, np.ones(4)]), np.eye(count)),)
+    found = []
+    for first, last in ((0, count // 2), (count // 2, count)):
+        inner = np.arange(first + 1, last)
+        knots = np.concatenate([[first] * 4, inner, [last] * 4]) / count
+        t = np.array([knots[k + 1 : k + 4].mean() for k in range(len(knots) - 4)])
+        own = BSpline.design_matrix(np.clip(t, knots[0], knots[-1]), knots, DEGREE).toarray()
+        T = np.linalg.solve(own, _periodic(count, t))
+        found.append(((knots - knots[0]) / (knots[-1] - knots[0]), T))
+    return tuple(found)
+
+
+def _periodic(count: int, t: np.ndarray, order: int = 0) -> np.ndarray:
+    """Return the basis (len t, count) of periodic uniform cubics on [0, 1], or a derivative."""
+    knots = np.arange(-3, count + 4) / count
+    basis = BSpline(knots, np.eye(count + 3), DEGREE)(np.clip(t, 0.0, 1.0), nu=order)
+    found = basis[:, :count].copy()
+    found[:, :3] += basis[:, count:]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One free run of the outline, material to its left.
+
+    Attributes:
+        points: (n, 2) control points, m.
+        closed: whether it is a whole loop.
+    """
+
+    points: np.ndarray
+    closed: bool
+
+    @property
+    def pieces(self) -> list[Piece]:
+        """The curves of the run."""
+        fixed = (not self.closed, not self.closed)
+        return [
+            Piece(Spline(knots, T @ self.points), free=True, fixed=fixed)
+            for knots, T in _curves_of(len(self.points), self.closed)
+        ]
+
+    @cached_property
+    def frame(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points of the curve beside the control points, and outward normals there (n, 2)."""
+        n = len(self.points)
+        if self.closed:
+            t = ((np.arange(n) - 1) % n) / n
+            at, along = _periodic(n, t) @ self.points, _periodic(n, t, 1) @ self.points
+        else:
+            knots = _curves_of(n, False)[0][0]
+            curve = Spline(knots, self.points)
+            t = np.clip([knots[k + 1 : k + 4].mean() for k in range(n)], 0.0, 1.0)
+            at, along = curve.at(t), curve.derivative(t)
+        along = along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None]
+        return at, np.stack([along[:, 1], -along[:, 0]], axis=1)
+
+    def filter(self, reach: float) -> np.ndarray:
+        """Return F (n, n) with s = F x; rows of control points that stay are zero."""
+        n = len(self.points)
+        links = np.arange(n if self.closed else n - 1)
+        ends = np.stack([links, (links + 1) % n])
+        length = np.linalg.norm(np.diff(self.points[ends], axis=0)[0], axis=1)
+        W, K = np.zeros(n), np.zeros((n, n))
+        for i, j in (ends, ends[::-1]):
+            np.add.at(W, i, 0.5 * length)
+            np.add.at(K, (i, i), 1.0 / length)
+            np.add.at(K, (i, j), -1.0 / length)
+        moves = np.ones(n, dtype=bool)
+        if not self.closed:
+            moves[[0, 1, -2, -1]] = False
+        F = np.zeros((n, n))
+        A = (np.diag(W) + reach**2 * K)[np.ix_(moves, moves)]
+        F[np.ix_(moves, moves)] = np.linalg.solve(A, np.diag(W[moves]))
+        return F
+
+
+@dataclass(frozen=True, eq=False)
+class FreeOutline:
+    """The outline of one part: pieces that stay, and runs that move.
+
+    Attributes:
+        part: that it was made of.
+        loops: every loop's pieces in order; a number stands for the run of that number.
+        runs: what moves.
+        arm, stays: where material may be, and where it must be (shapely).
+        least: smallest widths of members and gaps, m.
+        partner: (count,) control point that moves the mirror image; None without symmetry.
+    """
+
+    part: Part
+    loops: tuple[tuple[Piece | int, ...], ...]
+    runs: tuple[Run, ...]
+    arm: Geometry
+    stays: Geometry
+    least: tuple[float, float]
+    partner: np.ndarray | None
+
+    @cached_property
+    def shape(self) -> Shape:
+        """The outline in curves."""
+        loops = [
+            tuple(
+                piece
+                for one in loop
+                for piece in (self.runs[one].pieces if isinstance(one, int) else [one])
+            )
+            for loop in self.loops
+        ]
+        return Shape(tuple(loops))
+
+    @property
+    def blocks(self) -> list[slice]:
+        """Where the control points of every run stand among all of them."""
+        ends = np.cumsum([0, *(len(run.points) for run in self.runs)])
+        return [slice(a, b) for a, b in pairwise(ends)]
+
+    @property
+    def count(self) -> int:
+        """Number of control points."""
+        return sum(len(run.points) for run in self.runs)
+
+    @cached_property
+    def filters(self) -> list[np.ndarray]:
+        """F of every run."""
+        reach = REACH * self.part.domain.cell
+        return [run.filter(reach) for run in self.runs]
+
+    def filtered(self, x: np.ndarray) -> np.ndarray:
+        """Return s = F x (count,), m."""
+        x = self._symmetric(x)
+        return np.concatenate(
+            [F @ x[b] for F, b in zip(self.filters, self.blocks, strict=True)] or [np.empty(0)]
+        )
+
+    def by_x(self, by_s: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, count) by x from those by s."""
+        parts = [by_s[:, b] @ F for F, b in zip(self.filters, self.blocks, strict=True)]
+        return self._symmetric(np.hstack(parts) if parts else np.empty((len(by_s), 0)))
+
+    def _symmetric(self, values: np.ndarray) -> np.ndarray:
+        if self.partner is None:
+            return values
+        return 0.5 * (values + values[..., self.partner])
+
+    def moved(self, s: np.ndarray) -> FreeOutline:
+        """Return the outline with control points moved outwards by s (count,), m."""
+        runs = [
+            replace(run, points=run.points + s[b, None] * run.frame[1])
+            for run, b in zip(self.runs, self.blocks, strict=True)
+        ]
+        return replace(self, runs=tuple(runs))
+
+    def by_s(self, mesh: BodyMesh, by_outline: np.ndarray) -> np.ndarray:
+        """Return derivatives (count,) by s, per m.
+
+        That nodes stand a little off the curves, so that straight sides enclose their area, is
+        left out: a share of about (side over radius)^2 of the derivative.
+
+        Args:
+            mesh: along the curves of this outline.
+            by_outline: (k, 2) derivatives by the first node of every side of the mesh.
+        """
+
+        def pull(number: int, curve: Spline) -> np.ndarray:
+            here = np.flatnonzero(mesh.piece == number)
+            t = np.clip(mesh.span[here, 0], 0.0, 1.0)
+            basis = BSpline.design_matrix(t, curve.knots, DEGREE)
+            return np.asarray(basis.T @ by_outline[here])
+
+        return self._along_normals(pull)
+
+    def area_by_s(self) -> np.ndarray:
+        """Return the derivative (count,) of the area by s, m."""
+
+        def pull(_: int, curve: Spline) -> np.ndarray:
+            ends = curve.breaks
+            t = (ends[:-1, None] + np.diff(ends)[:, None] * _GAUSS).ravel()
+            weights = (np.diff(ends)[:, None] * _WEIGHTS).ravel()
+            d = curve.derivative(t)
+            outward = np.stack([d[:, 1], -d[:, 0]], axis=1) * weights[:, None]
+            return np.asarray(BSpline.design_matrix(t, curve.knots, DEGREE).T @ outward)
+
+        return self._along_normals(pull)
+
+    def _along_normals(self, pull: Callable[[int, Spline], np.ndarray]) -> np.ndarray:
+        """Return derivatives by s of what `pull` gives by the control points of every curve."""
+        found, number = np.zeros(self.count), 0
+        for loop in self.loops:
+            for one in loop:
+                if not isinstance(one, int):
+                    number += 1
+                    continue
+                run, block = self.runs[one], self.blocks[one]
+                by_points = np.zeros_like(run.points)
+                for knots, T in _curves_of(len(run.points), run.closed):
+                    by_points += T.T @ pull(number, Spline(knots, T @ run.points))
+                    number += 1
+                found[block] = (by_points * run.frame[1]).sum(axis=1)
+        return found
+
+    def widths(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the width (count,) of members, and of gaps, beside every control point, m."""
+        at = np.vstack([run.frame[0] for run in self.runs])
+        places, inward = [at], [-np.vstack([run.frame[1] for run in self.runs])]
+        for piece in self.shape.pieces:
+            t = _samples(piece, 0.25 * self.part.domain.cell)
+            places.append(piece.curve.at(t))
+            inward.append(-normals(piece.curve, t))
+        every, into = np.vstack(places), np.vstack(inward)
+        near = cKDTree(every).query(every, k=min(NEAREST, len(every)))[1]
+        beside, found = cKDTree(at).query(every)[1], []
+        for side in (1.0, -1.0):
+            wide = facing(every, into, near, side)
+            narrowest = wide[: len(at)].copy()
+            np.minimum.at(narrowest, beside, wide)
+            found.append(narrowest)
+        return found[0], found[1]
+
+    def room(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far (count,) control points may move inwards and outwards in a step, m.
+
+        Members and gaps get no narrower than `least`; material stays where it may be.
+        """
+        import shapely
+
+        inwards, outwards = (
+            np.minimum(ROOM_SHARE * np.maximum(wide - least, 0.0), WIDTH_SHARE * wide)
+            for wide, least in zip(self.widths(), self.least, strict=True)
+        )
+        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
+        outwards = np.minimum(outwards, self._outside(points))
+        if not self.stays.is_empty:
+            inwards = np.minimum(inwards, EDGE_SHARE * shapely.distance(points, self.stays))
+        return self._least_beside(inwards), self._least_beside(outwards)
+
+    def _outside(self, points: Any) -> np.ndarray:
+        """Return how far (n,) material may grow at places of the outline, m."""
+        import shapely
+
+        edge = EDGE_SHARE * shapely.distance(points, self.arm.boundary)
+        return np.where(shapely.covers(self.arm, points), edge, 0.0)
+
+    def widened(self) -> FreeOutline:
+        """Return the outline with members that are thinner than `least` a little wider."""
+        import shapely
+
+        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
+        missing = 0.5 * np.maximum(self.least[0] - self.widths()[0], 0.0)
+        s = np.minimum(missing, np.minimum(WIDENED * self.part.domain.cell, self._outside(points)))
+        for run, block in zip(self.runs, self.blocks, strict=True):
+            if run.closed:
+                own = s[block]
+                s[block] = np.maximum(own, 0.5 * np.maximum(np.roll(own, 1), np.roll(own, -1)))
+            else:
+                s[block][[0, 1, -2, -1]] = 0.0
+        return self.moved(self._symmetric(s))
+
+    def _least_beside(self, room: np.ndarray) -> np.ndarray:
+        """Return the least of every control point and those beside it."""
+        found = room.copy()
+        for run, block in zip(self.runs, self.blocks, strict=True):
+            own = room[block]
+            for shift in range(-BESIDE, BESIDE + 1):
+                if run.closed:
+                    other = np.roll(own, shift)
+                else:
+                    other = own[np.clip(np.arange(len(own)) + shift, 0, len(own) - 1)]
+                found[block] = np.minimum(found[block], other)
+        return found
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether no curve crosses another, and material is where it may and must be."""
+        import shapely
+
+        cell = self.part.domain.cell
+        if not self.shape.is_simple(CHORD * cell):
+            return False
+        outer, *holes = self.shape.polygons(CHORD * cell)
+        polygon, near = shapely.Polygon(outer, holes), 0.02 * cell
+        kept = self.stays.is_empty or polygon.buffer(near).covers(self.stays)
+        return bool(kept and self.arm.buffer(near).covers(polygon))
+
+
+def _samples(piece: Piece, spacing: float) -> np.ndarray:
+    """Return parameters of places that stand for a piece, about so far apart, m."""
+    length = float(np.linalg.norm(piece.curve.end - piece.curve.start))
+    if isinstance(piece.curve, Line):
+        return np.linspace(0.0, 1.0, max(3, int(length / spacing)))
+    count = len(piece.curve.points) if isinstance(piece.curve, Spline) else 16
+    return np.linspace(0.0, 1.0, 4 * count)
+
+
+def free_outline(part: Part) -> FreeOutline:
+    """Return the outline of a part with free runs of evenly spaced control points.
+
+    Raises:
+        InputError: its free curves are lines and arcs.
+    """
+    import shapely
+
+    if any(piece.free and not isinstance(piece.curve, Spline) for piece in part.shape.pieces):
+        raise InputError("--optimize: expected splines, not --curves arcs")
+
+    domain, shape = part.domain, part.shape
+    chord, cell = CHORD * domain.cell, domain.cell
+    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
+    stays = shapely.union_all([domain.solid.area_inside(chord)])
+    loops: list[tuple[Piece | int, ...]] = []
+    runs: list[Run] = []
+    fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]
+    for loop in fixed:
+        found: list[Piece | int] = []
+        for piece in loop:
+            if piece.free:
+                found.append(len(runs))
+                line = piece.curve.at(piece.curve.parameters(chord))
+                runs.append(Run(_fitted_open(line, SPACING * cell), False))
+            else:
+                found.append(piece)
+        loops.append(tuple(found))
+    tool = part.outline.tool_radius
+    for ring in _free_rings(shape, tool, chord, len(fixed)):
+        loops.append((len(runs),))
+        runs.append(Run(_fitted_closed(ring, SPACING * cell, domain.symmetric), True))
+    partner = None
+    if domain.symmetric:
+        runs, partner = _mirrored(runs)
+    least = max(domain.minimum_member, LEAST_MEMBER * cell), max(2.0 * tool, LEAST_GAP * cell)
+    made = FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner)
+    for _ in range(WIDENINGS if runs else 0):
+        made = made.widened()
+    return made
+
+
+def _free_rings(shape: Shape, tool: float, chord: float, fixed: int) -> list[np.ndarray]:
+    """Return the corners (n, 2) of the free holes, clockwise, concave corners as wide as the tool.
+
+    Args:
+        shape: of the part.
+        tool: radius, m.
+        chord: distance of polygons from curves, m.
+        fixed: loops with pieces that stay, which come first.
+    """
+    import shapely
+
+    polygons = shape.polygons(chord)
+    free = [k for k, loop in enumerate(shape.loops) if all(piece.free for piece in loop)]
+    if 0 in free:  # the outer loop: only its arm's own curves bound a part
+        free.remove(0)
+    found = []
+    for k in free:
+        hole: Polygon = shapely.Polygon(polygons[k])
+        opened = hole.buffer(-tool, quad_segs=16).buffer(tool, quad_segs=16) if tool else hole
+        if opened.geom_type == "Polygon" and not opened.is_empty:
+            hole = opened
+        turned = shapely.geometry.polygon.orient(hole, -1.0)
+        found.append(np.asarray(turned.exterior.coords)[:-1])
+    return found
+
+
+def _resampled(points: np.ndarray, count: int) -> np.ndarray:
+    """Return points (count + 1, 2) evenly spaced along a line, its ends included."""
+    s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    t = np.linspace(0.0, s[-1], count + 1)
+    return np.stack([np.interp(t, s, points[:, axis]) for axis in (0, 1)], axis=1)
+
+
+def _length(points: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _fitted_closed(ring: np.ndarray, spacing: float, symmetric: bool) -> np.ndarray:
+    """Return control points (n, 2) of a periodic spline through a ring of corners."""
+    if symmetric and ring[:, 1].min() < 0.0 < ring[:, 1].max():  # begin on the axis
+        ring = np.roll(ring, -int(np.argmin(np.abs(ring[:, 1]))), axis=0)
+    line = np.vstack([ring, ring[:1]])
+    n = max(LEAST_POINTS, round(_length(line) / spacing))
+    n += n % 2
+    points = _resampled(line, SAMPLES * n)[:-1]
+    basis = _periodic(n, np.arange(SAMPLES * n) / (SAMPLES * n))
+    bend = np.roll(np.eye(n), 1, axis=0) - 2.0 * np.eye(n) + np.roll(np.eye(n), -1, axis=0)
+    A = basis.T @ basis / SAMPLES + STIFF * bend.T @ bend
+    return np.linalg.solve(A, basis.T @ points / SAMPLES)
+
+
+def _fitted_open(line: np.ndarray, spacing: float) -> np.ndarray:
+    """Return control points (n, 2) of a clamped spline along a line, its ends and directions."""
+    n = max(6, round(_length(line) / spacing) + DEGREE)
+    knots = _curves_of(n, False)[0][0]
+    points = _resampled(line, SAMPLES * n)
+    basis = BSpline.design_matrix(np.linspace(0.0, 1.0, len(points)), knots, DEGREE).toarray()
+    bend = np.diff(np.eye(n), 2, axis=0)
+    A = basis.T @ basis / SAMPLES + STIFF * bend.T @ bend
+    right = basis.T @ points / SAMPLES
+    found = np.empty((n, 2))
+    step = _length(line) * knots[DEGREE + 1] / DEGREE
+    for end, ahead, row in ((0, 1, 1), (-1, -2, -2)):
+        along = points[ahead] - points[end]
+        found[end], found[row] = points[end], points[end] + step * along / np.linalg.norm(along)
+    held, inner = np.array([0, 1, n - 2, n - 1]), np.arange(2, n - 2)
+    rest = right[inner] - A[np.ix_(inner, held)] @ found[held]
+    found[inner] = np.linalg.solve(A[np.ix_(inner, inner)], rest)
+    return found
+
+
+def _mirrored(runs: Sequence[Run]) -> tuple[list[Run], np.ndarray]:
+    """Return runs that are mirror images of each other or of themselves, and every partner."""
+    found = list(runs)
+    starts = np.cumsum([0, *(len(run.points) for run in runs)])
+    partner = np.arange(starts[-1])
+    centres = np.array([run.points.mean(axis=0) for run in runs]).reshape(-1, 2)
+    done: set[int] = set()
+    for k, run in enumerate(runs):
+        if k in done:
+            continue
+        apart = np.linalg.norm(centres * MIRROR - centres[k], axis=1)
+        like = [abs(len(one.points) - len(run.points)) <= 2 for one in runs]
+        twin = int(np.argmin(np.where(like, apart, np.inf)))
+        n = len(run.points)
+        turned = (2 - np.arange(n)) % n if run.closed else np.arange(n)[::-1]
+        if twin == k:
+            points = 0.5 * (run.points + (run.points * MIRROR)[turned])
+            found[k] = replace(run, points=points)
+        else:
+            found[twin] = replace(run, points=(run.points * MIRROR)[turned])
+        done |= {k, twin}
+        # A twin may have had two control points more or less.
+        starts = np.cumsum([0, *(len(one.points) for one in found)])
+    partner = np.arange(starts[-1])
+    for k, run in enumerate(found):
+        n = len(run.points)
+        turned = (2 - np.arange(n)) % n if run.closed else np.arange(n)[::-1]
+        images = (run.points * MIRROR)[turned]
+        twin = int(np.argmin([_gap(one.points, images) for one in found]))
+        partner[starts[k] : starts[k + 1]] = starts[twin] + np.argsort(turned)
+    return found, partner
+
+
+def _gap(points: np.ndarray, others: np.ndarray) -> float:
+    return float(np.abs(points - others).max()) if len(points) == len(others) else np.inf

@@ -1,0 +1,555 @@
+"""Search for a number at which something has the wanted size, also where that leaps.
+
+Polygons as a tool leaves them: corners rounded, necks cut, pinholes closed.
+
+The density as a smooth field on a raster, and the polygons above a level of it.
+
+Where the material of a part ends: the level of the density that holds the material's volume.
+
+What stays solid, the interfaces and the arm's own outline are kept; islands are dropped, and every
+hole, gap and concave corner is as wide as the tool.
+
+How wide the thinnest member of an outline is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.part.plane.curves import sampled
+from dolfinopt.part.plane.domain import INBOARD, OUTBOARD, Domain
+
+if TYPE_CHECKING:
+    from shapely import Geometry, Polygon
+
+
+T = TypeVar("T")
+
+NARROW = 2e-4  # bracket at which the search ends, of the span
+SEARCH_STEPS = 30
+BEYOND = 1.15  # of the step to where a straight line ends
+
+
+def search(
+    at: Callable[[float], T],
+    off: Callable[[T], float],
+    first: float,
+    slope: float,
+    span: tuple[float, float],
+    enough: float,
+) -> T:
+    """Return what is nearest to the wanted size; no further off than `enough` where nothing leaps.
+
+    A bracket is looked for along straight lines, then narrowed by the secant and, as sizes may
+    leap, by halves.
+
+    Args:
+        at: what comes of a number.
+        off: by how much it is too large, relative; it grows with the number.
+        first: where to begin.
+        slope: about, of what `off` returns.
+        span: what the number may be.
+        enough: relative.
+    """
+    tried: list[tuple[float, float]] = []
+    place = min(max(first, span[0]), span[1])
+    best = at(place)
+    found, width = best, np.inf
+    for _ in range(SEARCH_STEPS):
+        excess = off(found)
+        if abs(excess) < abs(off(best)):
+            best = found
+        if abs(excess) < enough:
+            break
+        tried.append((place, excess))
+        above = min((p for p in tried if p[1] > 0.0), default=None)
+        below = max((p for p in tried if p[1] <= 0.0), default=None)
+        if above is None or below is None:
+            ahead = min(max(place - _step(tried, slope), span[0]), span[1])
+            if ahead == place:  # at the end of what it may be
+                break
+            place = ahead
+        else:
+            if abs(above[0] - below[0]) < NARROW * (span[1] - span[0]):
+                break
+            # A size may leap, as it does to nothing: then the secant hardly narrows the bracket.
+            leaps = abs(above[0] - below[0]) > 0.5 * width or max(above[1], -below[1]) > 0.5
+            width = abs(above[0] - below[0])
+            share = 0.5 if leaps else -below[1] / (above[1] - below[1])
+            place = below[0] + min(max(share, 0.03), 0.97) * (above[0] - below[0])
+        found = at(place)
+    return best
+
+
+def _step(tried: list[tuple[float, float]], slope: float) -> float:
+    """Return the step to the other side of the root: a little further than along the line there."""
+    (place, excess) = tried[-1]
+    if len(tried) > 1 and excess != tried[-2][1]:
+        steepness = (excess - tried[-2][1]) / (place - tried[-2][0])
+        slope = min(max(steepness, 0.25 * slope), 4.0 * slope)
+    return BEYOND * excess / slope
+
+
+QUADRANT = 12  # sides of a quarter of the tool's circle
+SLIVER = 2e-3  # area of a corner that is rounded, squares of the radius: turns of 20 degrees
+
+
+def rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
+    """Return the polygons with all that a disc cannot reach from without added to them.
+
+    Elsewhere their sides stay what they are to the bit.
+    """
+    import shapely
+
+    closed = whole.buffer(radius, quad_segs=QUADRANT).buffer(-radius, quad_segs=QUADRANT)
+    added = shapely.get_parts(closed.difference(whole))
+    # The rounding of numbers, and every corner of the polygon, leave slivers all along.
+    added = added[shapely.area(added) > SLIVER * radius * radius]
+    return shapely.union_all([whole, *shapely.buffer(added, 0.1 * chord, join_style="mitre")])
+
+
+def without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
+    """Return the polygons without what is narrower than a width and joins wider parts."""
+    import shapely
+
+    opened = whole.buffer(-0.5 * width, quad_segs=QUADRANT).buffer(
+        0.5 * width + 0.1 * chord, quad_segs=QUADRANT
+    )
+    pieces = shapely.get_parts(whole.difference(opened))
+    necks = []
+    for piece in pieces[shapely.area(pieces) > 0.01 * width * width]:
+        touched = piece.buffer(chord).intersection(opened)
+        if len(polygons_of(touched)) != 1:  # a corner touches one wider part
+            necks.append(piece.buffer(chord, join_style="mitre"))
+    return whole.difference(shapely.union_all(necks)) if necks else whole
+
+
+def is_kept(ring: Any, arm: Geometry, least: float) -> bool:
+    """Return whether a hole is a bore of the arm or no mere pinhole."""
+    import shapely
+
+    hole = shapely.Polygon(ring)
+    return bool(hole.area > least or not arm.covers(hole.representative_point()))
+
+
+def polygons_of(geometry: Geometry) -> list[Polygon]:
+    """Return the polygons of a geometry, without points and lines."""
+    import shapely
+
+    return [p for p in shapely.get_parts(geometry) if p.geom_type == "Polygon" and p.area > 0.0]
+
+
+SAMPLES = 5  # points of the raster in a cell
+MOST = 1_500_000  # points of a raster
+MARGIN = 4  # points beyond the arm on every side
+# Width of the Gaussian, in cells, that turns the steps of a projected design into slopes. A strut
+# of one cell keeps 0.595 of its density in its middle; from 0.75 on it would fall below one half.
+BLUR = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """A smooth field on a grid of points that covers an arm.
+
+    Attributes:
+        x: (nx,) m.
+        y: (ny,) m; symmetric about 0 where the arm is.
+        values: (ny, nx).
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    values: np.ndarray
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring points, m."""
+        return float(max(self.x[1] - self.x[0], self.y[1] - self.y[0]))
+
+    def above(self, level: float) -> Geometry:
+        """Return the polygons in which the field, linear between its points, exceeds a level."""
+        import shapely
+        from contourpy import FillType, contour_generator
+
+        generator = contour_generator(
+            self.x, self.y, self.values, fill_type=FillType.OuterOffset, name="serial"
+        )
+        polygons = []
+        filled: Any = generator.filled(level, np.inf)
+        for points, offsets in zip(filled[0], filled[1]):
+            rings = [points[a:b] for a, b in pairwise(offsets)]
+            polygons.append(shapely.Polygon(rings[0], rings[1:]))
+        return shapely.make_valid(shapely.unary_union(polygons))
+
+
+def rasterise(domain: Domain) -> Raster:
+    """Return the arm's `field` as a smooth function.
+
+    On a grid of cells a cubic spline through their values, on others the piecewise cubic, once
+    differentiable interpolant of Clough and Tocher; no slope across the arm's outline, as with the
+    filter. A design that leaps from cell to cell is blurred by a Gaussian of `BLUR` cells.
+    """
+    low, high = domain.corners.min(axis=(0, 1)), domain.corners.max(axis=(0, 1))
+    if domain.symmetric:
+        high[1] = max(high[1], -low[1])
+        low[1] = -high[1]
+    step = max(domain.cell / SAMPLES, float(np.sqrt(np.prod(high - low) / MOST)))
+    counts = np.ceil((high - low) / step).astype(int)
+    size = (high - low) / counts
+    x, y = (
+        low[k] + size[k] * np.arange(-MARGIN, counts[k] + MARGIN + 1, dtype=float) for k in (0, 1)
+    )
+    if domain.symmetric:
+        y = 0.5 * (y - y[::-1])
+    values = _on_grid(domain, x, y) if domain.grid is not None else _scattered(domain, x, y)
+    if domain.crisp:
+        from scipy.ndimage import gaussian_filter
+
+        values = gaussian_filter(values, BLUR * domain.cell / size[::-1], mode="nearest")
+    if domain.symmetric:
+        values = 0.5 * (values + values[::-1])
+    return Raster(x, y, values)
+
+
+def _on_grid(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    from scipy.interpolate import RectBivariateSpline
+
+    assert domain.grid is not None
+    low, high = domain.corners.min(axis=(0, 1)), domain.corners.max(axis=(0, 1))
+    size = (high - low) / domain.grid
+    column, row = np.floor((domain.centroid - low) / size).astype(int).T
+    table = np.empty(domain.grid)
+    table[column, row] = domain.field
+    pad = 3
+    along, across = (
+        low[k] + size[k] * (np.arange(-pad, domain.grid[k] + pad) + 0.5) for k in (0, 1)
+    )
+    spline = RectBivariateSpline(along, across, np.pad(table, pad, mode="symmetric"))
+    return spline(x, y).T
+
+
+def _scattered(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    from scipy.interpolate import CloughTocher2DInterpolator, NearestNDInterpolator
+
+    cell = domain.rim_cells
+    a, b = domain.rim[:, 0], domain.rim[:, 1]
+    normal = np.stack([b[:, 1] - a[:, 1], a[:, 0] - b[:, 0]], axis=1)
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    depth = ((a - domain.centroid[cell]) * normal).sum(axis=1)
+    images = domain.centroid[cell] + 2.0 * depth[:, None] * normal
+    points = np.vstack([domain.centroid, images])
+    values = np.append(domain.field, domain.field[cell])
+    grid = np.stack(np.meshgrid(x, y), axis=-1)
+    found = CloughTocher2DInterpolator(points, values, rescale=False)(grid)
+    outside = np.isnan(found)
+    found[outside] = NearestNDInterpolator(points, values)(grid[outside])
+    return found
+
+
+AREA = 1e-4  # relative: up to which the level is sought
+LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leaves at one level
+CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
+STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
+ROUGH = 0.01  # the same while a level is looked for roughly, cells
+TOOL = 0.2  # default radius of the tool, cells
+# Material along an interface that the design leaves void, in cells: the interface is rigid.
+STRIP = 0.5
+# Width of members that the design has and the level has not, in cells: solid cells that share a
+# corner are joined in the finite elements.
+LINK = 0.5
+UNIFORM = 1e-3  # range of a density without outline
+PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
+NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
+# Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
+# one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
+CHECKERED, FEW = 0.4, 100
+# Corners are rounded by the tool's radius and so many tolerances: curves may turn a little sharper.
+ROUNDING = 8.0
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """The polygon of a part and how it was found.
+
+    Attributes:
+        domain: the arm.
+        polygon: shapely's, m; with sides on the arm's own curves where it touches them.
+        level: of the field.
+        offset: by which the outline was moved outwards, m; 0 where the level alone would do.
+        tool_radius: m.
+        rounding: radius of its concave corners, m.
+        chord: distance of its sides from the arm's own curves, m.
+        islands, islands_area: number of pieces that join no interface and were dropped; m2.
+        filled: number of holes narrower than the tool, closed.
+    """
+
+    domain: Domain
+    polygon: Polygon
+    level: float
+    offset: float
+    tool_radius: float
+    rounding: float
+    chord: float
+    islands: int
+    islands_area: float
+    filled: int
+
+    @property
+    def area(self) -> float:
+        """Area within the polygon, m2."""
+        return float(self.polygon.area)
+
+
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """What all levels have in common, as shapely's geometries.
+
+    Attributes:
+        arm: where material may be.
+        stays: where it must be.
+        links: along which the design hangs together.
+        inboard, outboard: lines of the interfaces.
+    """
+
+    arm: Geometry
+    stays: Geometry
+    links: Geometry
+    inboard: Geometry
+    outboard: Geometry
+
+
+def default_tool(domain: Domain) -> float:
+    """Return the tool's radius where none is asked for, m."""
+    return TOOL * domain.cell
+
+
+def draw_outline(
+    domain: Domain, tool_radius: float, tolerance: float, rounding: float | None = None
+) -> Outline:
+    """Find the outline whose area is the material's volume over the thickness.
+
+    Args:
+        domain: the arm.
+        tool_radius: of every concave corner, m.
+        tolerance: of the part, m; the polygon is far closer to the arm's own curves.
+        rounding: radius of the polygon's concave corners, m; by default so much more than the
+            tool's that curves within the tolerance can hardly turn sharper than it.
+
+    Raises:
+        InputError: the tool does not fit into the arm; the design is a checkerboard; no material
+            joins the interfaces; what must stay solid is more than the volume.
+    """
+    where = f"arm {domain.name!r}"
+    if 2.0 * tool_radius >= domain.height:
+        raise InputError(
+            f"--tool-radius = {tool_radius:g} m: the tool is as wide as {where}, which is "
+            f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
+        )
+    solid = int((domain.x_phys > 0.5).sum())
+    if domain.contacts > max(CHECKERED * solid, FEW):
+        raise InputError(
+            f"{where}: its {solid} solid cells touch each other in {domain.contacts} corners: a "
+            "checkerboard has no outline; give design.filter_radius the length of two cells or more"
+        )
+    radius = tool_radius + ROUNDING * tolerance if rounding is None else rounding
+    radius = 0.0 if tool_radius == 0.0 else radius
+    given = _given(domain, CHORD * tolerance)
+    raster = rasterise(domain)
+    target = domain.volume
+    if given.stays.area > target * (1.0 + AREA):
+        raise InputError(
+            f"{where}: what stays solid has {1e6 * given.stays.area:.6g} mm2, the design "
+            f"{1e6 * target:.6g} mm2; shorten arms.passive or raise design.volume_fraction"
+        )
+
+    if target > given.arm.area * (1.0 - AREA):
+        polygon = max(polygons_of(given.arm), key=lambda p: p.area)
+        return Outline(domain, polygon, 0.0, 0.0, tool_radius, radius, CHORD * tolerance, 0, 0.0, 0)
+    if float(np.ptp(domain.field)) < UNIFORM:
+        raise InputError(
+            f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
+            "optimise it first"
+        )
+
+    def at(level: float, offset: float = 0.0) -> Outline:
+        return _at(domain, given, raster, level, offset, radius, CHORD * tolerance)
+
+    found = _at_level(at, lambda level: _rough(given, raster, domain, level), domain, raster)
+    if _off(found) > LEAP:  # a large piece joins or leaves: move the outline itself
+        found = _at_offset(at, found)
+    if _off(found) > LEAP:
+        raise InputError(
+            f"{where}: the material of the design does not hang together: at no level has the "
+            "piece that joins both interfaces the design's volume; let the optimisation go on "
+            "until the design is crisp (design.projection)"
+        )
+    return replace(found, tool_radius=tool_radius, rounding=radius)
+
+
+def _given(domain: Domain, chord: float) -> _Given:
+    import shapely
+
+    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
+    interfaces = {}
+    for label in (INBOARD, OUTBOARD):
+        curves = [edge.curve for edge in domain.outline.edges if edge.label == label]
+        interfaces[label] = shapely.union_all(
+            [shapely.LineString(np.vstack([sampled([c], chord), c.end])) for c in curves]
+        )
+    strips = [one.buffer(STRIP * domain.cell) for one in interfaces.values()]
+    stays = shapely.union_all([domain.solid.area_inside(chord), *strips]).intersection(arm)
+    links = shapely.MultiLineString(list(domain.links)).buffer(
+        0.5 * LINK * domain.cell, quad_segs=4
+    )
+    return _Given(arm, stays, links.intersection(arm), interfaces[INBOARD], interfaces[OUTBOARD])
+
+
+def _material(
+    given: _Given, raster: Raster, level: float, offset: float, straight: float
+) -> Geometry:
+    """Return what is solid at a level, before a tool has been there.
+
+    Args:
+        given, raster: of the arm.
+        level: of the field.
+        offset: by which its outline is moved outwards, m.
+        straight: distance from the outline of corners that are left out, m.
+    """
+    import shapely
+
+    above = shapely.simplify(raster.above(level), straight)
+    if offset:
+        above = above.buffer(offset, quad_segs=QUADRANT)
+    return shapely.union_all([above.intersection(given.arm), given.stays, given.links])
+
+
+def _at(
+    domain: Domain,
+    given: _Given,
+    raster: Raster,
+    level: float,
+    offset: float,
+    tool: float,
+    chord: float,
+) -> Outline:
+    """Return the outline at a level, moved outwards by an offset, m."""
+    import shapely
+
+    whole = _material(given, raster, level, offset, STRAIGHT * chord / CHORD)
+    before = polygons_of(whole)
+    if tool > 0.0:
+        whole = rounded(whole, tool, chord).intersection(given.arm)
+    whole = without_necks(whole, NECK * chord / CHORD, chord)
+    parts = polygons_of(whole)
+    near = 1e-6 * domain.extent
+    kept = [p for p in parts if all(p.distance(i) < near for i in (given.inboard, given.outboard))]
+    main = max(kept, key=lambda p: p.area) if kept else shapely.Polygon()
+    pinhole = 0.25 * np.pi * (PINHOLE * domain.cell) ** 2
+    holes = [ring for ring in main.interiors if is_kept(ring, given.arm, pinhole)]
+    dropped = [p for p in parts if p is not main]
+    closed = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in dropped)
+    return Outline(
+        domain=domain,
+        polygon=shapely.Polygon(main.exterior, holes) if kept else main,
+        level=level,
+        offset=offset,
+        tool_radius=tool,
+        rounding=tool,
+        chord=chord,
+        islands=len(dropped),
+        islands_area=float(sum(p.area for p in dropped)),
+        filled=max(closed - len(holes), 0),
+    )
+
+
+def _excess(outline: Outline) -> float:
+    """Return by how much the area is above the volume, relative."""
+    return outline.area / outline.domain.volume - 1.0
+
+
+def _off(outline: Outline) -> float:
+    return abs(_excess(outline))
+
+
+def _rough(given: _Given, raster: Raster, domain: Domain, level: float) -> float:
+    """Return by how much the material's area is above the volume, relative."""
+    return _material(given, raster, level, 0.0, ROUGH * domain.cell).area / domain.volume - 1.0
+
+
+def _at_level(
+    at: Callable[[float], Outline],
+    rough: Callable[[float], float],
+    domain: Domain,
+    raster: Raster,
+) -> Outline:
+    """Return the outline of the level at which it has the volume's area.
+
+    Args:
+        at: the outline by the level.
+        rough: its excess by the level, without all that takes time.
+        domain, raster: of the arm.
+    """
+    low, high = float(raster.values.min()), float(raster.values.max())
+    order = np.argsort(-domain.field)
+    filled = np.cumsum(domain.area[order])
+    # Rounding must not make the first void cell of a crisp design the last solid one.
+    last = min(int(np.searchsorted(filled, (1.0 - AREA) * domain.volume)), len(order) - 1)
+    first = domain.field[order[last]]
+    step = 0.02 * (high - low)
+    span = (-high - step, step - low)  # a lower level has more material
+    place, _ = search(
+        lambda number: (number, rough(-number)),
+        lambda tried: tried[1],
+        -float(first),
+        1.0 / (high - low),
+        span,
+        LEAP,
+    )
+    slope = (rough(-place - step) - rough(-place + step)) / (2.0 * step)
+    slope = max(slope, 0.1 / (high - low))
+    return search(lambda number: at(-number), _excess, place, slope, span, AREA)
+
+
+def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline:
+    """Return the outline at the level of `found`, moved so that it has the volume's area."""
+    most = 2.0 * found.domain.cell
+    slope = max(float(found.polygon.length), found.domain.length) / found.domain.volume
+    moved = search(lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), AREA)
+    return min(found, moved, key=_off)
+
+
+WIDTH_STEPS = 11  # of the bisection: to a four thousandth of the height
+STRAIGHT = 1e-4  # distance of corners that are left out, heights
+TIP = 0.05  # area of a piece that counts as a wider part, squares of the width
+
+
+def thinnest_member(outline: Outline) -> float | None:
+    """Return the largest width up to which nothing falls apart when half of it is taken off.
+
+    None where nothing falls apart before the half of the height is gone.
+    """
+    polygon: Any = outline.polygon.simplify(STRAIGHT * outline.domain.height)
+    low, high = 0.0, 0.5 * outline.domain.height
+    if not _falls_apart(polygon, high):
+        return None
+    for _ in range(WIDTH_STEPS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if _falls_apart(polygon, middle) else (middle, high)
+    return low
+
+
+def _falls_apart(polygon: Any, width: float) -> bool:
+    """Return whether a member is thinner: the polygon eroded by half the width has more pieces."""
+    import shapely
+
+    eroded = polygon.buffer(-0.5 * width, quad_segs=4)
+    parts = shapely.get_parts(eroded)
+    large = np.asarray(shapely.area(parts)) > TIP * width * width
+    lost_hole = sum(len(p.interiors) for p in parts) < len(polygon.interiors)
+    return int(large.sum()) != 1 or lost_hole

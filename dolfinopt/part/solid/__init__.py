@@ -1,0 +1,1 @@
+"""Parts of solid arms: surface, mesh, stress."""

@@ -1,0 +1,172 @@
+"""Body-fitted meshes of solid parts: tetrahedra of the part's volume, faces of the arm exact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.geometry import Tetrahedra, tetrahedra_of
+from dolfinopt.part.plane.part import Part
+from dolfinopt.part.solid.part import SolidPart
+from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
+
+COARSER = 1.6  # sides of the cells of the mesh with which the scene's is compared
+# What is tried until a mesh is valid: angles, degrees, from which on there are edges between faces,
+# and sides, of those wanted.
+TRIES = ((40.0, 1.0), (60.0, 1.0), (80.0, 1.0), (40.0, 0.75), (60.0, 0.75), (40.0, 0.5))
+MOST = 10_000  # cells of a part, about
+ACROSS = 3.0  # cells over the smaller of a part's height and thickness, at least
+IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
+NEAR = 1e-6  # of a cell: distance of points from the arm's faces up to which they lie on them
+LEAST = 1e-3  # shape of the worst cell, of a valid mesh
+SAME_VOLUME = 1e-4  # relative, of a mesh that is taken to the part
+ROUNDS = 10  # of holding points whose cells a correction of the volume would spoil
+APART = 1e-6  # relative, of a mesh's volume to the part's
+
+
+@dataclass(frozen=True, eq=False)
+class SolidMeshes:
+    """Meshes of solid parts by their place among the arms.
+
+    Attributes:
+        coarse: to tell by how much figures depend on the mesh.
+        fine: those of the parts' scene, cells about as large as the design's.
+    """
+
+    coarse: Mapping[int, Tetrahedra]
+    fine: Mapping[int, Tetrahedra]
+
+
+def mesh_solid_parts(parts: Mapping[int, SolidPart], coarse: bool = True) -> SolidMeshes:
+    """Return the meshes of parts, on this process alone; `coarse` ones if they are wanted.
+
+    Raises:
+        InputError: Gmsh cannot mesh a part.
+    """
+    sizes = {k: mesh_size(part) for k, part in parts.items()}
+    fine = {k: solid_mesh(part, sizes[k]) for k, part in parts.items()}
+    found = {k: solid_mesh(part, COARSER * sizes[k]) for k, part in parts.items() if coarse}
+    return SolidMeshes(found, fine)
+
+
+def mesh_size(part: SolidPart) -> float:
+    """Return the wanted side of a part's cells, m: that of a cube as large as the design's cells.
+
+    At most a third of the part's height and thickness, for it may twist; at least so much that
+    there are no more than `MOST`.
+    """
+    cube = float(np.median(part.domain.sizes)) ** (1.0 / 3.0)
+    across = float(np.ptp(part.surface.points, axis=0)[1:].min())
+    least = (IN_CUBE * part.volume / MOST) ** (1.0 / 3.0)
+    return float(max(min(cube, across / ACROSS), least))
+
+
+def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
+    """Mesh a part with tetrahedra of its volume.
+
+    Raises:
+        InputError: Gmsh cannot mesh it.
+    """
+    if part.domain.further:
+        raise InputError(
+            f"arm {part.name!r}: parts with several outboard interfaces (arms.interfaces) are not "
+            "meshed"
+        )
+    if not part.closed:  # Gmsh would end the process
+        raise InputError(f"arm {part.name!r}: its surface is not closed")
+    for angle, share in TRIES:
+        try:
+            if part.flat is None:
+                mesh = _freeform_mesh(part, share * size, np.radians(angle))
+            else:
+                mesh = _plate_mesh(part, part.flat, share * size)
+        except InputError as error:
+            reason = str(error)
+            continue
+        mesh = _of_volume(part, mesh)
+        off = mesh.volumes.sum() / part.volume - 1.0
+        if mesh.quality.min() <= LEAST:
+            reason = "its cells are flat"
+        elif abs(off) > SAME_VOLUME:
+            reason = f"its mesh has {100.0 * off:+.2g} % of its volume more"
+        else:
+            return mesh
+    raise InputError(f"arm {part.name!r}: {reason}")
+
+
+def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
+    domain, surface = part.domain, part.surface
+    centres = surface.corners.mean(axis=1)
+    near = NEAR * domain.cell
+    inboard, outboard = (
+        distance_to_faces(centres, faces) < near for faces in (domain.inboard, domain.outboard)
+    )
+    return tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
+
+
+def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
+    """Return prisms over the triangles of a plate, each cut in three."""
+    from mpi4py import MPI
+
+    from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, gmsh_on_root
+    from dolfinopt.part.plane.mesh import body_mesh
+
+    cell = flat.domain.cell
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        face = body_mesh(gmsh, flat.shape, cell, size / cell)
+    thickness = flat.domain.thickness
+    layers = max(1, round(thickness / size))
+    count = len(face.points)
+    heights = np.linspace(-0.5 * thickness, 0.5 * thickness, layers + 1)
+    points = np.concatenate([np.column_stack([face.points, np.full(count, z)]) for z in heights])
+    # Corners in ascending order: neighbours cut their common side along the same diagonal.
+    a, b, c = np.sort(face.triangles, axis=1).T
+    prism = np.stack(
+        [
+            np.stack([a, b, c, c + count], axis=1),
+            np.stack([a, b, b + count, c + count], axis=1),
+            np.stack([a, a + count, b + count, c + count], axis=1),
+        ],
+        axis=1,
+    ).reshape(-1, 4)
+    cells = np.concatenate([prism + layer * count for layer in range(layers)])
+    ends = [np.sort(face.sides[face.labelled(NAMES[g])], axis=1) for g in (INBOARD, OUTBOARD)]
+    walls = []
+    for sides in ends:
+        a, b = sides.T
+        wall = np.concatenate(
+            [np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)]
+        )
+        walls.append(np.concatenate([wall + layer * count for layer in range(layers)]))
+    mesh = Tetrahedra(points, cells, walls[0], walls[1])
+    turned = mesh.volumes < 0.0
+    cells[turned] = cells[turned][:, [0, 1, 3, 2]]
+    return mesh
+
+
+def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
+    """Return a mesh whose points within the arm are moved a little, so that it has the volume.
+
+    Flat facets cut off what is round. Points of cells that the move would spoil stay where they
+    are, and the others make up for them.
+    """
+    wanted = part.volume
+    if abs(mesh.volumes.sum() - wanted) <= APART * wanted:
+        return mesh
+    facets, domain = mesh.boundary, part.domain
+    free = np.zeros(len(mesh.points), dtype=bool)
+    free[facets] = True
+    faces = np.concatenate([domain.own, domain.kept])
+    rim = np.flatnonzero(free)
+    free[rim] = distance_to_faces(mesh.points[rim], faces) > NEAR * domain.cell
+    for _ in range(ROUNDS):
+        moved = with_volume(Surface(mesh.points, facets), free, wanted)
+        found = replace(mesh, points=moved.points)
+        spoilt = (found.quality <= LEAST) & (found.quality < mesh.quality)
+        if not spoilt.any():
+            return found
+        free[mesh.cells[spoilt]] = False
+    return mesh

@@ -1,0 +1,369 @@
+"""How wide the thinnest member and the narrowest gap of a solid part are, on a raster of voxels.
+
+From the density of a solid arm to its part: a closed surface, smooth, of the same volume.
+
+A design that is the same over the thickness is a plate: its part is that of the plane, extruded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.density.members import WIDE, narrowest, voxel_size, widest
+from dolfinopt.errors import InputError
+from dolfinopt.part.files.triangles import extruded_facets
+from dolfinopt.part.plane.curves import Shape
+from dolfinopt.part.plane.part import Part, check_options, make_part
+from dolfinopt.part.solid.domain import SolidDomain, read_solid_domains
+from dolfinopt.part.solid.surface import (
+    WHOLE,
+    Surface,
+    at_volume,
+    crossings,
+    outside,
+    smooth_surface,
+    with_volume,
+)
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.part.solid.domain import SolidDomain
+
+
+OPEN = 2.0  # cells around the arm that count as void
+
+
+@dataclass(frozen=True)
+class Widths:
+    """What is narrowest in a part.
+
+    Attributes:
+        member: width of its thinnest member, m; None where nothing is thin.
+        gap: of its narrowest gap, hole or cavity, m; None without one.
+        to: accuracy of both, m.
+    """
+
+    member: float | None
+    gap: float | None
+    to: float
+
+
+def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
+    """Return the narrowest member and gap of the part of a solid arm."""
+    h = voxel_size(domain.cell, np.ptp(surface.points, axis=0))
+    solid = rasterised(surface, h, int(np.ceil(OPEN * domain.cell / h)))
+    inner = _cropped(solid)
+    member, _ = narrowest(inner, h) or widest(inner, h)
+    asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
+    gap = narrowest(~solid, h, WIDE * asked)
+    return Widths(member, None if gap is None else gap[0], h)
+
+
+def rasterised(surface: Surface, h: float, margin: int) -> np.ndarray:
+    """Return which voxels (nx, ny, nz) of side h have their centres in a closed surface.
+
+    Args:
+        surface: m.
+        h: m.
+        margin: number of void voxels around it.
+    """
+    import pyvista
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
+
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    inner = np.maximum(np.ceil((high - low) / h - 1e-9), 1.0)
+    first = 0.5 * (low + high) - 0.5 * h * (inner - 1.0) - margin * h
+    counts = inner.astype(int) + 2 * margin
+    stencil: Any = vtkPolyDataToImageStencil()
+    stencil.SetInputData(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
+    stencil.SetOutputOrigin(*first)
+    stencil.SetOutputSpacing(h, h, h)
+    stencil.SetOutputWholeExtent(0, counts[0] - 1, 0, counts[1] - 1, 0, counts[2] - 1)
+    image: Any = vtkImageStencilToImage()
+    image.SetInputConnection(stencil.GetOutputPort())
+    image.SetInsideValue(1)
+    image.SetOutsideValue(0)
+    image.SetOutputScalarTypeToUnsignedChar()
+    image.Update()
+    flat = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
+    return np.asarray(flat.reshape(counts[::-1]).transpose(2, 1, 0) > 0)
+
+
+def _cropped(solid: np.ndarray) -> np.ndarray:
+    """Return the box of all that is solid with a layer of void around it."""
+    found = solid
+    for axis in range(3):
+        others = tuple(k for k in range(3) if k != axis)
+        place = np.flatnonzero(solid.any(axis=others))
+        found = np.take(found, np.arange(place[0], place[-1] + 1), axis=axis)
+    return np.pad(found, 1)
+
+
+SAME_VOLUME = 1e-4  # relative, of the part to the design
+FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
+HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
+GRAY = 0.02  # grayness from which on a design is no longer close to any part
+ROUNDS = 8  # of taking smoothing back where the surface would cross itself
+LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
+NARROW = 0.9  # of the width asked for, below which a member or gap is told
+
+
+@dataclass(frozen=True, eq=False)
+class SolidPart:
+    """The part of one solid arm.
+
+    Attributes:
+        domain: the arm and its design.
+        surface: of the part, in the arm's frame, m.
+        level: density at which the isosurface, or the outline, lies.
+        distance: furthest that a point was moved from the isosurface, or curves from the outline,
+            m.
+        pieces: number of pieces left out because they do not join both interfaces.
+        pieces_volume: their volume, m3.
+        flat: the part in the plane that it is extruded from; None of others.
+    """
+
+    domain: SolidDomain
+    surface: Surface
+    level: float
+    distance: float
+    pieces: int
+    pieces_volume: float
+    flat: Part | None = None
+
+    @property
+    def name(self) -> str:
+        """The arm's name."""
+        return self.domain.name
+
+    @cached_property
+    def widths(self) -> Widths:
+        """Of its thinnest member and its narrowest gap; of plates of the member alone."""
+        if self.flat is None:
+            return measured_widths(self.domain, self.surface)
+        return Widths(self.flat.thinnest, None, self.flat.tolerance)
+
+    @property
+    def volume(self) -> float:
+        """Of the part, m3; of an extruded one that within its curves."""
+        if self.flat is None:
+            return self.surface.volume
+        return self.flat.shape.area * self.flat.domain.thickness
+
+    @property
+    def watertight(self) -> bool:
+        """Whether the surface is closed and does not cross itself."""
+        return self.closed and self.crossings == 0
+
+    @cached_property
+    def crossings(self) -> int:
+        """Number of pairs of triangles that cross; none of plates, whose outline is checked."""
+        return len(crossings(self.surface)) if self.flat is None else 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether every edge has two triangles, which run along it in opposite directions."""
+        corners = self.surface.triangles
+        edges = np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+        count = len(self.surface.points)
+        there, back = (np.sort(edges @ row) for row in ([count, 1], [1, count]))
+        return bool((np.diff(there) > 0).all() and np.array_equal(there, back))
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the workshop or the designer should know, a sentence each."""
+        one, found = self.domain, []
+        if one.grayness > GRAY:
+            found.append(
+                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
+                "the material is in cells that are neither solid nor void; the part is another "
+                'design than the optimised one; optimise with design.projection = "robust"'
+            )
+        if self.pieces:
+            pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
+            share = 100.0 * self.pieces_volume / one.volume
+            found.append(
+                f"arm {one.name!r}: {pieces} without a joint to both interfaces "
+                f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
+            )
+        if not self.closed:
+            found.append(f"arm {one.name!r}: its surface is not closed; repair it")
+        if self.crossings:
+            found.append(
+                f"arm {one.name!r}: its surface crosses itself in {self.crossings} pairs of "
+                "triangles; repair it"
+            )
+        return found + self._narrow()
+
+    def _narrow(self) -> list[str]:
+        """Return what is said of members and gaps narrower than asked for, or than the filter."""
+        one = self.domain
+        found: dict[str, list[str]] = {}
+        for name, width, asked, key in (
+            ("thinnest member", self.widths.member, one.minimum_member, "design.minimum_member"),
+            ("narrowest gap", self.widths.gap, one.minimum_gap, "design.minimum_gap"),
+        ):
+            limit = f"{key}, {1e3 * asked:.3g} mm"
+            if asked == 0.0:
+                asked = one.filter_radius
+                limit = f"the filter's radius, {1e3 * asked:.3g} mm"
+            if width is not None and width < NARROW * asked:
+                found.setdefault(limit, []).append(f"its {name} is {1e3 * width:.2g} mm wide")
+        return [
+            f"arm {one.name!r}: {' and '.join(words)}, below {limit}"
+            for limit, words in found.items()
+        ]
+
+    def figures(self, density: float) -> dict[str, Any]:
+        """Return the entry of part.json.
+
+        Args:
+            density: of the material, kg/m3.
+        """
+        return {
+            "volume": self.volume,
+            "mass": density * self.volume,
+            "design_volume": self.domain.volume,
+            "level": self.level,
+            "distance": self.distance,
+            "triangles": len(self.surface.triangles),
+            "watertight": self.watertight,
+            "extruded": self.flat is not None,
+            "thinnest_member": self.widths.member,
+            "narrowest_gap": self.widths.gap,
+            "widths_to": self.widths.to,
+            "filter_radius": self.domain.filter_radius,
+            "pieces_left_out": self.pieces,
+            "grayness": self.domain.grayness,
+            "warnings": self.warnings,
+        }
+
+
+def make_solid_parts(
+    scene: Scene,
+    folder: Path,
+    world: MPI.Comm,
+    tool_radius: float | None = None,
+    tolerance: float | None = None,
+    arcs: bool = False,
+) -> dict[int, SolidPart]:
+    """Make the parts of the solid arms that have a design of their own (collective).
+
+    Args:
+        scene: of the run.
+        folder: with its design.npz.
+        world: the ranks that share the arms.
+        tool_radius, tolerance, arcs: of designs that are the same over the thickness, see
+            `part.make_parts`.
+
+    Returns:
+        Parts by their place among the arms, on the root; none elsewhere.
+
+    Raises:
+        InputError: no design in the folder, or no part can be made of it; on all ranks.
+    """
+    from dolfinopt.parallel import on_root, together
+
+    on_root(world, check_options, folder, tool_radius, tolerance)
+    domains = read_solid_domains(scene, folder, world)
+    curved = arcs or tool_radius is not None or tolerance is not None
+    with together(world):
+        for one in domains.values():
+            if curved and one.flat is None:
+                raise InputError(
+                    f"arm {one.name!r}: its design varies over the thickness, so that its part "
+                    "has no curves: leave out --tool-radius, --tolerance and --curves, or "
+                    "optimise with arms.extruded = true"
+                )
+        mine = {k: make_solid_part(one, tool_radius, tolerance, arcs) for k, one in domains.items()}
+    found: dict[int, SolidPart] = {}
+    for pieces in world.gather(mine, root=0) or ():
+        found.update(pieces)
+    return {k: found[k] for k in sorted(found)}
+
+
+def make_solid_part(
+    domain: SolidDomain,
+    tool_radius: float | None = None,
+    tolerance: float | None = None,
+    arcs: bool = False,
+) -> SolidPart:
+    """Return the part of one solid arm, see `make_solid_parts`.
+
+    Raises:
+        InputError: it does not hang together, or no level of the density keeps its volume.
+    """
+    if domain.flat is None:
+        return _freeform_part(domain)
+    part = make_part(domain.flat, tool_radius, tolerance, arcs)
+    outline, t = part.outline, domain.flat.thickness
+    surface = _prism(part.shape, t, 0.5 * part.tolerance)
+    lost = t * outline.islands_area
+    far = part.shape.distance
+    return SolidPart(domain, surface, outline.level, far, outline.islands, lost, part)
+
+
+def _prism(shape: Shape, thickness: float, tolerance: float) -> Surface:
+    """Return the surface of a shape extruded to both sides of z = 0, chords within a tolerance."""
+    corners = extruded_facets(shape.polygons(tolerance), thickness).reshape(-1, 3)
+    points, which = np.unique(corners, axis=0, return_inverse=True)
+    return Surface(points - np.array([0.0, 0.0, 0.5 * thickness]), which.reshape(-1, 3))
+
+
+def _freeform_part(domain: SolidDomain) -> SolidPart:
+    level, solid, pieces, lost = at_volume(domain)
+    surface, values = outside(solid)
+    # Material ends within the arm where all corners of a triangle lie at the level.
+    at_level = np.abs(values["density"] - level) < 1e-9
+    inner = at_level[surface.triangles].all(axis=1)
+    free = at_level & (values["own"] < WHOLE) & (values["stays"] < HELD)
+    free[surface.triangles[~inner]] = False
+    walls = [domain.own, domain.kept]
+    smooth = smooth_surface(surface, inner, free, domain.cell, np.concatenate(walls), domain.crisp)
+    found = _uncrossed(surface, smooth, free, domain.volume)
+    distance = float(np.linalg.norm(found.points - surface.points, axis=1).max())
+    if abs(found.volume - domain.volume) > SAME_VOLUME * domain.volume or (
+        distance > FURTHEST * domain.cell
+    ):
+        raise InputError(
+            f"arm {domain.name!r}: no level of its density keeps its volume, "
+            f"{1e9 * domain.volume:.6g} mm3, and joins both interfaces: the nearest, {level:.3g}, "
+            f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
+            'longer, or with design.projection = "robust"'
+        )
+    return SolidPart(domain, found, level, distance, pieces, lost)
+
+
+def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
+    """Return the smoothed surface with a volume, less smooth where it would cross itself.
+
+    The isosurface does not cross itself. Points of triangles that do go back towards it by halves,
+    those beside them with them, and all the way at last; the others make up for the volume.
+
+    Args:
+        surface: the isosurface.
+        smooth: the same, smoothed.
+        free: (n,) True of points that move.
+        volume: that is wanted, m3.
+    """
+    share = np.ones(len(surface.points))
+    move = smooth.points - surface.points
+    for _ in range(ROUNDS):
+        now = replace(surface, points=surface.points + share[:, None] * move)
+        found = with_volume(now, free & (share > 0.0), volume)
+        crossed = crossings(found)
+        if not len(crossed):
+            break
+        near = np.zeros(len(share), dtype=bool)
+        near[surface.triangles[crossed]] = True
+        near[surface.triangles[near[surface.triangles].any(axis=1)]] = True
+        share = np.where(near, np.where(share > LEAST_SHARE, 0.5 * share, 0.0), share)
+    return found

@@ -1,0 +1,616 @@
+"""The surface of a solid's design: where its density passes the level that keeps its volume.
+
+Densities of cells are averaged to their nodes, by the cells' volumes. The cells are cut at the
+level; where the density is above it the solid's own faces stay, interfaces among them.
+
+Smoothing of a solid's surface without shrinkage, a correction of its volume, crossings.
+
+Smoothed is where material ends within the arm, by VTK's windowed sinc: Taubin, Zhang & Golub,
+Optimal surface smoothing as filter design, ECCV 1996, doi:10.1007/BFb0015544. Points on the arm's
+own faces, interfaces among them, do not move.
+
+The level of a solid's density that keeps its volume, and what above it joins both interfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.part.solid.domain import SolidDomain
+
+HALVINGS = 40  # of the interval in which the level lies
+BELOW = 0.98  # the highest level, over the highest density
+APART = 0.005  # least difference of a node's density from the level
+SAME_VOLUME = 1e-3  # relative, of the surface to the design
+CLOSE = 0.01  # likewise, beyond which there is no surface: volumes leap at plateaus of the density
+# Corners of a hexahedron, from a tensor product's order to VTK's.
+AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+
+MIRRORED = {4: [0, 2, 1, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3]}
+MIRRORED[27] = [*range(18, 27), *range(9, 18), *range(9)]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A closed surface of triangles.
+
+    Attributes:
+        points: (n, 3) m.
+        triangles: (m, 3) indices of corners, counterclockwise seen from outside.
+        cells: (m,) index of the cell behind every triangle, if it was cut from cells.
+        fields: (n, ...) values at the points, by name.
+    """
+
+    points: np.ndarray
+    triangles: np.ndarray
+    cells: np.ndarray | None = None
+    fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners (m, 3, 3) of the triangles, m."""
+        return np.asarray(self.points[self.triangles])
+
+    @property
+    def volume(self) -> float:
+        """Volume within, m3."""
+        a, b, c = self.corners.swapaxes(0, 1)
+        return float(np.einsum("na,na->", a, np.cross(b, c)) / 6.0)
+
+
+def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
+    """Return the surface of a solid's design, in the cells' frame.
+
+    Args:
+        corners: (n, 4 or 8, 3) of the tetrahedra or hexahedra in any order, m; common ones are
+            the same to the last bit.
+        density: (n,) of the same cells.
+
+    Raises:
+        InputError: no level of the density encloses the design's volume: it is too grey.
+    """
+    points, nodes, values = nodal_densities(corners, density)
+    volume = float(cell_volumes(corners) @ density)
+    above, below = 0.0, BELOW * float(values.max())  # levels that enclose too much and too little
+    for _ in range(HALVINGS):
+        level = 0.5 * (above + below)
+        surface = _cut(points, nodes, values, level)
+        if abs(surface.volume - volume) <= SAME_VOLUME * volume:
+            break
+        above, below = (level, below) if surface.volume > volume else (above, level)
+    if abs(surface.volume - volume) > CLOSE * volume:
+        raise InputError(
+            f"no level of its density encloses its volume, {1e9 * volume:.4g} mm3: the nearest, "
+            f"{level:.3g}, encloses {1e9 * surface.volume:.4g} mm3; the design is too grey for a "
+            'surface; optimise longer, or with design.projection = "robust"'
+        )
+    return surface
+
+
+def surface_at(
+    corners: np.ndarray,
+    density: np.ndarray,
+    level: float,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> Surface:
+    """Return the surface of what is denser than a level, in the cells' frame; it may be empty.
+
+    Args:
+        corners, density: as for `design_surface`.
+        level: of the density.
+        fields: (n, 4 or 8, ...) values at the same corners, to be carried to the surface's points.
+    """
+    points, nodes, values = nodal_densities(corners, density)
+    if values.max() <= level - APART:
+        empty = np.zeros((0, 3))
+        return Surface(empty, empty.astype(int), np.zeros(0, dtype=int))
+    at_nodes = {}
+    for name, at_corners in (fields or {}).items():
+        at_nodes[name] = np.empty((len(points), *at_corners.shape[2:]))
+        at_nodes[name][_numbers(corners)[1]] = at_corners
+    return _cut(points, nodes, values, level, at_nodes)
+
+
+def _numbers(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (n, 3) of cells, and the cells' nodes in the order of their corners."""
+    points, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return points, nodes.reshape(corners.shape[:2])
+
+
+def nodal_densities(
+    corners: np.ndarray, density: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points (n, 3), nodes of right-handed cells, and the densities (n,) at the points.
+
+    Args:
+        corners, density: as for `design_surface`.
+    """
+    points, nodes = _numbers(corners)
+    nodes = _right_handed(corners, nodes)
+    sizes = cell_volumes(corners)
+    weight, total = np.zeros((2, len(points)))
+    for node in nodes.T:
+        np.add.at(weight, node, sizes)
+        np.add.at(total, node, sizes * density)
+    return points, nodes, total / weight
+
+
+def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `nodal_densities` does of hexahedra cut in eight, 27 points in each.
+
+    At a cell's centre its own density counts alone: a member as thick as one cell stays so.
+
+    Args:
+        corners: (n, 8, 3) m, common ones the same to the last bit.
+        density: (n,) of the cells.
+
+    Returns:
+        Points (m, 3); nodes (n, 27) of every cell as a tensor product; densities (m,).
+    """
+    grid = corners.reshape(-1, 2, 2, 2, 3)
+    for axis in (1, 2, 3):
+        first, last = np.split(grid, 2, axis=axis)
+        # Sums of the same two numbers, whichever comes first: halves of common edges are common.
+        grid = np.concatenate([first, 0.5 * (first + last), last], axis=axis)
+    for axis in (1, 2, 3):
+        _centre_faces(grid, corners, axis)
+    points, nodes = _numbers(grid.reshape(-1, 27, 3))
+    nodes = np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[27]], nodes)
+    sizes = cell_volumes(corners)
+    weight, total = (
+        np.bincount(nodes.ravel(), np.repeat(one, 27), len(points))
+        for one in (sizes, sizes * density)
+    )
+    return points, nodes, total / weight
+
+
+def middles(faces: np.ndarray) -> np.ndarray:
+    """Return the nine points (n, 9, 3) of `halved` on faces (n, 4, 3), corners around them, m."""
+    a, b, c, d = faces.swapaxes(0, 1)
+    ends = [0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + d), 0.5 * (d + a)]
+    return np.stack([a, b, c, d, *ends, 0.25 * ((a + c) + (b + d))], axis=1)
+
+
+def eighths(nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (8 n, 8) of the cells that `halved` made of nodes (n, 27)."""
+    grid = nodes.reshape(-1, 3, 3, 3)
+    parts = [
+        grid[:, z : z + 2, y : y + 2, x : x + 2].reshape(-1, 8)
+        for z in (0, 1) for y in (0, 1) for x in (0, 1)
+    ]  # fmt: skip
+    return np.stack(parts, axis=1).reshape(-1, 8)
+
+
+def forty_eighths(nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (48 n, 4) of the tetrahedra that `halved` can be cut in, from (n, 27).
+
+    Each has the centre of the cell, of a face, of an edge, and a corner. Neighbours cut a face they
+    share alike, however they are turned, as VTK's ways to clip hexahedra do not.
+    """
+    return nodes[:, FORTY_EIGHTHS].reshape(-1, 4)
+
+
+def _forty_eighths() -> np.ndarray:
+    """Return the rows (48, 4) of `forty_eighths`, of positive volume."""
+    places = np.array([[x, y, z] for z in (0, 1, 2) for y in (0, 1, 2) for x in (0, 1, 2)])
+    found = []
+    odd = (places != 1).sum(axis=1)  # of a corner 3, of an edge 2, of a face 1, of the centre 0
+    for face in np.flatnonzero(odd == 1):
+        for edge in np.flatnonzero(odd == 2):
+            for corner in np.flatnonzero(odd == 3):
+                steps = places[[face, edge, corner]] - 1
+                if ((steps[0] == 0) | (steps[0] == steps[1])).all() and (
+                    (steps[1] == 0) | (steps[1] == steps[2])
+                ).all():
+                    turned = np.linalg.det(steps) < 0.0
+                    found.append([13, face, *((corner, edge) if turned else (edge, corner))])
+    return np.array(found)
+
+
+FORTY_EIGHTHS = _forty_eighths()
+
+
+def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
+    """Put the centres of the faces across an axis where both of their cells have them."""
+    cube = corners.reshape(-1, 2, 2, 2, 3)
+    for place, side in ((0, 0), (2, 1)):
+        face = np.take(cube, side, axis=axis)
+        middle = 0.25 * ((face[:, 0, 0] + face[:, 1, 1]) + (face[:, 0, 1] + face[:, 1, 0]))
+        at: list[slice | int] = [slice(None), 1, 1, 1]
+        at[axis] = place
+        grid[tuple(at)] = middle
+
+
+def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes of cells, those of left-handed ones in another order."""
+    return np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[nodes.shape[1]]], nodes)
+
+
+def _left_handed(corners: np.ndarray) -> np.ndarray:
+    """Tell which cells (n, 4 or 8, 3) are left-handed."""
+    edges = corners[:, [1, 2, 3 if corners.shape[1] == 4 else 4]] - corners[:, :1]
+    return np.asarray(np.linalg.det(edges) < 0.0)
+
+
+def _cut(
+    points: np.ndarray,
+    nodes: np.ndarray,
+    values: np.ndarray,
+    level: float,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> Surface:
+    """Return the surface of what of the cells is above a level."""
+    fields = fields or {}
+    surface, found = outside(cut(points, nodes, values, level, fields))
+    carried = {name: found[name].reshape(-1, *one.shape[1:]) for name, one in fields.items()}
+    return replace(surface, fields=carried)
+
+
+def cut(
+    points: np.ndarray,
+    nodes: np.ndarray,
+    values: np.ndarray,
+    level: float,
+    fields: Mapping[str, np.ndarray] | None = None,
+) -> Any:
+    """Return the grid, of VTK, of what of the cells is above a level, with its nodes' density.
+
+    Args:
+        points, nodes, values: of `nodal_densities`.
+        level: of the density.
+        fields: (n, ...) further values at the nodes that the grid is to have, by their names.
+    """
+    import pyvista
+
+    count = nodes.shape[1]
+    kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
+    grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
+    # Through a node or next to it triangles would have no size, and corners fall together.
+    grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
+    for name, field_values in (fields or {}).items():
+        grid.point_data[name] = field_values.reshape(len(points), -1)
+    grid.cell_data["cell"] = np.arange(len(nodes))
+    return grid.clip_scalar(scalars="density", invert=False, value=level)
+
+
+def outside(solid: Any) -> tuple[Surface, dict[str, np.ndarray]]:
+    """Return the surface of a grid of `cut`, and the values (n, ...) at its points by name."""
+    import pyvista
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    faces = vtkDataSetSurfaceFilter()
+    faces.SetInputData(solid)
+    faces.PassThroughCellIdsOn()
+    faces.Update()
+    found = pyvista.PolyData(faces.GetOutput()).triangulate().clean()
+    triangles = found.faces.reshape(-1, 4)[:, 1:].astype(int)
+    within = solid.cell_centers().points[found.cell_data["vtkOriginalCellIds"]]
+    surface = _outwards(np.asarray(found.points, dtype=float), triangles, within)
+    values = {name: np.asarray(found.point_data[name]) for name in found.point_data}
+    return replace(surface, cells=np.asarray(found.cell_data["cell"])), values
+
+
+def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> Surface:
+    """Return a surface whose triangles turn their backs on points (m, 3) of the cells they bound.
+
+    VTK's own are not all counterclockwise seen from outside in every version. Triangles that share
+    an edge run along it in opposite directions; which way they turn is what most of them say,
+    by the volume to their point: that of a warped cell may be on the wrong side of one of them.
+    """
+    import scipy.sparse as sp
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(triangles)
+    a, b, c = points[triangles].swapaxes(0, 1)
+    outwards = np.einsum("na,na->n", np.cross(b - a, c - a), a - within)
+    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    order = np.lexsort(np.sort(edges, axis=1).T)
+    edges, sides = np.sort(edges, axis=1)[order], order % count
+    forth = (triangles[:, [0, 1, 2]] < triangles[:, [1, 2, 0]]).T.ravel()[order]
+    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
+    one, other, alike = sides[pair], sides[pair + 1], forth[pair] != forth[pair + 1]
+    # Every triangle as it is, 0 ... m - 1, and turned, m ... 2 m - 1: which go together.
+    start, end = np.concatenate([one, one + count]), np.where(alike, other, other + count)
+    end = np.concatenate([end, (end + count) % (2 * count)])
+    links = sp.csr_matrix((np.ones(len(start)), (start, end)), shape=(2 * count, 2 * count))
+    sheet = connected_components(links, directed=False)[1]
+    score = np.bincount(sheet, weights=np.concatenate([outwards, -outwards]))
+    turned = score[sheet[:count]] < score[sheet[count:]]
+    return Surface(points, np.where(turned[:, None], triangles[:, ::-1], triangles))
+
+
+# Of the windowed sinc: steps from cell to cell go, ripples of a smooth field's isosurface.
+PASSES, STEPS, RIPPLES = 40, 0.03, 0.15
+FURTHEST = 0.4  # of a cell that smoothing moves a point
+ROOM = 0.5  # and of its distance from the arm's own faces
+CORRECTIONS, SAME_VOLUME = 20, 1e-9  # Newton's steps; relative
+MANY = 200_000  # pairs of an edge and a triangle that are looked at together
+CANDIDATES = 60  # triangles near an edge, about
+TOUCHES = 1e-9  # of an edge and of a triangle: what only touches does not cross
+
+
+def smooth_surface(
+    surface: Surface,
+    inner: np.ndarray,
+    free: np.ndarray,
+    cell: float,
+    walls: np.ndarray,
+    crisp: bool = True,
+) -> Surface:
+    """Return a surface whose free points are smoothed.
+
+    By 0.4 cells at most, and half of the distance from the arm's own faces: none is passed.
+
+    Args:
+        surface: closed.
+        inner: (m,) True of triangles where material ends within the arm.
+        free: (n,) True of points that move, all of them on inner triangles alone.
+        cell: size of the design's cells, m.
+        walls: (k, 3 or 4, 3) corners of the arm's own faces, around them, m.
+        crisp: whether the surface has the steps of cells.
+    """
+    import pyvista
+
+    if not free.any():
+        return surface
+    patch = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles[inner])
+    smooth = patch.smooth_taubin(
+        n_iter=PASSES,
+        pass_band=STEPS if crisp else RIPPLES,
+        boundary_smoothing=False,
+        feature_smoothing=False,
+        non_manifold_smoothing=False,
+        normalize_coordinates=True,
+    )
+    move = np.asarray(smooth.points, dtype=float) - surface.points
+    room = distance_to_faces(surface.points, walls)
+    most = np.minimum(FURTHEST * cell, ROOM * room)
+    length = np.linalg.norm(move, axis=1)
+    move *= np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
+    return replace(surface, points=surface.points + np.where(free[:, None], move, 0.0))
+
+
+def distance_to_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of points (n, 3) from the nearest of faces (k, 3 or 4, 3), m.
+
+    Args:
+        points: m.
+        faces: corners around flat faces, m.
+    """
+    import pyvista
+
+    corners = faces.reshape(-1, 3)
+    around = np.arange(len(corners), dtype=int).reshape(faces.shape[:2])
+    found = pyvista.PolyData.from_regular_faces(corners, around)
+    _, nearest = found.find_closest_cell(points, return_closest_point=True)
+    return np.asarray(np.linalg.norm(np.asarray(nearest) - points, axis=1))
+
+
+def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:
+    """Return a surface whose free points are moved along their normals until it has a volume.
+
+    All by the same length. Where that does not lead there the volume is not the one wanted.
+
+    Args:
+        surface: closed.
+        free: (n,) True of points that move.
+        volume: that it is to enclose, m3.
+    """
+    points = surface.points
+    for _ in range(CORRECTIONS):
+        now = replace(surface, points=points)
+        lacks = volume - now.volume
+        if abs(lacks) <= SAME_VOLUME * volume:
+            break
+        area = np.where(free[:, None], _area_vectors(now), 0.0)
+        size = np.linalg.norm(area, axis=1)
+        if size.sum() == 0.0:
+            break
+        normal = area / np.maximum(size, 1e-300)[:, None]
+        points = points + lacks / size.sum() * normal
+    return replace(surface, points=points)
+
+
+def _area_vectors(surface: Surface) -> np.ndarray:
+    """Return the derivative (n, 3) of the volume by the points, m2."""
+    a, b, c = surface.corners.swapaxes(0, 1)
+    found = np.zeros_like(surface.points)
+    for corner, across in zip(
+        surface.triangles.T, (np.cross(b, c), np.cross(c, a), np.cross(a, b)), strict=True
+    ):
+        np.add.at(found, corner, across / 6.0)
+    return found
+
+
+def crossings(surface: Surface) -> np.ndarray:
+    """Return pairs (n, 2) of triangles of which an edge of the first passes through the second.
+
+    Edges that have a corner in common with a triangle do not count, and neither does what only
+    touches, as pieces of material that meet in a point.
+    """
+    corners, triangles = surface.corners, surface.triangles
+    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    _, first = np.unique(np.sort(edges, axis=1), axis=0, return_index=True)
+    edges, owners = edges[first], first % len(triangles)
+    start, end = surface.points[edges].swapaxes(0, 1)
+    centres = corners.mean(axis=1)
+    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+    found = []
+    # Triangles in classes of their size, so that a large one does not make all neighbourhoods wide.
+    for low, group in _by_size(radii):
+        tree = cKDTree(centres[group])
+        reach = 0.5 * np.linalg.norm(end - start, axis=1) + 2.0 * low
+        for part in np.array_split(np.arange(len(edges)), max(1, len(edges) * CANDIDATES // MANY)):
+            near = tree.query_ball_point(0.5 * (start + end)[part], reach[part])
+            edge = np.repeat(part, [len(one) for one in near])
+            triangle = group[np.concatenate([*near, []]).astype(int)]
+            apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
+            edge, triangle = edge[apart], triangle[apart]
+            through = _passes(start[edge], end[edge], corners[triangle])
+            found.append(np.column_stack([owners[edge[through]], triangle[through]]))
+    return np.concatenate(found) if found else np.empty((0, 2), dtype=int)
+
+
+def _by_size(radii: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Return groups of triangles with radii between r and 2 r, and r."""
+    classes = np.floor(np.log2(np.maximum(radii, 1e-6 * radii.max())))
+    return [(2.0**one, np.flatnonzero(classes == one)) for one in np.unique(classes)]
+
+
+def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Tell which segments pass through their triangles (n, 3, 3), off all edges and ends.
+
+    Möller & Trumbore (1997), doi:10.1080/10867651.1997.10487468.
+    """
+    along = end - start
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    to = start - corners[:, 0]
+    normal = np.cross(along, second)
+    det = np.einsum("na,na->n", first, normal)
+    size = np.linalg.norm(along, axis=1) * np.linalg.norm(np.cross(first, second), axis=1)
+    flat = np.abs(det) <= TOUCHES * size  # parallel
+    det = np.where(flat, 1.0, det)
+    across = np.cross(to, first)
+    u = np.einsum("na,na->n", to, normal) / det
+    v = np.einsum("na,na->n", along, across) / det
+    t = np.einsum("na,na->n", second, across) / det
+    inside = (
+        (u > TOUCHES)
+        & (v > TOUCHES)
+        & (u + v < 1.0 - TOUCHES)
+        & (t > TOUCHES)
+        & (t < 1.0 - TOUCHES)
+    )
+    return np.asarray(inside & ~flat)
+
+
+HALVINGS, NEAR = 30, 1e-3  # of the interval of levels; relative difference of volumes that will do
+WHOLE = 1.0 - 1e-9  # of a mark that points between two marked nodes have, but for rounding
+FEW = (
+    20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
+)
+MARKS = ("own", "inboard", "outboard")
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """The density of a solid arm at nodes.
+
+    Attributes:
+        points: (n, 3) m.
+        nodes: (m, 4 or 8) of cells.
+        values: (n,) with the highest one at interfaces: material along them that the design leaves
+            void, since interfaces are rigid.
+        marks: (n,) 1.0 of nodes on `SolidDomain`'s faces and in what stays solid, by name.
+    """
+
+    points: np.ndarray
+    nodes: np.ndarray
+    values: np.ndarray
+    marks: dict[str, np.ndarray]
+
+    def above(self, level: float) -> Any:
+        """Return the grid of what is above a level, see `cut`; what stays solid is."""
+        stays = self.marks["stays"] > 0.0
+        values = np.where(stays, np.maximum(self.values, level + APART), self.values)
+        return cut(self.points, self.nodes, values, level, self.marks)
+
+
+def _field(domain: SolidDomain) -> _Field:
+    corners, density = domain.corners, domain.field
+    faces = {name: getattr(domain, name) for name in MARKS}
+    is_box = domain.is_box
+    if corners.shape[1] == 8 and (len(corners) <= FEW or not is_box):
+        points, nodes, values = halved(corners, density)
+        cells = eighths(nodes) if is_box else forty_eighths(nodes)
+        faces = {name: middles(one) for name, one in faces.items()}
+    else:
+        points, nodes, values = nodal_densities(corners, density)
+        cells = nodes
+    marks = {name: _among(points, one) for name, one in faces.items()}
+    marks["stays"] = np.zeros(len(points))
+    marks["stays"][nodes[domain.passive]] = 1.0
+    values[(marks["inboard"] > 0.0) | (marks["outboard"] > 0.0)] = values.max()
+    return _Field(points, cells, values, marks)
+
+
+def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
+    """Return the level that keeps the volume, the grid above it that joins both interfaces, the
+    number of pieces that do not, and their volume, m3."""
+    field, target = _field(domain), domain.volume
+    best: tuple[float, float, Any, Any] | None = None
+    # Levels that enclose too much and too little, and by how much; halves where it stays the same.
+    low, high = 0.0, BELOW * float(field.values.max())
+    more, less, last = float(domain.sizes.sum()) - target, -target, 0.0
+    for _ in range(HALVINGS):
+        level = high - (high - low) * min(max(less / (less - more), 0.1), 0.9)
+        whole = field.above(level)
+        joined = _joined(whole)
+        off = (0.0 if joined is None else outside(joined)[0].volume) - target
+        if joined is not None and (best is None or abs(off) < best[0]):
+            best = abs(off), level, whole, joined
+        if abs(off) <= NEAR * target:
+            break
+        if off > 0.0:
+            low, more = level, off
+            less *= 0.5 if last > 0.0 else 1.0
+        else:
+            high, less = level, off
+            more *= 0.5 if last < 0.0 else 1.0
+        last = off
+    if best is None:
+        raise InputError(
+            f"arm {domain.name!r}: its design does not hang together: no material joins both "
+            "interfaces; optimise longer, or with a larger design.volume_fraction"
+        )
+    _, level, whole, joined = best
+    count = _number_of_pieces(whole) - _number_of_pieces(joined)
+    lost = outside(whole)[0].volume - outside(joined)[0].volume if count else 0.0
+    return level, joined, count, lost
+
+
+def _among(points: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Return 1.0 (n,) of points (n, 3) that are corners of some faces to the last bit, else 0.0."""
+    kinds = np.unique(np.concatenate([points, some.reshape(-1, 3)]), axis=0, return_inverse=True)[
+        1
+    ].ravel()
+    return np.isin(kinds[: len(points)], kinds[len(points) :]).astype(float)
+
+
+def _regions(solid: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return which piece of a grid its points and its cells belong to."""
+    import scipy.sparse as sp
+    from scipy.sparse.csgraph import connected_components
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    first = vtk_to_numpy(solid.GetCells().GetOffsetsArray())
+    cells = np.repeat(np.arange(solid.n_cells), np.diff(first))
+    size = solid.n_cells + solid.n_points
+    ends = cells, solid.n_cells + solid.cell_connectivity
+    graph = sp.csr_matrix((np.ones(len(cells)), ends), shape=(size, size))
+    pieces = connected_components(graph, directed=False)[1]
+    return pieces[solid.n_cells :], pieces[: solid.n_cells]
+
+
+def _number_of_pieces(solid: Any) -> int:
+    return len(np.unique(_regions(solid)[1]))
+
+
+def _joined(solid: Any) -> Any:
+    """Return the pieces of a grid that have a part of both interfaces; None: there are none."""
+    if solid.n_cells == 0:
+        return None
+    of_points, of_cells = _regions(solid)
+    ends = [of_points[solid.point_data[name] > WHOLE] for name in ("inboard", "outboard")]
+    both = np.intersect1d(*ends)
+    if not len(both):
+        return None
+    stays = np.isin(of_cells, both)
+    return solid if stays.all() else solid.extract_cells(stays)
