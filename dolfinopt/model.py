@@ -56,8 +56,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from dolfinopt.part.check import Check
-    from dolfinopt.part.plane.part import Part
-    from dolfinopt.part.solid.part import SolidPart
+    from dolfinopt.part.part import Part
 
 Densities = Mapping[str, np.ndarray]
 
@@ -397,14 +396,15 @@ class Model:
             InputError: no part can be made of the design.
             ConvergenceError: the motion of the densities or of the parts cannot be simulated.
         """
-        from dolfinopt.part.of_scene import check_of, parts_of
+        from dolfinopt.part.check import check_parts
+        from dolfinopt.part.part import Curves, make_parts, mesh_parts
 
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
-            parts = parts_of(self.scene, place, self._world, tool_radius, tolerance, False)
+            parts = make_parts(self.scene, place, Curves(tool_radius, tolerance), self._world)
             with together(self._world):
                 if self._world.rank == 0:
-                    return check_of(self.scene, place, parts)
+                    return check_parts(self.scene, place, parts, mesh_parts(parts))
         return None
 
     def make_parts(
@@ -415,7 +415,7 @@ class Model:
         tool_radius: float | None = None,
         tolerance: float | None = None,
         arcs: bool = False,
-    ) -> dict[str, Part] | dict[str, SolidPart]:
+    ) -> dict[str, Part]:
         """Make parts for the workshop of a design, as `dolfinopt part` does.
 
         Args:
@@ -433,20 +433,23 @@ class Model:
             InputError: no part can be made of the design, or the folder holds files already.
         """
         from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
-        from dolfinopt.part.of_scene import names_of, parts_of, write_of
+        from dolfinopt.part.files.folder import file_names, write_parts
+        from dolfinopt.part.part import Curves, make_parts, mesh_parts
 
         out = None if folder is None else Path(folder)
         if out is not None:
-            on_root(self._world, check_sources, out, names_of(self.scene), self.scene)
-            on_root(self._world, check_unused, out, names_of(self.scene))
+            on_root(self._world, check_sources, out, file_names(self.scene), self.scene)
+            on_root(self._world, check_unused, out, file_names(self.scene))
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
-            found = parts_of(self.scene, place, self._world, tool_radius, tolerance, arcs)
+            curves = Curves(tool_radius, tolerance, arcs)
+            found = make_parts(self.scene, place, curves, self._world)
         if out is not None:
             with together(self._world):
                 if self._world.rank == 0:
                     prepare_folder(out)
-                    write_of(out, self.scene, found)
+                    meshes = mesh_parts(found, coarse=False).fine
+                    write_parts(out, self.scene, found, meshes)
         return {self.scene.arms[k].name: part for k, part in found.items()}
 
     def study(

@@ -106,7 +106,7 @@ def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, anima
 
 def _next(scene: Scene, folder: Path, grayness: float) -> str:
     """Return how to go on from a design."""
-    from dolfinopt.part.plane.part import GRAY
+    from dolfinopt.part.part import GRAY
 
     if scene.design.projection or grayness <= GRAY:
         return f"parts for the workshop: dolfinopt part {folder}"

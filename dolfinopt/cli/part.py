@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,16 +25,14 @@ from dolfinopt.cli.shared import (
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from mpi4py import MPI
 
     from dolfinopt.part.check import Check
     from dolfinopt.part.optimize import Optimized
-    from dolfinopt.part.plane.mesh import Meshes
-    from dolfinopt.part.plane.part import Part
-    from dolfinopt.part.solid.mesh import SolidMeshes
-    from dolfinopt.part.solid.part import SolidPart
+    from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
+
+Say = Callable[[str], None]
 
 
 @click.command()
@@ -101,144 +99,32 @@ def part(
     world = start()
     from dolfinopt.parallel import on_root, together
     from dolfinopt.part.files.folder import file_names
-    from dolfinopt.part.plane.mesh import mesh_parts
-    from dolfinopt.part.plane.part import make_parts
+    from dolfinopt.part.part import Curves, make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
     target = out or folder / "part"
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
-    if scene.is_spatial:
-        if optimize:
-            raise InputError(
-                f"--optimize: of arms in the plane alone; the arms of {folder} are solids; leave "
-                "it out"
-            )
-        options = tool_radius, tolerance, curves == "arcs"
-        make_solids(world, scene, folder, target, options, check, overwrite, plots)
-        return
-    claim(world, target, overwrite, file_names(scene), scene=scene)
-    parts = make_parts(scene, folder, tool_radius, tolerance, curves == "arcs", world)
-    with together(world):
-        if world.rank == 0:
-            warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
-            meshes = mesh_parts(parts)
-            found = _checked(scene, folder, parts, meshes) if check else None
-            optimized = _optimized(scene, parts, iterations) if optimize else None
-            if optimized is not None:
-                parts, meshes = optimized.parts, optimized.meshes
-                after = _checked(scene, folder, parts, meshes) if check else None
-                if found is not None and after is not None:
-                    found = replace(after, before=found.part)
-            _write(scene, folder, target, parts, meshes, found, optimized, plots)
-
-
-def _optimized(scene: Scene, parts: dict[int, Part], iterations: int) -> Optimized:
-    """Return the parts with optimised shapes, and say what it brought."""
-    from dolfinopt.part.optimize import optimize_parts
-
-    found = optimize_parts(scene, parts, iterations, lambda line: click.echo(line, err=True))
-    click.echo(found.sentence)
-    return found
-
-
-def _checked(scene: Scene, folder: Path, parts: dict[int, Part], meshes: Meshes) -> Check | None:
-    """Return what the parts do; None, and a warning, where that cannot be simulated."""
-    from dolfinopt.part.check import check_parts
-
-    try:
-        return check_parts(scene, folder, parts, meshes)
-    except ConvergenceError as error:
-        warn([f"the machine with the parts cannot be compared: {error}"])
-        return None
-
-
-def _write(
-    scene: Scene,
-    run: Path,
-    target: Path,
-    parts: dict[int, Part],
-    meshes: Meshes,
-    check: Check | None,
-    optimized: Optimized | None,
-    plots: bool,
-) -> None:
-    """Write the files and say what was made (root only)."""
-    from dolfinopt.output.folders import prepare_folder
-    from dolfinopt.part.files.folder import write_parts
-
-    def pictures(folder: Path) -> None:
-        from dolfinopt.plots.design import parts_figure
-
-        made = [parts[k] for k in sorted(parts)]
-        draw_pictures(folder, parts_figure(made, scene.name), check, scene)
-
-    prepare_folder(target)
-    drawn = pictures if plots else None
-    bodies = meshes.fine if check is None else check.meshes
-    figures = write_parts(target, scene, parts, bodies, check, optimized, drawn, run / "design.npz")
-    for name, row in figures["arms"].items():
-        points = f" with {row['control_points']} control points" if row["control_points"] else ""
-        click.echo(
-            f"{name}: {1e6 * row['area']:.6g} mm2, {row['mass']:.4g} kg, {row['loops'] - 1} holes, "
-            f"{row['curves']} curves{points}, at most "
-            f"{1e3 * row['distance']:.2g} mm from the outline"
+    if optimize and any(scene.arms[k].is_solid for k in scene.cell_counts):
+        raise InputError(
+            f"--optimize: of arms in the plane alone; the arms of {folder} are solids; leave it out"
         )
-    for arm, owner in zip(scene.arms, scene.owners, strict=True):
-        if owner is None:
-            click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
-    if check is not None:
-        tell(check)
-    click.echo(f"{elapsed():.1f} s; files in {target}, the machine with these parts in part.toml")
-
-
-# -- `dolfinopt part` of solid arms --------------------------------------------------------------
-
-Parts = dict[int, "SolidPart"]
-Say = Callable[[str], None]
-
-
-def make_solids(
-    world: MPI.Comm,
-    scene: Scene,
-    folder: Path,
-    target: Path,
-    curves: tuple[float | None, float | None, bool],
-    check: bool,
-    overwrite: bool,
-    plots: bool,
-) -> None:
-    """Make the parts of the solid arms of a run, and say what was made (collective).
-
-    Args:
-        world: all ranks.
-        scene: of the run.
-        folder: of the run.
-        target: for the files.
-        curves: the tool's radius, the tolerance, and whether arcs are wanted: of extruded designs.
-        check: whether to simulate the machine with them.
-        overwrite: whether it may hold parts.
-        plots: whether to draw them.
-    """
-    from dolfinopt.parallel import together
-    from dolfinopt.part.files.solid_folder import file_names
-    from dolfinopt.part.solid.part import make_solid_parts
-
     claim(world, target, overwrite, file_names(scene), scene=scene)
     with _stages(world) as say:
-        say("surfaces")
-        parts = make_solid_parts(scene, folder, world, *curves)
+        say("outlines and surfaces")
+        asked = Curves(tool_radius, tolerance, curves == "arcs")
+        parts = make_parts(scene, folder, asked, world)
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
-                meshes = _meshes(parts, check, say)
-                found = None
-                if check and meshes is not None:
-                    found = _checked_solid(scene, folder, parts, meshes, say)
+                made = Made(scene, parts, _meshes(parts, check or optimize, say))
+                made = made.checked(folder, say) if check else made
+                if optimize and made.meshes is not None:
+                    made = made.optimized(folder, iterations, check, say)
                 say("files")
-                _write_solid(scene, folder, target, parts, meshes, found, plots)
+                made.write(folder, target, plots)
     if world.rank == 0:
-        _say_what(scene, target, parts, meshes is not None, found)
+        made.tell(target)
 
 
 @contextmanager
@@ -256,112 +142,117 @@ def _stages(world: MPI.Comm) -> Iterator[Say]:
         yield lambda stage: status.update(f"{elapsed():.1f} s: {stage}")
 
 
-def _meshes(parts: Parts, check: bool, say: Say) -> SolidMeshes | None:
+def _meshes(parts: Mapping[int, Part], coarse: bool, say: Say) -> Meshes | None:
     """Return the meshes of all parts; None, and a warning, where one cannot be meshed."""
-    from dolfinopt.part.solid.mesh import mesh_solid_parts
+    from dolfinopt.part.part import mesh_parts
 
     say("meshes")
     try:
-        return mesh_solid_parts(parts, coarse=check)
+        return mesh_parts(parts, coarse)
     except InputError as error:
         warn([f"no part.toml: {error}"])
         return None
 
 
-def _checked_solid(
-    scene: Scene, folder: Path, parts: Parts, meshes: SolidMeshes, say: Say
-) -> Check | None:
-    """Return what the parts do; None, and a warning, where that cannot be simulated."""
-    from dolfinopt.part.check import check_solid_parts
+@dataclass(frozen=True, eq=False)
+class Made:
+    """What the command has made so far, on the root.
 
-    try:
-        return check_solid_parts(scene, folder, parts, meshes, say)
-    except ConvergenceError as error:
-        warn([f"the machine with the parts cannot be compared: {error}"])
-        return None
+    Attributes:
+        scene: of the run.
+        parts: by their place in the chain.
+        meshes: of the parts; None: there are none.
+        check: what the parts do; None: it is not known.
+        shape: what optimising their shape brought; None: it was not asked for.
+    """
 
+    scene: Scene
+    parts: Mapping[int, Part]
+    meshes: Meshes | None
+    check: Check | None = None
+    shape: Optimized | None = None
 
-def _write_solid(
-    scene: Scene,
-    run: Path,
-    target: Path,
-    parts: Parts,
-    meshes: SolidMeshes | None,
-    check: Check | None,
-    plots: bool,
-) -> None:
-    """Write the files (root only)."""
-    from dolfinopt.output.folders import prepare_folder
-    from dolfinopt.part.files.solid_folder import write_solid_parts
+    def checked(self, run: Path, say: Say) -> Made:
+        """Return it with what the parts do, or a warning where that cannot be simulated."""
+        from dolfinopt.part.check import check_parts
 
-    def pictures(folder: Path) -> None:
-        from dolfinopt.plots.solid_design import solid_parts_figure
+        if self.meshes is None:
+            return self
+        try:
+            return replace(self, check=check_parts(self.scene, run, self.parts, self.meshes, say))
+        except ConvergenceError as error:
+            warn([f"the machine with the parts cannot be compared: {error}"])
+            return replace(self, check=None)
 
-        made = [parts[k] for k in sorted(parts)]
-        masses = [scene.material_of(k).density * parts[k].volume for k in sorted(parts)]
-        draw_pictures(folder, solid_parts_figure(made, scene.name, masses), check, scene)
+    def optimized(self, run: Path, iterations: int, check: bool, say: Say) -> Made:
+        """Return it with optimised shapes, the parts before beside them in the check."""
+        from dolfinopt.part.optimize import optimize_parts
+        from dolfinopt.part.plane.part import PlanePart
 
-    prepare_folder(target)
-    fine = None if meshes is None else meshes.fine
-    drawn = pictures if plots else None
-    write_solid_parts(target, scene, parts, fine, check, drawn, run / "design.npz")
-
-
-def _say_what(scene: Scene, target: Path, parts: Parts, meshed: bool, check: Check | None) -> None:
-    """Print what was made (root only)."""
-    rough = []
-    for arm, owner in zip(scene.arms, scene.owners, strict=True):
-        if owner is None:
-            click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
-            continue
-        part = parts[owner]
-        row = part.figures(scene.material_of(owner).density)
-        rows = f"{row['triangles']} triangles"
-        where = f"the isosurface at density {row['level']:.3g}"
-        if part.flat is not None:
-            rows, where = f"{len(part.flat.shape.curves)} curves", "the outline"
-        else:
-            rough.append(arm.name)
-        click.echo(
-            f"{arm.name}: {1e9 * row['volume']:.6g} mm3, {row['mass']:.4g} kg, {rows}, at most "
-            f"{1e3 * row['distance']:.2g} mm from {where}, {_widths(part)}"
+        say("shapes")
+        plates = {k: one for k, one in self.parts.items() if isinstance(one, PlanePart)}
+        found = optimize_parts(
+            self.scene, plates, iterations, lambda line: click.echo(line, err=True)
         )
-    if check is not None:
-        tell(check)
-    if rough:
-        click.echo(
-            f"no STEP of {', '.join(rough)}: a free-form surface, in triangles (STL, 3MF); "
-            "arms.extruded = true makes plates, which have curves"
-        )
-    machine = ", the machine with these parts in part.toml" if meshed else ""
-    click.echo(f"{elapsed():.1f} s; files in {target}{machine}")
+        click.echo(found.sentence)
+        after = replace(self, parts=found.parts, meshes=found.meshes, shape=found, check=None)
+        after = after.checked(run, say) if check else after
+        if self.check is None or after.check is None:
+            return after
+        return replace(after, check=replace(after.check, before=self.check.part))
 
+    def write(self, run: Path, target: Path, plots: bool) -> None:
+        """Write the files, all or none."""
+        from dolfinopt.output.folders import prepare_folder
+        from dolfinopt.part.files.folder import write_parts
 
-def _widths(part: SolidPart) -> str:
-    found = []
-    for name, width in (("member", part.widths.member), ("gap", part.widths.gap)):
-        if width is not None:
-            found.append(
-                f"{'thinnest' if name == 'member' else 'narrowest'} {name} {1e3 * width:.2g} mm"
+        prepare_folder(target)
+        meshes = None if self.meshes is None else self.meshes.fine
+        if self.check is not None:
+            meshes = self.check.meshes
+        drawn = self.draw if plots else None
+        given = self.scene, self.parts, meshes, self.check, self.shape
+        write_parts(target, *given, drawn, run / "design.npz")
+
+    def draw(self, folder: Path) -> None:
+        """Write the picture of the parts, and those of what they do if that is known."""
+        from dolfinopt.output.views import designed
+        from dolfinopt.plots.curves import check_figure
+        from dolfinopt.plots.design import parts_figure, stress_figure
+        from dolfinopt.plots.style import save
+
+        scene = self.scene
+        masses = [scene.material_of(k).density * one.volume for k, one in self.parts.items()]
+        save(parts_figure(list(self.parts.values()), scene.name, masses), folder / "part.png")
+        if self.check is not None:
+            save(check_figure(self.check, scene), folder / "deviation.png")
+            stress = stress_figure(designed(self.check.views), f"{scene.name}: stress of the parts")
+            save(stress, folder / "stress.png")
+
+    def tell(self, target: Path) -> None:
+        """Print what was made."""
+        scene, rough = self.scene, []
+        for arm, owner in zip(scene.arms, scene.owners, strict=True):
+            if owner is None:
+                click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
+                continue
+            part = self.parts[owner]
+            mass = scene.material_of(owner).density * part.volume
+            click.echo(f"{arm.name}: {mass:.4g} kg, {part.sentence}")
+            if not part.has_curves:
+                rough.append(arm.name)
+        if self.check is not None:
+            tell(self.check)
+        if rough:
+            click.echo(
+                f"no STEP of {', '.join(rough)}: a free-form surface, in triangles (STL, 3MF); "
+                "arms.extruded = true makes plates, which have curves"
             )
-    return ", ".join(found) or "nothing thin"
+        machine = ", the machine with these parts in part.toml" if self.meshes is not None else ""
+        click.echo(f"{elapsed():.1f} s; files in {target}{machine}")
 
 
-# -- what `dolfinopt part` shows: pictures in the folder, and the table of the check -------------
-
-
-def draw_pictures(folder: Path, parts: Figure, check: Check | None, scene: Scene) -> None:
-    """Write the picture of the parts, and those of what they do if that is known."""
-    from dolfinopt.output.views import designed
-    from dolfinopt.plots.curves import check_figure
-    from dolfinopt.plots.design import stress_figure
-    from dolfinopt.plots.style import save
-
-    save(parts, folder / "part.png")
-    if check is not None:
-        save(check_figure(check, scene), folder / "deviation.png")
-        stress = stress_figure(designed(check.views), f"{scene.name}: stress of the parts")
-        save(stress, folder / "stress.png")
+# -- the table of the check ----------------------------------------------------------------------
 
 
 def tell(check: Check) -> None:

@@ -13,11 +13,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import check_cells, check_mesh, facet_keys, flatten, keys_of, remedy
 from dolfinopt.mesh.file_check import check_start, open_file
@@ -25,6 +26,7 @@ from dolfinopt.mesh.gmsh_session import (
     DESIGN,
     FURTHER,
     INBOARD,
+    LINE,
     NAMES,
     OUTBOARD,
     PASSIVE,
@@ -50,10 +52,6 @@ from dolfinopt.mesh.measured import (
 )
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.arms import SIZE_PARAMETER
-
-if TYPE_CHECKING:
-    from dolfinopt.exchange.urdf.geometry import LinkCells
-    from dolfinopt.mesh.sections import Member
 
 # ONELAB parameters of meshes/*.geo, without the number that orders them.
 LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (m)"
@@ -680,6 +678,8 @@ class Tetrahedra:
     inboard: np.ndarray
     outboard: np.ndarray
 
+    kind: ClassVar[str] = "tetrahedra"
+
     @property
     def volumes(self) -> np.ndarray:
         """Volumes (m,) of the cells, m3; negative of those turned over."""
@@ -707,6 +707,19 @@ class Tetrahedra:
         order = np.sort(facets, axis=1)
         _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
         return np.asarray(facets[count[which.ravel()] == 1])
+
+    def figures(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+        return {
+            self.kind: len(self.cells),
+            "volume": float(self.volumes.sum()),
+            "least_quality": float(self.quality.min()),
+            "mean_quality": float(self.quality.mean()),
+        }
+
+    def write(self, path: Path) -> None:
+        """Write it as `arms.mesh` reads it back (.msh)."""
+        write_bytes(path, msh_bytes(self))
 
 
 def tetrahedra_of(
@@ -823,23 +836,45 @@ def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners[:, 0], np.cross(corners[:, 1], corners[:, 2])
 
 
-def msh_bytes(mesh: Tetrahedra | LinkCells | Member) -> bytes:
+class InterfaceMesh(Protocol):
+    """Cells of an arm in the plane or in space, with the facets of its interfaces."""
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, d) in the arm's frame, m."""
+
+    @property
+    def cells(self) -> np.ndarray:
+        """(m, c) nodes of triangles, tetrahedra or hexahedra."""
+
+    @property
+    def inboard(self) -> np.ndarray:
+        """(k, f) nodes of the inboard interface's facets."""
+
+    @property
+    def outboard(self) -> np.ndarray:
+        """(k, f) nodes of the outboard interface's facets."""
+
+
+def msh_bytes(mesh: InterfaceMesh) -> bytes:
     """Return the .msh file that `arms.mesh` reads back, on this process alone."""
-    is_tetrahedron = mesh.cells.shape[1] == 4
-    cell, side = (TETRAHEDRON, TRIANGLE) if is_tetrahedron else (HEXAHEDRON, QUADRILATERAL)
+    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
+    cell, side = kinds[mesh.cells.shape[1]]
+    dim = mesh.points.shape[1]
+    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
     with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
         model = gmsh.model
         model.add("solid")
-        solid = model.addDiscreteEntity(3)
-        model.mesh.addNodes(3, solid, np.arange(1, len(mesh.points) + 1), mesh.points.ravel())
+        solid = model.addDiscreteEntity(dim)
+        model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
         model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
-        model.addPhysicalGroup(3, [solid], DESIGN)
-        model.setPhysicalName(3, DESIGN, NAMES[DESIGN])
+        model.addPhysicalGroup(dim, [solid], DESIGN)
+        model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
         for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
-            face = model.addDiscreteEntity(2)
+            face = model.addDiscreteEntity(dim - 1)
             model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
-            model.addPhysicalGroup(2, [face], group)
-            model.setPhysicalName(2, group, NAMES[group])
+            model.addPhysicalGroup(dim - 1, [face], group)
+            model.setPhysicalName(dim - 1, group, NAMES[group])
         gmsh.option.setNumber("Mesh.Binary", 1)
         gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
         path = Path(folder) / "solid.msh"

@@ -20,7 +20,7 @@ from dolfinopt.mesh.measured import UNREAD_STATEMENTS_LIMIT
 from dolfinopt.parallel import together
 
 # Gmsh's numbers of straight triangles and quadrilaterals.
-TRIANGLE, QUADRILATERAL = 2, 3
+LINE, TRIANGLE, QUADRILATERAL = 1, 2, 3
 
 
 @contextmanager

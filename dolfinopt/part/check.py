@@ -1,15 +1,8 @@
-"""The machine with its arms as densities, as crisp design and as parts, and its figures.
-
-What parts do in the moving machine, beside the densities that they were made of.
+"""What parts do in the moving machine, beside the densities that they were made of.
 
 The same scene is simulated with three forms of the arms: the physical densities; the crisp design,
-cut at the density that keeps the volume, on the design's own cells; and the part, solid, on a mesh
-along its curves. A second, coarser mesh of the part tells how far its figures depend on the mesh.
-
-What solid parts do in the moving machine, beside the densities that they were made of.
-
-As in the plane, see `check`: the same scene with the densities, with the crisp design on the
-design's own cells, and with the parts, in quadratic tetrahedra.
+cut to solid and void at the level that keeps the volume, on the design's own cells; and the parts,
+on meshes of quadratic triangles along their curves or of quadratic tetrahedra in their surface.
 """
 
 from __future__ import annotations
@@ -25,20 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.disk import write_bytes
 from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.mesh.geometry import Tetrahedra, msh_bytes
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.output.views import ArmView, gather_views
 from dolfinopt.part.buckling import Buckling, lowest_buckling
-from dolfinopt.part.files.scene_file import scene_data, solid_scene_data, toml_text
-from dolfinopt.part.plane.mesh import BodyMesh, Meshes, finer_meshes, write_meshes
-from dolfinopt.part.plane.part import Part
-from dolfinopt.part.plane.stress import APART, HOT, PartStress, part_stress
-from dolfinopt.part.solid.mesh import SolidMeshes
-from dolfinopt.part.solid.part import SolidPart
-from dolfinopt.part.solid.stress import solid_part_stress
+from dolfinopt.part.files.scene_file import scene_data, toml_text
+from dolfinopt.part.part import Meshes, Part, PartMesh
+from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.response import objective_of
@@ -98,10 +85,10 @@ class Simulated:
     trajectory: Trajectory
 
 
-def simulate_bodies(
+def simulate_parts(
     scene: Scene,
     parts: Mapping[int, Part],
-    meshes: Mapping[int, BodyMesh],
+    meshes: Mapping[int, PartMesh],
     start: Sequence[Solution] = (),
     **changes: Any,
 ) -> Simulated:
@@ -113,15 +100,18 @@ def simulate_bodies(
         start: `Trajectory.solutions` of parts nearby.
         changes: tables of the scene that are other than the run's.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        write_meshes(Path(folder), {scene.arms[k].name: one for k, one in meshes.items()})
-        data = scene_data(scene, parts, Path(folder))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for arm, owner in zip(scene.arms, scene.owners, strict=True):
+            if owner is not None and not arm.design:
+                meshes[owner].write(folder / f"{arm.name}.msh")
+        data = scene_data(scene, parts, folder)
         for table, keys in changes.items():
             data[table] = {**data.get(table, {}), **keys}
-        return simulate_scene(data, start)
+        return _simulate_scene(data, start)
 
 
-def simulate_scene(data: Mapping[str, Any], start: Sequence[Solution] = ()) -> Simulated:
+def _simulate_scene(data: Mapping[str, Any], start: Sequence[Solution] = ()) -> Simulated:
     """Simulate a machine whose arms are of solid material, by what part.toml holds of it."""
     scene = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
     partition, arms = _built(scene)
@@ -201,15 +191,14 @@ def _design_column(one: Simulated) -> Column:
 
 
 def part_column(
-    scene: Scene,
-    one: Simulated,
-    parts: Mapping[int, Part],
+    scene: Scene, one: Simulated, parts: Mapping[int, Part]
 ) -> tuple[Column, dict[int, PartStress]]:
-    apart = {k: APART * part.domain.cell for k, part in parts.items()}
-    shapes = {k: part.shape for k, part in parts.items()}
-    found = part_stress(one.arms, one.trajectory, shapes, apart)
+    """Return the figures of a machine with parts, and their stress by their place in the chain."""
+    found = stress_of_parts(one.arms, one.trajectory, parts)
     peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
-    return column_of(one, peak, arm, lowest_buckling(one.arms, one.trajectory)), found
+    plates = not any(arm.is_solid for arm in one.scene.arms)
+    buckling = lowest_buckling(one.arms, one.trajectory) if plates else None
+    return column_of(one, peak, arm, buckling), found
 
 
 def column_of(
@@ -227,7 +216,7 @@ def column_of(
             for limit in limits
         ]
     values = dict(_values(one, float("nan") if peak is None else peak.value))
-    if not one.scene.is_spatial:  # of densities it is not looked at
+    if not any(arm.is_solid for arm in one.scene.arms):  # of densities it is not looked at
         values[BUCKLING] = float("nan") if buckling is None else buckling.factor
     return Column(values, peak, arm, tuple(limits), one.trajectory, buckling)
 
@@ -297,7 +286,6 @@ def largest_of(peaks: Mapping[int, Peak], scene: Scene) -> tuple[Peak | None, st
 # Change by the last refinement up to which a figure counts as converged, also that of stress: a
 # method of second order leaves a third of it.
 SETTLED, SETTLED_STRESS = 1.5e-2, 0.1
-ROUNDS = 2  # refinements of the mesh where stress is largest, at most
 SAFE = 1.5  # buckling factor below which the program warns
 LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART, OPTIMISED = "density", "crisp", "part", "optimised part"
@@ -314,10 +302,8 @@ class Check:
         stress_change: relative, of the largest stress by the last refinement where it is largest.
         meshes: of the parts by their place in the chain, as fine as their stress needs.
         views: the parts' arms with their stress, for pictures.
-        cells: triangles, or tetrahedra, of the parts by the name of the arm.
         singular: where stress has no limit on the parts and is larger than the one reported.
         singular_arm: which part has it.
-        kind: of the cells.
         before: the parts before their shape was optimised; None where it was not.
     """
 
@@ -327,12 +313,10 @@ class Check:
     part: Column
     coarse: Column
     stress_change: float
-    meshes: Mapping[int, Any]
+    meshes: Mapping[int, PartMesh]
     views: list[ArmView]
-    cells: Mapping[str, int]
     singular: Peak | None
     singular_arm: str
-    kind: str = "triangles"
     before: Column | None = None
 
     @property
@@ -470,6 +454,13 @@ class Check:
         ]
         return found
 
+    def _cells(self) -> dict[str, dict[str, int]]:
+        """Return the number of cells of the parts by their kind and the arm's name."""
+        scene, found = self.part.trajectory.scene, dict[str, dict[str, int]]()
+        for k, mesh in self.meshes.items():
+            found.setdefault(mesh.kind, {})[scene.arms[k].name] = len(mesh.cells)
+        return found
+
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of part.json."""
         table = {
@@ -489,7 +480,7 @@ class Check:
             "table": table,
             "check": {
                 "loss": self.loss,
-                self.kind: dict(self.cells),
+                **self._cells(),
                 "refinement": self.refinement,
                 "converged": self.converged,
                 "stress": places,
@@ -507,11 +498,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _finite(one) for key, one in value.items()}
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def relative_change(value: float, other: float) -> float:
-    """Return value / other - 1, nan where there is nothing to compare with."""
-    return _ratio(value, other) - 1.0
 
 
 def _word(change: Mapping[str, float]) -> str:
@@ -532,35 +518,43 @@ def _told(peak: Peak, arm: str) -> str:
 
 
 def refined(
-    scene: Scene, parts: Mapping[int, Part], meshes: Meshes, before: Column
-) -> tuple[Simulated, Column, dict[int, PartStress], float, Mapping[int, BodyMesh]]:
+    scene: Scene, parts: Mapping[int, Part], meshes: Mapping[int, PartMesh], before: Column
+) -> tuple[Simulated, Column, dict[int, PartStress], float, Mapping[int, PartMesh]]:
     """Return what parts do on meshes that are refined where their stress is largest.
 
     Args:
-        scene, parts, meshes: as for `check_parts`.
-        before: what they do on the coarse meshes.
+        scene, parts: as for `check_parts`.
+        meshes: fine ones.
+        before: what they do on coarse ones.
 
     Returns:
         The machine, its figures, its stress, the relative change of the largest one by the last
         refinement, and the meshes.
     """
-    bodies: Mapping[int, BodyMesh] = meshes.fine
     places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
-    for round_ in range(ROUNDS + 1):
-        fine = simulate_bodies(scene, parts, bodies)
+    most = max((one.REFINEMENTS for one in parts.values()), default=0)
+    for round_ in range(most + 1):
+        fine = simulate_parts(scene, parts, meshes)
         column, stress = part_column(scene, fine, parts)
-        change = relative_change(column.values[STRESS], before.values[STRESS])
-        if round_ == ROUNDS or not abs(change) > SETTLED_STRESS:
+        change = _ratio(column.values[STRESS], before.values[STRESS]) - 1.0
+        if round_ == most or not abs(change) > SETTLED_STRESS:
             break
         for place, one in stress.items():
             owner = scene.owners[place]
             if owner is not None and one.peak.value > HOT * column.values[STRESS]:
                 places[owner].append(one.hot)
-        before, bodies = column, finer_meshes(parts, places)
-    return fine, column, stress, change, bodies
+        before = column
+        meshes = {k: part.mesh(finer=places[k]) for k, part in parts.items()}
+    return fine, column, stress, change, meshes
 
 
-def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: Meshes) -> Check:
+def check_parts(
+    scene: Scene,
+    folder: Path,
+    parts: Mapping[int, Part],
+    meshes: Meshes,
+    say: Callable[[str], None] = lambda _: None,
+) -> Check:
     """Simulate the densities of a run, the crisp design and the parts, on this rank alone.
 
     Args:
@@ -568,13 +562,17 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
         folder: with its design.npz.
         parts: by their place in the chain.
         meshes: what `mesh_parts` returned of them.
+        say: is told what is done next.
 
     Raises:
         ConvergenceError: the motion of the densities or of the parts cannot be simulated.
     """
+    say("the machine with the densities")
     density, crisp = design_columns(scene, folder)
-    coarse, _ = part_column(scene, simulate_bodies(scene, parts, meshes.coarse), parts)
-    fine, column, stress, change, bodies = refined(scene, parts, meshes, coarse)
+    say("the machine with the parts, larger cells")
+    coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
+    say("the machine with the parts")
+    fine, column, stress, change, bodies = refined(scene, parts, meshes.fine, coarse)
     cells = {place: one.cells for place, one in stress.items()}
     worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value
@@ -587,74 +585,6 @@ def check_parts(scene: Scene, folder: Path, parts: Mapping[int, Part], meshes: M
         stress_change=change,
         meshes=bodies,
         views=gather_views(fine.scene, fine.partition, fine.arms, fine.x_phys, cells),
-        cells={scene.arms[k].name: fine.arms[k].mesh.num_cells for k in parts},
         singular=worst if grows else None,
         singular_arm=at,
     )
-
-
-def check_solid_parts(
-    scene: Scene,
-    folder: Path,
-    parts: Mapping[int, SolidPart],
-    meshes: SolidMeshes,
-    say: Callable[[str], None] | None = None,
-) -> Check:
-    """Simulate the densities of a run, the crisp design and the parts, on this rank alone.
-
-    Args:
-        scene: of the run.
-        folder: with its design.npz.
-        parts: by their place among the arms.
-        meshes: what `mesh_solid_parts` returned of them.
-        say: is told what is done next.
-
-    Raises:
-        ConvergenceError: the motion of the densities or of the parts cannot be simulated.
-    """
-    say = say or (lambda _: None)
-    say("the machine with the densities")
-    density, crisp = design_columns(scene, folder)
-    say("the machine with the parts, larger cells")
-    coarse, _, _ = _column(scene, parts, meshes.coarse)
-    say("the machine with the parts")
-    column, stress, fine = _column(scene, parts, meshes.fine)
-    worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
-    grows = column.stress is not None and worst is not None and worst.value > column.stress.value
-    cells = {place: one.cells for place, one in stress.items()}
-    return Check(
-        units=units_of(scene, column),
-        density=density,
-        crisp=crisp,
-        part=column,
-        coarse=coarse,
-        stress_change=relative_change(column.values[STRESS], coarse.values[STRESS]),
-        meshes=meshes.fine,
-        views=gather_views(fine.scene, fine.partition, fine.arms, fine.x_phys, cells),
-        cells={scene.arms[k].name: len(mesh.cells) for k, mesh in meshes.fine.items()},
-        singular=worst if grows else None,
-        singular_arm=at,
-        kind="tetrahedra",
-    )
-
-
-def _column(
-    scene: Scene, parts: Mapping[int, SolidPart], meshes: Mapping[int, Tetrahedra]
-) -> tuple[Column, dict[int, PartStress], Simulated]:
-    """Return what the parts do on given meshes, their stress, and all of the simulation."""
-    with tempfile.TemporaryDirectory() as folder:
-        write_solid_meshes(Path(folder), scene, meshes)
-        one = simulate_scene(solid_scene_data(scene, parts, Path(folder)))
-    found = solid_part_stress(
-        one.arms, one.trajectory, {k: part.domain for k, part in parts.items()}
-    )
-    peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
-    return column_of(one, peak, arm), found, one
-
-
-def write_solid_meshes(folder: Path, scene: Scene, meshes: Mapping[int, Tetrahedra]) -> None:
-    """Write NAME.msh of every arm with a part into a folder that exists."""
-    data = {k: msh_bytes(mesh) for k, mesh in meshes.items()}
-    for arm, owner in zip(scene.arms, scene.owners, strict=True):
-        if owner is not None:
-            write_bytes(folder / f"{arm.name}.msh", data[owner])

@@ -17,26 +17,20 @@ from typing import Any
 
 import numpy as np
 import shapely
-from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.optimization.acceptance import Promise, judge_step
 from dolfinopt.optimization.measured import LIMIT_PRICE
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import Stage
-from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_bodies
+from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
+from dolfinopt.part.part import Meshes, mesh_parts
 from dolfinopt.part.plane.free_outline import CHORD, FreeOutline, free_outline
-from dolfinopt.part.plane.mesh import BodyMesh, Meshes, body_mesh, mesh_parts, triangle_areas
+from dolfinopt.part.plane.mesh import BodyMesh
 from dolfinopt.part.plane.outline import thinnest_member
-from dolfinopt.part.plane.part import Part
-from dolfinopt.part.plane.stress import (
-    APART,
-    OutlineStress,
-    away_from_ends,
-    corner_stress,
-)
+from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
@@ -71,7 +65,7 @@ class Optimized:
         ending: why it ended.
     """
 
-    parts: dict[int, Part]
+    parts: dict[int, PlanePart]
     meshes: Meshes
     iterations: int
     before: float
@@ -96,7 +90,7 @@ class Optimized:
 
 
 def optimize_parts(
-    scene: Scene, parts: Mapping[int, Part], iterations: int = ITERATIONS, tell: Tell = print
+    scene: Scene, parts: Mapping[int, PlanePart], iterations: int = ITERATIONS, tell: Tell = print
 ) -> Optimized:
     """Return parts that are better by the scene's objective and keep its limits.
 
@@ -157,15 +151,15 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[float, tuple[Limit, ...]]:
+def _judged(scene: Scene, parts: dict[int, PlanePart]) -> tuple[float, tuple[Limit, ...]]:
     """Return objective and limits of parts on refined meshes, stress that of the outline."""
     meshes = mesh_parts(parts)
-    coarse, _ = part_column(scene, simulate_bodies(scene, parts, meshes.coarse), parts)
-    state, column, *_ = refined(scene, parts, meshes, coarse)
+    coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
+    state, column, *_ = refined(scene, parts, meshes.fine, coarse)
     return state.evaluation.objective, column.limits
 
 
-def _part(outline: FreeOutline) -> Part:
+def _part(outline: FreeOutline) -> PlanePart:
     """Return the part with these curves, and what is measured of it."""
     part, chord = outline.part, CHORD * outline.part.domain.cell
     outer, *holes = outline.shape.polygons(chord)
@@ -231,19 +225,16 @@ class Problem:
         """Return what the machine does; on meshes that are made anew where none are given.
 
         Raises:
-            ConvergenceError: an outline cannot be meshed, or the machine not be simulated.
+            InputError: an outline cannot be meshed.
+            ConvergenceError: the machine cannot be simulated.
         """
         parts = {k: replace(one.part, shape=one.shape) for k, one in outlines.items()}
         if not bodies:
-            with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-                bodies = {
-                    k: body_mesh(gmsh, part.shape, part.domain.cell, SIDES)
-                    for k, part in parts.items()
-                }
+            bodies = {k: part.mesh(SIDES) for k, part in parts.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
-        simulated = simulate_bodies(self.scene, parts, bodies, *start, **changes)
+        simulated = simulate_parts(self.scene, parts, bodies, *start, **changes)
         found, rows = simulated.evaluation, []
         every = limits_of(simulated.scene, found)
         for one, value, limit in zip(every, found.constraints, found.smooth_limits, strict=True):
@@ -267,14 +258,12 @@ class Problem:
         self, simulated: Simulated, outlines: Mapping[int, FreeOutline]
     ) -> tuple[OutlineStress, Analysis]:
         """Return the stress on the outlines as a response, and what it is computed from."""
-        shapes = {k: one.shape for k, one in outlines.items()}
-        apart = {k: APART * one.part.domain.cell for k, one in outlines.items()}
-        away = away_from_ends(shapes, apart)
+        parts = {k: replace(one.part, shape=one.shape) for k, one in outlines.items()}
         one = simulated
         given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
         p = max(one.scene.objective.stress_exponent, STRESS_EXPONENT)
         options = one.scene.objective.model_copy(update={"stress_exponent": p})
-        return OutlineStress(options, away, corner_stress), analysis_of(*given)
+        return OutlineStress(options, parts), analysis_of(*given)
 
     def _volumes(
         self, outlines: Mapping[int, FreeOutline]
@@ -463,7 +452,7 @@ class Search:
             if any(one.is_folded for one in bodies.values()):
                 bodies = {}
             return self.problem.evaluated(outlines, bodies, self.solutions)
-        except ConvergenceError:
+        except (ConvergenceError, InputError):
             return None
 
     @property
@@ -472,11 +461,4 @@ class Search:
         return self.state.simulated.trajectory.solutions
 
     def _worst_triangle(self) -> float:
-        return min(_quality(mesh) for mesh in self.state.bodies.values())
-
-
-def _quality(mesh: BodyMesh) -> float:
-    """Return 4 sqrt(3) area over the sum of the squared sides, the least of all triangles."""
-    corners = mesh.points[mesh.triangles]
-    sides = np.square(corners - np.roll(corners, 1, axis=1)).sum(axis=(1, 2))
-    return float((4.0 * np.sqrt(3.0) * triangle_areas(mesh.points, mesh.triangles) / sides).min())
+        return min(float(mesh.quality.min()) for mesh in self.state.bodies.values())

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.part.plane.part import Part
+    from dolfinopt.part.part import Part
+    from dolfinopt.part.plane.part import PlanePart
 
 REGION = {"solid": ORANGE, "void": BLUE}  # borders of what stays solid and void
 STRESS_COLOURS = "YlOrRd"  # nothing is light, the largest dark
@@ -104,17 +105,31 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     return figure
 
 
-def parts_figure(parts: Sequence[Part], title: str) -> Figure:
-    """Return the picture of the parts' outlines over the densities of their arms, mm."""
-    corners = [MILLI * part.domain.corners for part in parts]
+def parts_figure(parts: Sequence[Part], title: str, masses: Sequence[float]) -> Figure:
+    """Return the picture of parts below each other, mm: plates over the densities of their arms.
+
+    Args:
+        parts: from the cart outwards, all plane or all solid.
+        title: above the picture.
+        masses: of the parts, kg.
+    """
+    from dolfinopt.part.plane.part import PlanePart
+    from dolfinopt.part.solid.part import SolidPart
+
+    plates = [part for part in parts if isinstance(part, PlanePart)]
+    if not plates:
+        from dolfinopt.plots.solid_design import solid_parts_figure
+
+        return solid_parts_figure([p for p in parts if isinstance(p, SolidPart)], title, masses)
+    corners = [MILLI * part.domain.corners for part in plates]
     figure, rows = _arm_rows(corners, f"{title}: part over density", "mm", FOOT)
-    for axes, part, cells in zip(rows, parts, corners, strict=True):
+    for axes, part, cells, mass in zip(rows, plates, corners, masses, strict=True):
         _fill(axes, cells, part.domain.x_phys)
         for loop in _loops(part):
             axes.plot(*np.vstack([loop, loop[:1]]).T, color=ORANGE, lw=1.3, clip_on=False)
         shape = part.shape
         words = (
-            f"{part.domain.name}:  {1e6 * shape.area:.5g} mm\N{SUPERSCRIPT TWO}, "
+            f"{part.name}:  {1e6 * shape.area:.5g} mm\N{SUPERSCRIPT TWO}, {mass:.4g} kg, "
             f"{len(shape.loops) - 1} holes, {len(shape.curves)} curves"
         )
         axes.set_title(words, loc="left", fontsize=10, parse_math=False)
@@ -122,7 +137,7 @@ def parts_figure(parts: Sequence[Part], title: str) -> Figure:
     return figure
 
 
-def figure_of_plates(parts: Sequence[Part], densities: Sequence[float] = ()) -> Figure:
+def figure_of_plates(parts: Sequence[PlanePart], densities: Sequence[float] = ()) -> Figure:
     """Return a picture of parts as plates seen from the right and above, to one scale.
 
     Args:
@@ -218,7 +233,7 @@ def _caption(view: ArmView) -> str:
     return f"{view.name}:  {long}, {size[1]:.4g} m high, {share}"
 
 
-def _loops(part: Part) -> list[np.ndarray]:
+def _loops(part: PlanePart) -> list[np.ndarray]:
     """Return the closed curves of a part as polygons (n, 2), mm; the outline first."""
     return [MILLI * loop for loop in part.shape.polygons(CHORD * part.domain.cell)]
 

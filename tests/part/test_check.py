@@ -16,8 +16,7 @@ from dolfinopt.output.views import canonical_order
 from dolfinopt.part import check as checks
 from dolfinopt.part.buckling import Buckling
 from dolfinopt.part.check import check_parts, crisp
-from dolfinopt.part.plane.mesh import mesh_parts
-from dolfinopt.part.plane.part import make_parts
+from dolfinopt.part.part import make_parts, mesh_parts
 
 pytestmark = pytest.mark.serial
 
@@ -136,7 +135,7 @@ def test_part_that_cannot_be_simulated_has_files_all_the_same(made, monkeypatch,
     def fail(*_, **__):
         raise ConvergenceError("too weak")
 
-    monkeypatch.setattr(checks, "simulate_bodies", fail)
+    monkeypatch.setattr(checks, "simulate_parts", fail)
     run("part", made[0], "--out", tmp_path / "part", "--no-plots")
     assert "the machine with the parts cannot be compared: too weak" in capsys.readouterr().err
     found = json.loads((tmp_path / "part" / "part.json").read_text())

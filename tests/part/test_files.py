@@ -300,8 +300,6 @@ def test_files_are_there_all_or_none(tmp_path, monkeypatch):
 
 
 def test_interrupted_command_leaves_what_was_there(tmp_path, monkeypatch):
-    from dolfinopt.part.files import folder as files
-
     folder = folder_with(tmp_path / "run", frame)
     (folder / "part").mkdir()
     (folder / "part" / "note.txt").write_text("mine")
@@ -309,7 +307,7 @@ def test_interrupted_command_leaves_what_was_there(tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "solid_text", interrupted)
+    monkeypatch.setattr("dolfinopt.part.plane.part.solid_text", interrupted)
     with pytest.raises(click.Abort):
         run("part", folder, "--no-plots", "--no-check")
     assert [path.name for path in (folder / "part").iterdir()] == ["note.txt"]

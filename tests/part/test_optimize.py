@@ -12,9 +12,9 @@ from runs import run
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.part.optimize import Problem, optimize_parts
+from dolfinopt.part.part import make_parts
 from dolfinopt.part.plane.curves import MIRROR, Spline, direction
 from dolfinopt.part.plane.free_outline import free_outline
-from dolfinopt.part.plane.part import make_parts
 
 pytestmark = pytest.mark.serial
 

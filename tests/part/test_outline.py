@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.part.part import Curves
 from dolfinopt.part.plane import outline
 from dolfinopt.part.plane.curves import Arc, Line, direction
 from dolfinopt.part.plane.outline import draw_outline, search
@@ -39,7 +40,7 @@ def check(part, holes):
 
 
 def test_frame(design):
-    part = make_part(design(frame), None, None)
+    part = make_part(design(frame))
     check(part, holes=4)
     assert part.outline.islands == part.outline.filled == 0
     outer = [piece.curve for piece in part.shape.loops[0]]
@@ -55,13 +56,15 @@ def test_frame(design):
 
 @pytest.mark.parametrize("radius", [0.001, 0.003, 0.006])
 def test_concave_corners_have_the_radius_of_the_tool(design, radius):
-    part = make_part(design(frame), radius, None)
+    part = make_part(design(frame), Curves(radius))
     check(part, holes=4)
     assert radius * 0.98 <= part.shape.concave_radius <= radius + 0.005
 
 
 def test_tolerance_bounds_the_distance_and_sets_the_number_of_points(design):
-    parts = [make_part(design(frame), None, tolerance) for tolerance in (5e-4, 1e-4, 2e-5)]
+    parts = [
+        make_part(design(frame), Curves(tolerance=tolerance)) for tolerance in (5e-4, 1e-4, 2e-5)
+    ]
     for part in parts:
         check(part, holes=4)
     points = [part.shape.control_points for part in parts]
@@ -69,7 +72,7 @@ def test_tolerance_bounds_the_distance_and_sets_the_number_of_points(design):
 
 
 def test_lines_and_arcs_on_request(design):
-    part = make_part(design(frame), None, None, arcs=True)
+    part = make_part(design(frame), Curves(arcs=True))
     check(part, holes=4)
     assert {type(curve) for curve in part.shape.curves} == {Line, Arc}
     assert 40 < len(part.shape.curves) < 400
@@ -77,7 +80,7 @@ def test_lines_and_arcs_on_request(design):
         for before, after in zip(loop, (*loop[1:], loop[0]), strict=True):
             turn = direction(before.curve, 1.0) @ direction(after.curve, 0.0)
             assert turn > 1.0 - 1e-6
-    spline = make_part(design(frame), None, None)
+    spline = make_part(design(frame))
     here, there = (
         shapely.MultiLineString([np.vstack([ring, ring[:1]]) for ring in one.shape.polygons(1e-6)])
         for one in (part, spline)
@@ -89,7 +92,7 @@ def test_island_is_dropped(design):
     def density(x, y):
         return frame(x, y) | (np.hypot(x - 0.375, y) < 0.008)
 
-    part = make_part(design(density), None, None)
+    part = make_part(design(density))
     check(part, holes=4)
     assert part.outline.islands == 1
     assert "1 piece without a joint to both interfaces (" in " ".join(part.warnings)
@@ -99,7 +102,7 @@ def test_strut_of_one_cell_stays(design):
     def density(x, y):
         return frame(x, y) | (np.abs(x - 0.3725) < 0.002)
 
-    part = make_part(design(density), None, None)
+    part = make_part(design(density))
     check(part, holes=5)
     assert 0.002 < part.thinnest < 0.006
 
@@ -111,17 +114,17 @@ def test_cells_that_share_a_corner_stay_joined(design):
         column, row = np.floor(x / 0.005 + 1e-9), np.floor((y + 0.03) / 0.005 + 1e-9)
         return frame(x, y) | ((column - 72 == row - 3) & (np.abs(y) < 0.015))
 
-    part = make_part(design(density), None, None)
+    part = make_part(design(density))
     check(part, holes=5)
 
 
 def test_design_that_falls_apart_is_refused(design):
     with pytest.raises(InputError, match=r"arm 'arm1'.*does not hang together"):
-        make_part(design(lambda x, y: np.abs(x - 0.5) > 0.05), None, None)
+        make_part(design(lambda x, y: np.abs(x - 0.5) > 0.05))
 
 
 def test_full_arm_is_its_own_outline(design):
-    part = make_part(design(lambda x, y: np.ones_like(x)), None, None)
+    part = make_part(design(lambda x, y: np.ones_like(x)))
     assert part.shape.area == pytest.approx(0.06, rel=1e-12)
     assert len(part.shape.curves) == 4 and part.shape.control_points == 0
 
@@ -130,7 +133,7 @@ def test_gray_design_says_what_it_is(design):
     def density(x, y):
         return 0.2 + 0.7 * (y / 0.03) ** 2
 
-    part = make_part(design(density, "design.projection=false"), None, None)
+    part = make_part(design(density, "design.projection=false"))
     check(part, holes=len(part.shape.loops) - 1)
     assert any("grayness" in text and "robust" in text for text in part.warnings)
 
@@ -139,7 +142,7 @@ def test_bores_are_exact_and_the_part_is_its_mirror_image(design):
     def density(x, y):
         return (np.abs(y) > 0.0149) | (np.abs(x - 0.5) < 0.02) | (np.minimum(x, 1.0 - x) < 0.05)
 
-    part = make_part(design(density, *BORES), None, None)
+    part = make_part(design(density, *BORES))
     check(part, holes=4)
     for label, x in (("inboard", 0.0), ("outboard", 1.0)):
         (curve,) = [piece.curve for piece in part.shape.pieces if piece.label == label]
@@ -155,7 +158,7 @@ def test_bores_are_exact_and_the_part_is_its_mirror_image(design):
 def test_regions_stay_solid_and_void(design):
     solid, void = (f'{{kind="{kind}", box={box}}}' for kind, box in (
         ("solid", [0.3, -0.02, 0.4, 0.01]), ("void", [0.5, 0.02, 0.6, 0.03])))  # fmt: skip
-    part = make_part(design(frame, f"arms.0.regions=[{solid}, {void}]"), None, None)
+    part = make_part(design(frame, f"arms.0.regions=[{solid}, {void}]"))
     outer, *holes = part.shape.polygons(1e-7)
     polygon = shapely.Polygon(outer, holes)
     assert polygon.buffer(1e-8).covers(shapely.box(0.3, -0.02, 0.4, 0.01))
@@ -193,7 +196,7 @@ def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
         return near | (np.abs(y) > 0.018 - 0.006 * x) | (np.abs(x - 0.5) < 0.03)
 
     changes = [f"arms.0.mesh={path}", "arms.0.height=0.08", "arms.0.mesh_size=0.006"]
-    part = make_part(design(density, *changes, "arms.0.passive=0.006"), 0.002, None)
+    part = make_part(design(density, *changes, "arms.0.passive=0.006"), Curves(0.002))
     check(part, holes=4)
     assert part.shape.concave_radius > 0.98 * 0.002
     circles = {p.label: p.curve for p in part.shape.pieces if p.label}

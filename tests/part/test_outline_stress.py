@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from moved_nodes import node_test
@@ -10,12 +13,11 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
-from dolfinopt.part.check import simulate_bodies
+from dolfinopt.part.check import simulate_parts
+from dolfinopt.part.part import make_parts, mesh_parts
 from dolfinopt.part.plane import stress as plane_stress
-from dolfinopt.part.plane.mesh import mesh_parts
-from dolfinopt.part.plane.part import make_parts
-from dolfinopt.part.plane.stress import OutlineStress
 from dolfinopt.part.solid import stress as solid_stress
+from dolfinopt.part.stress import OutlineStress, stress_of_parts
 from dolfinopt.responses.response import Analysis
 
 pytestmark = pytest.mark.serial
@@ -44,11 +46,14 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     scene = do.load_scene(ROOT / "demos" / f"{base}.toml", (*ROUGHLY, *told, kind))
     stress = plane_stress.corner_stress if plane else solid_stress.corner_stress
 
-    def away(index: int, places: np.ndarray, margin: float) -> np.ndarray:
-        x = places[:, 0] / scene.arms[index].length
-        return (x > 0.15) & (x < 0.85)  # cells end at twelfths, or fifths
+    def middle(length: float, places: np.ndarray, margin: float) -> np.ndarray:
+        return (places[:, 0] > 0.15 * length) & (places[:, 0] < 0.85 * length)
 
-    response = OutlineStress(scene.objective, away, stress)
+    parts = {
+        k: SimpleNamespace(stress=stress, regular=partial(middle, arm.length))
+        for k, arm in enumerate(scene.arms)  # cells end at twelfths, or fifths
+    }
+    response = OutlineStress(scene.objective, parts)
     size = 0.01 if plane else 0.005  # m, of cells of 20 to 100 mm
     found = node_test(scene, solid, size, cut=not plane, response=response)
     assert found.slope != 0.0
@@ -65,12 +70,9 @@ def test_largest_is_that_of_the_part(tmp_path) -> None:
     folder = folder_with(tmp_path / "run", frame, "arms.cells=[100,6]", "simulation.sample=0.005")
     scene = scene_of(folder)
     parts = make_parts(scene, folder)
-    state = simulate_bodies(scene, parts, mesh_parts(parts).coarse)
-    shapes = {k: part.shape for k, part in parts.items()}
-    apart = {k: plane_stress.APART * part.domain.cell for k, part in parts.items()}
-    known = plane_stress.part_stress(state.arms, state.trajectory, shapes, apart)
-    away = plane_stress.away_from_ends(shapes, apart)
-    response = OutlineStress(scene.objective, away, plane_stress.corner_stress)
+    state = simulate_parts(scene, parts, mesh_parts(parts).coarse)
+    known = stress_of_parts(state.arms, state.trajectory, parts)
+    response = OutlineStress(scene.objective, parts)
     designs = {k: arm.current for k, arm in state.arms.items()}
     place = state.scene, state.partition, designs, state.trajectory
     found = response.measure(Analysis(*place, do.Profile()))

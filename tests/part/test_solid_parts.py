@@ -22,7 +22,6 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.part.files.step import solid_text
 from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
-from dolfinopt.part.plane.domain import read_domains
 from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
 from dolfinopt.part.solid.part import make_solid_part, rasterised
@@ -415,14 +414,12 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
     assert parts["link1"].volume == pytest.approx(figures["arms"]["link1"]["volume"], rel=1e-9)
     assert (tmp_path / "parts" / "link1.step").exists()
     told = {}
-    monkeypatch.setattr("dolfinopt.part.check.check_solid_parts",
+    monkeypatch.setattr("dolfinopt.part.check.check_parts",
                         lambda *given: told.update(given=given) or "check")  # fmt: skip
     assert model.check_parts(design) == "check" and told["given"][2].keys() == {1}
 
 
-def test_outlines_of_solids_are_refused(tmp_path):
-    with pytest.raises(InputError, match="arm 'arm1' is a solid"):
-        read_domains(solid_scene(), tmp_path, MPI.COMM_SELF)  # before anything is meshed
+def test_options_of_outlines_are_refused_for_solids(tmp_path):
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
     for option, words in (("--optimize", "--optimize"), ("--curves=arcs", "varies over the thick")):
         with pytest.raises(InputError, match=words):

@@ -13,50 +13,58 @@ from typing import TYPE_CHECKING, Any
 from dolfinopt.disk import write_bytes, write_text, writing
 from dolfinopt.locks import working_in
 from dolfinopt.output.folders import PARTS_LIST, record_of_parts, remove_stale
-from dolfinopt.part.files.drawings import dxf_text, r12_text, svg_text
 from dolfinopt.part.files.scene_file import scene_text
-from dolfinopt.part.files.step import face_text, solid_text
-from dolfinopt.part.files.triangles import stl_bytes
-from dolfinopt.part.plane.mesh import BodyMesh, write_meshes
-from dolfinopt.part.plane.part import Part
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.part.check import Check
     from dolfinopt.part.optimize import Optimized
+    from dolfinopt.part.part import Part, PartMesh
 
 
-FORMATS = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
+PLATE = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
+SOLID = (".stl", ".3mf", ".msh", ".step", ".dxf")
 STAGE = ".part-"  # folder of files about to be renamed
 SCENE, FIGURES = "part.toml", PARTS_LIST
 PICTURES = ("part.png", "deviation.png", "stress.png")
+UNITS = {
+    "area": "m2", "volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m",
+    "tolerance": "m", "tool_radius": "m", "smallest_concave_radius": "m", "thinnest_member": "m",
+    "narrowest_gap": "m", "widths_to": "m", "filter_radius": "m",
+}  # fmt: skip
 
 
 def file_names(scene: Scene) -> list[str]:
     """Return the names of all files, the one that says they are complete first."""
     arms = [
-        arm.name for arm, owner in zip(scene.arms, scene.owners, strict=True) if owner is not None
+        f"{name}{ending}"
+        for name, owner in _owners(scene).items()
+        for ending in (SOLID if scene.arms[owner].is_solid else PLATE)
     ]
-    return [FIGURES, SCENE, *PICTURES, *(f"{arm}{kind}" for arm in arms for kind in FORMATS)]
+    return [FIGURES, SCENE, *PICTURES, *arms]
+
+
+def _owners(scene: Scene) -> dict[str, int]:
+    """Return which arm's design each arm with a part has, by its name."""
+    owned = zip(scene.arms, scene.owners, strict=True)
+    return {arm.name: owner for arm, owner in owned if owner is not None}
 
 
 def figures_of(
     scene: Scene,
     parts: Mapping[int, Part],
+    meshes: Mapping[int, PartMesh] | None = None,
     check: Check | None = None,
     optimized: Optimized | None = None,
 ) -> dict[str, Any]:
     """Return the content of part.json."""
     arms = {
-        arm.name: parts[owner].figures(scene.material_of(owner).density)
-        for arm, owner in zip(scene.arms, scene.owners, strict=True)
-        if owner is not None
+        name: parts[k].figures(scene.material_of(k).density)
+        | ({} if meshes is None else {"mesh": meshes[k].figures()})
+        for name, k in _owners(scene).items()
     }
-    units = {
-        "area": "m2", "volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m",
-        "tolerance": "m", "tool_radius": "m", "smallest_concave_radius": "m",
-        "thinnest_member": "m",
-    }  # fmt: skip
+    known = {key for row in arms.values() for key in row}
+    units = {key: unit for key, unit in UNITS.items() if key in known}
     checked = {} if check is None else check.to_dict()
     if optimized is not None:
         checked["optimize"] = optimized.to_dict()
@@ -67,7 +75,7 @@ def write_parts(
     folder: Path,
     scene: Scene,
     parts: Mapping[int, Part],
-    meshes: Mapping[int, BodyMesh],
+    meshes: Mapping[int, PartMesh] | None = None,
     check: Check | None = None,
     optimized: Optimized | None = None,
     pictures: Callable[[Path], None] | None = None,
@@ -82,7 +90,7 @@ def write_parts(
         folder: exists.
         scene: of the arms.
         parts: by their place in the chain.
-        meshes: that the scene of the parts has, likewise.
+        meshes: that the scene of the parts has, likewise; None: there is no part.toml.
         check, optimized: what the parts do, and what optimising their shape brought, if it is
             known.
         pictures: draws `PICTURES` into a folder.
@@ -94,14 +102,17 @@ def write_parts(
     """
     with tempfile.TemporaryDirectory(prefix="dolfinopt-part-") as name:
         made = Path(name)
-        _write_drawings(made, scene, parts)
-        _write_steps(made, scene, parts)
-        write_text(made / SCENE, scene_text(scene, parts, folder))
-        owned = zip(scene.arms, scene.owners, strict=True)
-        write_meshes(made, {arm.name: meshes[k] for arm, k in owned if k is not None})
+        for arm, k in _owners(scene).items():
+            for ending, data in parts[k].files(arm, f"{arm} of {scene.name}"):
+                raw = data.encode() if isinstance(data, str) else data
+                write_bytes(made / f"{arm}{ending}", raw)
+            if meshes is not None:
+                meshes[k].write(made / f"{arm}.msh")
+        if meshes is not None:
+            write_text(made / SCENE, scene_text(scene, parts, folder))
         if pictures is not None:
             pictures(made)
-        figures = figures_of(scene, parts, check, optimized)
+        figures = figures_of(scene, parts, meshes, check, optimized)
         publish(made, folder, file_names(scene), figures, design)
     return figures
 
@@ -137,28 +148,3 @@ def _replace(made: Path, folder: Path, names: Sequence[str]) -> None:
                 os.replace(stage / name, folder / name)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
-
-
-def _of_arms(scene: Scene, parts: Mapping[int, Part]) -> Sequence[tuple[str, Part]]:
-    """Return the names of all arms with a part; some may share one."""
-    return [
-        (arm.name, parts[owner])
-        for arm, owner in zip(scene.arms, scene.owners, strict=True)
-        if owner is not None
-    ]
-
-
-def _write_drawings(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> None:
-    for name, part in _of_arms(scene, parts):
-        shape, title = part.shape, f"{name} of {scene.name}"
-        write_text(folder / f"{name}.dxf", dxf_text(shape))
-        write_text(folder / f"{name}_r12.dxf", r12_text(shape, 0.5 * part.tolerance))
-        write_text(folder / f"{name}.svg", svg_text(shape, title))
-        data = stl_bytes(shape, part.domain.thickness, 0.5 * part.tolerance, title)
-        write_bytes(folder / f"{name}.stl", data)
-
-
-def _write_steps(folder: Path, scene: Scene, parts: Mapping[int, Part]) -> None:
-    for name, part in _of_arms(scene, parts):
-        write_text(folder / f"{name}_face.step", face_text(part.shape, name))
-        write_text(folder / f"{name}.step", solid_text(part.shape, part.domain.thickness, name))

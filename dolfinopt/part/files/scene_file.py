@@ -7,26 +7,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from dolfinopt.part.plane.part import Part
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import with_relative_paths
 
 if TYPE_CHECKING:
-    from dolfinopt.part.solid.part import SolidPart
+    from dolfinopt.part.part import Part
 
 
 def scene_text(scene: Scene, parts: Mapping[int, Part], folder: Path) -> str:
-    """Return the text of a scene in which the arms are solid parts.
+    """Return the text of a scene in which the arms are parts of solid material.
 
     Args:
         scene: of the run.
         parts: by their place in the chain.
-        folder: where the scene and the parts' files will lie.
+        folder: where the scene and the meshes NAME.msh will lie.
     """
     head = (
-        "# The arms as parts, meshed along their curves: simulate and study them like any scene.\n"
+        "# The arms as parts, with meshes of their own: simulate and study them like any scene.\n"
         f"# Made of the design of {scene.name}.\n"
     )
     return head + toml_text(with_relative_paths(scene_data(scene, parts, folder), folder))
@@ -44,53 +41,10 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
     for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
         if owner is not None:
             name = scene.arms[owner].name if arm.design else arm.name
-            row.update(_arm(parts[owner], meshes.absolute() / f"{name}.msh"))
+            row.update(_meshed(meshes.absolute() / f"{name}.msh") | parts[owner].keys())
     # All of it stays solid; what else there is to say of a design has no use.
     data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
     return data
-
-
-def solid_scene_text(scene: Scene, parts: Mapping[int, SolidPart], folder: Path) -> str:
-    """Return the text of a scene in which the arms are parts, meshed with tetrahedra.
-
-    Args:
-        scene: of the run, in space.
-        parts: by their place among the arms.
-        folder: where the scene and the meshes NAME.msh will lie.
-    """
-    head = (
-        "# The arms as parts, meshed with tetrahedra: simulate and study them like any scene.\n"
-        f"# Made of the design of {scene.name}.\n"
-    )
-    return head + toml_text(with_relative_paths(solid_scene_data(scene, parts, folder), folder))
-
-
-def solid_scene_data(scene: Scene, parts: Mapping[int, SolidPart], meshes: Path) -> dict[str, Any]:
-    """Return the data of `solid_scene_text` with absolute paths.
-
-    Args:
-        scene, parts: as there.
-        meshes: folder of the meshes, NAME.msh.
-    """
-    data = scene.to_tree()
-    data["name"] = f"{scene.name}: part"
-    for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
-        if owner is None:
-            continue
-        name = scene.arms[owner].name if arm.design else arm.name
-        row.update(_meshed(meshes.absolute() / f"{name}.msh"))
-        size = np.ptp(parts[owner].surface.points, axis=0)
-        row["height"], row["thickness"] = float(size[1]), float(size[2])
-        row["cell_shape"] = "tetrahedron"
-        row["symmetric_z"] = row["extruded"] = False
-    data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
-    return data
-
-
-def _arm(part: Part, mesh: Path) -> dict[str, Any]:
-    """Return the keys of an arm that is a part."""
-    corners = np.vstack(part.shape.polygons(part.tolerance))
-    return _meshed(mesh) | {"height": float(np.ptp(corners[:, 1]))}
 
 
 def _meshed(mesh: Path) -> dict[str, Any]:

@@ -9,20 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
 
-from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, sampled
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
     from shapely import Geometry
 
     from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -397,41 +394,6 @@ class Domain:
         """Share of the material in cells of densities between 0.1 and 0.9."""
         gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
         return float((self.x_phys * self.area)[gray].sum() / self.volume)
-
-
-def read_domains(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, Domain]:
-    """Return this rank's share of the arms with a design of their own (collective).
-
-    Each arm is whole on one rank, so that its domain is the same on any number of them.
-
-    Returns:
-        Domains by their place in the chain.
-
-    Raises:
-        InputError: the folder holds no design, or one that does not fit the scene's arms; on all
-            ranks.
-    """
-    from dolfinopt.mesh.arm_mesh import arm_mesh
-    from dolfinopt.mesh.budget import check_budget
-    from dolfinopt.output.design import read_smooth_design
-    from dolfinopt.parallel import partition_arms, together
-
-    for k in scene.cell_counts:
-        if scene.arms[k].is_solid:
-            raise InputError(
-                f"{folder}: arm {scene.arms[k].name!r} is a solid: parts are outlines of arms in "
-                "plane stress, cells = [along, across]; surfaces of solids: `dolfinopt part`"
-            )
-    check_budget(world, scene)
-    partition = partition_arms(world, scene.cell_counts, whole=True)
-    patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
-    with together(world):
-        meshes = {
-            k: arm_mesh(partition.comm, scene.arms[k], patterns.get(k)) for k in partition.arms
-        }
-    designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
-    with together(world):
-        return {k: domain_of(scene, k, mesh, *designs[k]) for k, mesh in meshes.items()}
 
 
 def domain_of(

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import InputError
 from dolfinopt.part.plane.curves import DEGREE, MIRROR, Line, Piece, Shape, Spline
 from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
-from dolfinopt.part.plane.part import Part
+from dolfinopt.part.plane.part import PlanePart
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -142,7 +142,7 @@ class FreeOutline:
         partner: (count,) control point that moves the mirror image; None without symmetry.
     """
 
-    part: Part
+    part: PlanePart
     loops: tuple[tuple[Piece | int, ...], ...]
     runs: tuple[Run, ...]
     arm: Geometry
@@ -346,7 +346,7 @@ def _samples(piece: Piece, spacing: float) -> np.ndarray:
     return np.linspace(0.0, 1.0, 4 * count)
 
 
-def free_outline(part: Part) -> FreeOutline:
+def free_outline(part: PlanePart) -> FreeOutline:
     """Return the outline of a part with free runs of evenly spaced control points.
 
     Raises:

@@ -1,6 +1,4 @@
-"""Triangles of a part: nodes of the outline on the curves, cut in four, moved with the curves.
-
-Body-fitted meshes of parts: triangles along the curves, for the finite elements.
+"""Meshes of plane parts: triangles along the curves, moved with the curves, written.
 
 The outline's nodes stand on the curves, moved outwards by what the straight sides between them
 would cut off: the mesh has the part's area, and the error of its outline is one of shape alone.
@@ -8,11 +6,11 @@ would cut off: the mesh has the part's area, and the error of its outline is one
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,10 +18,11 @@ from mpi4py import MPI
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from dolfinopt.errors import ConvergenceError
-from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, NAMES, OUTBOARD, TRIANGLE, gmsh_on_root
+from dolfinopt.disk import write_bytes
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.geometry import msh_bytes
+from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, TRIANGLE, gmsh_on_root
 from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
-from dolfinopt.part.plane.part import Part
 
 CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner
 FOLDED = 1e-3  # area of a triangle over the median's below which it counts as folded
@@ -51,10 +50,47 @@ class BodyMesh:
     piece: np.ndarray
     span: np.ndarray
 
+    kind: ClassVar[str] = "triangles"
+
     @property
     def area(self) -> float:
         """Area of the triangles, m2."""
         return float(triangle_areas(self.points, self.triangles).sum())
+
+    @property
+    def cells(self) -> np.ndarray:
+        """The triangles."""
+        return self.triangles
+
+    @property
+    def inboard(self) -> np.ndarray:
+        """Sides (k, 2) of the inboard interface."""
+        return self.sides[self.labelled(NAMES[INBOARD])]
+
+    @property
+    def outboard(self) -> np.ndarray:
+        """Sides (k, 2) of the outboard interface."""
+        return self.sides[self.labelled(NAMES[OUTBOARD])]
+
+    @property
+    def quality(self) -> np.ndarray:
+        """Shape (m,) of the triangles: 4 sqrt(3) area / sum of squared sides, 1 if equilateral."""
+        corners = self.points[self.triangles]
+        sides = np.square(corners - np.roll(corners, 1, axis=1)).sum(axis=(1, 2))
+        return 4.0 * np.sqrt(3.0) * triangle_areas(self.points, self.triangles) / sides
+
+    def figures(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+        return {
+            self.kind: len(self.triangles),
+            "area": self.area,
+            "least_quality": float(self.quality.min()),
+            "mean_quality": float(self.quality.mean()),
+        }
+
+    def write(self, path: Path) -> None:
+        """Write it as `arms.mesh` reads it back (.msh)."""
+        write_bytes(path, msh_bytes(self))
 
     @property
     def is_folded(self) -> bool:
@@ -66,29 +102,6 @@ class BodyMesh:
         """Return which sides (k,) belong to pieces of a label."""
         of = np.array([piece.label == label for piece in self.shape.pieces])
         return of[self.piece]
-
-    def refined(self) -> BodyMesh:
-        """Return the mesh with every triangle cut in four, new nodes on the curves."""
-        ends = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        count = len(self.points)
-        keys, which = np.unique(ends @ [count, 1], return_inverse=True)
-        first, second = np.divmod(keys, count)
-        points = np.vstack([self.points, 0.5 * (self.points[first] + self.points[second])])
-        ab, bc, ca = (count + which.reshape(-1, 3)).T
-        a, b, c = self.triangles.T
-        quarters = [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
-        triangles = np.stack([np.stack(q, axis=1) for q in quarters], axis=1).reshape(-1, 3)
-        middle = count + np.searchsorted(keys, np.sort(self.sides, axis=1) @ [count, 1])
-        half = self.span.mean(axis=1)
-        fine = BodyMesh(
-            self.shape,
-            points,
-            triangles,
-            np.stack([self.sides[:, 0], middle, middle, self.sides[:, 1]], axis=1).reshape(-1, 2),
-            np.repeat(self.piece, 2),
-            np.stack([self.span[:, 0], half, half, self.span[:, 1]], axis=1).reshape(-1, 2),
-        )
-        return fine.fitted()
 
     def fitted(self) -> BodyMesh:
         """Return the mesh with the outline's nodes where the curves want them."""
@@ -202,7 +215,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-COARSER = 2.0  # sides of the triangles of the mesh with which the one of the scene is compared
 TURN = 0.9  # of the outline along a side of a cell, rad
 WALL = 1.0  # side of a cell over the width of the member
 LARGEST = 2.5  # side of a cell, cells of the design
@@ -214,70 +226,31 @@ NEAREST = 48  # places around each that may be the other side of a member
 OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
-def finer_meshes(
-    parts: Mapping[int, Part], places: Mapping[int, Sequence[np.ndarray]]
-) -> dict[int, BodyMesh]:
-    """Return fine meshes of parts with shorter sides near places, see `body_mesh`."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        return {
-            k: body_mesh(gmsh, one.shape, one.domain.cell, finer=places[k])
-            for k, one in parts.items()
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Meshes:
-    """Meshes of parts by their place in the chain.
-
-    Attributes:
-        coarse: to tell by how much figures depend on the mesh.
-        fine: with `COARSER` times shorter sides; those of the parts' scene.
-    """
-
-    coarse: Mapping[int, BodyMesh]
-    fine: Mapping[int, BodyMesh]
-
-
-def mesh_parts(parts: Mapping[int, Part]) -> Meshes:
-    """Return the meshes of parts by their place in the chain, on this rank alone."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        coarse, fine = (
-            {k: body_mesh(gmsh, one.shape, one.domain.cell, size) for k, one in parts.items()}
-            for size in (COARSER, 1.0)
-        )
-    return Meshes(coarse, fine)
-
-
 def body_mesh(
-    gmsh: Any,
-    shape: Shape,
-    cell: float,
-    coarser: float = 1.0,
-    finer: Sequence[np.ndarray] = (),
+    shape: Shape, cell: float, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
     Args:
-        gmsh: with an open session on this process.
         shape: m.
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near each of which sides are halved, once for every array.
 
     Raises:
-        ConvergenceError: straight sides along its curves cross each other, however short.
+        InputError: straight sides along its curves cross each other, however short.
     """
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
     sizes = [coarser * size for size in _sizes(shape, samples, cell, finer)]
     for _ in range(FINER):
         outline = _outline(shape, samples, sizes, coarser * TURN)
         if outline.is_simple:  # Gmsh would end the process
-            points, triangles = _triangulated(gmsh, outline)
+            points, triangles = _triangulated(outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
         sizes = [0.5 * size for size in sizes]
-    raise ConvergenceError("the outline of a part cannot be meshed: its curves nearly touch")
+    raise InputError("the outline of a part cannot be meshed: its curves nearly touch")
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,10 +371,13 @@ def _divided(
     return at, np.interp(at[:-1], t, size)
 
 
-def _triangulated(gmsh: Any, outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
+def _triangulated(outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
     """Return points, those of the outline first and in its order, and triangles between them."""
-    gmsh.clear()
-    gmsh.model.add("mesh")
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        return _by_gmsh(gmsh, outline)
+
+
+def _by_gmsh(gmsh: Any, outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
     geo, corners = gmsh.model.geo, np.vstack(outline.loops)
     tags = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(corners, outline.sizes, strict=True)]
     rings, first = [], 0
@@ -428,39 +404,3 @@ def _triangulated(gmsh: Any, outline: _Outline) -> tuple[np.ndarray, np.ndarray]
     turned = triangle_areas(points, triangles) < 0.0
     triangles[turned] = triangles[turned][:, ::-1]
     return points, triangles
-
-
-def write_meshes(folder: Path, meshes: Mapping[str, BodyMesh]) -> None:
-    """Write NAME.msh of every mesh, by the arm's name, into a folder."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        for name, mesh in meshes.items():
-            write_mesh(gmsh, folder / f"{name}.msh", mesh)
-
-
-def write_mesh(gmsh: Any, path: Path, mesh: BodyMesh) -> None:
-    """Write a mesh with the groups that `arms.mesh` reads back (.msh).
-
-    Args:
-        gmsh: with an open session on this process.
-        path: ends in .msh.
-        mesh: m.
-    """
-    gmsh.clear()
-    model = gmsh.model
-    model.add("part")
-    surface = model.addDiscreteEntity(2)
-    tags = np.arange(1, len(mesh.points) + 1)
-    places = np.c_[mesh.points, np.zeros(len(mesh.points))]
-    model.mesh.addNodes(2, surface, tags, places.ravel())
-    model.mesh.addElementsByType(surface, TRIANGLE, [], mesh.triangles.ravel() + 1)
-    model.addPhysicalGroup(2, [surface], DESIGN)
-    model.setPhysicalName(2, DESIGN, NAMES[DESIGN])
-    for group in (INBOARD, OUTBOARD):
-        curve = model.addDiscreteEntity(1)
-        sides = mesh.sides[mesh.labelled(NAMES[group])]
-        model.mesh.addElementsByType(curve, 1, [], sides.ravel() + 1)
-        model.addPhysicalGroup(1, [curve], group)
-        model.setPhysicalName(1, group, NAMES[group])
-    gmsh.option.setNumber("Mesh.Binary", 1)
-    gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
-    gmsh.write(str(path))

@@ -1,32 +1,38 @@
-"""From a folder of results to the parts of its arms, and their figures."""
+"""The part of a plate: its outline in curves."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.part.files.drawings import dxf_text, r12_text, svg_text
+from dolfinopt.part.files.step import face_text, solid_text
+from dolfinopt.part.files.triangles import stl_bytes
+from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.domain import Domain, read_domains
+from dolfinopt.part.plane.domain import Domain
+from dolfinopt.part.plane.mesh import BodyMesh, body_mesh
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline, thinnest_member
+from dolfinopt.part.plane.stress import corner_stress, is_regular
 from dolfinopt.part.plane.trace import make_shape
-from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
+    from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.part.stress import CornerStress
 
 
 TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
-LEAST = 1e-7  # m, the finest tolerance: that of CAD programs
 TRIES, ENOUGH = 3, 0.98  # of the radius of concave corners; share of the tool's that will do
-GRAY = 0.02  # grayness from which on a design is no longer close to any part
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """The part of one arm.
+class PlanePart:
+    """The part of one arm in the plane, see `part.Part`.
 
     Attributes:
         domain: the arm and its design.
@@ -41,6 +47,30 @@ class Part:
     shape: Shape
     tolerance: float
     thinnest: float | None
+
+    COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
+    REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
+    has_curves: ClassVar[bool] = True
+
+    @property
+    def name(self) -> str:
+        """The arm's name."""
+        return self.domain.name
+
+    @property
+    def volume(self) -> float:
+        """Within its curves, m3."""
+        return self.shape.area * self.domain.thickness
+
+    @property
+    def sentence(self) -> str:
+        """Its size in words."""
+        shape = self.shape
+        points = f" with {shape.control_points} control points" if shape.control_points else ""
+        return (
+            f"{1e6 * shape.area:.6g} mm2, {len(shape.loops) - 1} holes, {len(shape.curves)} "
+            f"curves{points}, at most {1e3 * shape.distance:.2g} mm from the outline"
+        )
 
     @property
     def warnings(self) -> list[str]:
@@ -79,12 +109,11 @@ class Part:
             density: of the material, kg/m3.
         """
         one, shape = self.domain, self.shape
-        volume = shape.area * one.thickness
         radius = shape.concave_radius
         return {
             "area": shape.area,
-            "volume": volume,
-            "mass": density * volume,
+            "volume": self.volume,
+            "mass": density * self.volume,
             "design_volume": one.volume * one.thickness,
             "level": self.outline.level,
             "distance": shape.distance,
@@ -101,67 +130,37 @@ class Part:
             "warnings": self.warnings,
         }
 
+    def keys(self) -> dict[str, Any]:
+        """Return the keys of its arm in part.toml, but for the mesh."""
+        corners = np.vstack(self.shape.polygons(self.tolerance))
+        return {"height": float(np.ptp(corners[:, 1]))}
 
-def make_parts(
-    scene: Scene,
-    folder: Path,
-    tool_radius: float | None = None,
-    tolerance: float | None = None,
-    arcs: bool = False,
-    world: MPI.Comm | None = None,
-) -> dict[int, Part]:
-    """Make the parts of the arms that have a design of their own (collective on `world`).
+    def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
+        """Yield how the names of its files end, and what they hold; `name` and title of it."""
+        shape, thickness, chord = self.shape, self.domain.thickness, 0.5 * self.tolerance
+        yield ".step", solid_text(shape, thickness, name)
+        yield "_face.step", face_text(shape, name)
+        yield ".dxf", dxf_text(shape)
+        yield "_r12.dxf", r12_text(shape, chord)
+        yield ".svg", svg_text(shape, title)
+        yield ".stl", stl_bytes(shape, thickness, chord, title)
 
-    Args:
-        scene: of the run.
-        folder: with its design.npz.
-        tool_radius: of concave corners, m; default a fifth of a cell.
-        tolerance: of the curves, m; default 0.1 mm or a tenth of a cell, the smaller.
-        arcs: lines and arcs in place of splines.
-        world: the ranks that share the arms; by default this one alone.
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> BodyMesh:
+        """Return triangles along its curves, see `part.Part`."""
+        return body_mesh(self.shape, self.domain.cell, coarser, finer)
 
-    Returns:
-        Parts by their place in the chain, the same on any number of ranks; on the root, none
-        elsewhere.
+    def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
+        """Return which places (n, 2) are away from where stress has no limit (n,)."""
+        return is_regular(self.shape, self.domain.cell, places, margin)
 
-    Raises:
-        InputError: no design in the folder, or no part can be made of it with these values; on all
-            ranks.
-    """
-    from mpi4py import MPI
-
-    from dolfinopt.parallel import on_root, together
-
-    world = MPI.COMM_SELF if world is None else world
-    on_root(world, check_options, folder, tool_radius, tolerance)
-    domains = read_domains(scene, folder, world)
-    with together(world):
-        mine = {k: make_part(one, tool_radius, tolerance, arcs) for k, one in domains.items()}
-    found: dict[int, Part] = {}
-    for pieces in world.gather(mine, root=0) or ():
-        found.update(pieces)
-    return {k: found[k] for k in sorted(found)}
+    def stress(self, state: DesignState) -> CornerStress:
+        """Return the stress at the corners of the triangles of its arm."""
+        return corner_stress(state)
 
 
-def check_options(folder: Path, tool_radius: float | None, tolerance: float | None) -> None:
-    """Raise InputError unless the folder has a design and the options are in range."""
-    for name, value, least in (
-        ("--tool-radius", tool_radius, 0.0),
-        ("--tolerance", tolerance, LEAST),
-    ):
-        if value is not None and not (math.isfinite(value) and value >= least):
-            raise InputError(f"{name} = {value:g} m: expected a length of at least {least:g} m")
-    if not (folder / "design.npz").is_file():
-        raise InputError(
-            f"{folder / 'design.npz'}: no design there; name the folder of a finished optimize or "
-            "simulate run"
-        )
-
-
-def make_part(
-    domain: Domain, tool_radius: float | None, tolerance: float | None, arcs: bool = False
-) -> Part:
-    """Return the part of one arm, see `make_parts`."""
+def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
+    """Return the part of one arm, see `part.make_parts`."""
+    tool_radius, tolerance = curves.tool_radius, curves.tolerance
     if tolerance is None:
         tolerance = min(TOLERANCE, CELLS * domain.cell)
     elif tolerance > domain.cell:
@@ -175,12 +174,12 @@ def make_part(
     rounding = None
     for _ in range(TRIES):
         outline = draw_outline(domain, tool, tolerance, rounding)
-        shape = make_shape(outline, tolerance, arcs)
+        shape = make_shape(outline, tolerance, curves.arcs)
         radius = shape.concave_radius
         if radius >= least:
             break
         rounding = outline.rounding * min(1.1 * tool / radius, 2.0)
-    return Part(domain, outline, shape, tolerance, thinnest_member(outline))
+    return PlanePart(domain, outline, shape, tolerance, thinnest_member(outline))
 
 
 def _count(number: int, name: str) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +13,6 @@ from dolfinopt.part.plane.domain import Domain, domain_of
 from dolfinopt.scene.load import Arm, Scene
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from dolfinopt.mesh.arm_mesh import ArmMesh
 
 
@@ -98,35 +95,6 @@ class SolidDomain:
         """Share of the material in cells of densities between 0.1 and 0.9."""
         gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
         return float((self.x_phys * self.sizes)[gray].sum() / self.volume)
-
-
-def read_solid_domains(scene: Scene, folder: Path, world: MPI.Comm) -> dict[int, SolidDomain]:
-    """Return this rank's share of the solid arms with a design of their own (collective).
-
-    Each arm is whole on one rank, so that its domain is the same on any number of them.
-
-    Returns:
-        Domains by their place among the arms.
-
-    Raises:
-        InputError: the folder holds no design, or one that does not fit the scene's arms; on all
-            ranks.
-    """
-    from dolfinopt.mesh.arm_mesh import arm_mesh
-    from dolfinopt.mesh.budget import check_budget
-    from dolfinopt.output.design import read_smooth_design
-    from dolfinopt.parallel import partition_arms, together
-
-    check_budget(world, scene)
-    partition = partition_arms(world, scene.cell_counts, whole=True)
-    patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
-    with together(world):
-        meshes = {
-            k: arm_mesh(partition.comm, scene.arms[k], patterns.get(k)) for k in partition.arms
-        }
-    designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
-    with together(world):
-        return {k: domain_in_scene(scene, k, mesh, *designs[k]) for k, mesh in meshes.items()}
 
 
 def domain_in_scene(

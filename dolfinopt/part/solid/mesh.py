@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra, tetrahedra_of
-from dolfinopt.part.plane.part import Part
-from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
-COARSER = 1.6  # sides of the cells of the mesh with which the scene's is compared
+if TYPE_CHECKING:
+    from dolfinopt.part.plane.part import PlanePart
+    from dolfinopt.part.solid.part import SolidPart
+
+
 # What is tried until a mesh is valid: angles, degrees, from which on there are edges between faces,
 # and sides, of those wanted.
 TRIES = ((40.0, 1.0), (60.0, 1.0), (80.0, 1.0), (40.0, 0.75), (60.0, 0.75), (40.0, 0.5))
@@ -25,31 +27,6 @@ LEAST = 1e-3  # shape of the worst cell, of a valid mesh
 SAME_VOLUME = 1e-4  # relative, of a mesh that is taken to the part
 ROUNDS = 10  # of holding points whose cells a correction of the volume would spoil
 APART = 1e-6  # relative, of a mesh's volume to the part's
-
-
-@dataclass(frozen=True, eq=False)
-class SolidMeshes:
-    """Meshes of solid parts by their place among the arms.
-
-    Attributes:
-        coarse: to tell by how much figures depend on the mesh.
-        fine: those of the parts' scene, cells about as large as the design's.
-    """
-
-    coarse: Mapping[int, Tetrahedra]
-    fine: Mapping[int, Tetrahedra]
-
-
-def mesh_solid_parts(parts: Mapping[int, SolidPart], coarse: bool = True) -> SolidMeshes:
-    """Return the meshes of parts, on this process alone; `coarse` ones if they are wanted.
-
-    Raises:
-        InputError: Gmsh cannot mesh a part.
-    """
-    sizes = {k: mesh_size(part) for k, part in parts.items()}
-    fine = {k: solid_mesh(part, sizes[k]) for k, part in parts.items()}
-    found = {k: solid_mesh(part, COARSER * sizes[k]) for k, part in parts.items() if coarse}
-    return SolidMeshes(found, fine)
 
 
 def mesh_size(part: SolidPart) -> float:
@@ -107,16 +84,9 @@ def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     return tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
 
 
-def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
+def _plate_mesh(part: SolidPart, flat: PlanePart, size: float) -> Tetrahedra:
     """Return prisms over the triangles of a plate, each cut in three."""
-    from mpi4py import MPI
-
-    from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, gmsh_on_root
-    from dolfinopt.part.plane.mesh import body_mesh
-
-    cell = flat.domain.cell
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        face = body_mesh(gmsh, flat.shape, cell, size / cell)
+    face = flat.mesh(size / flat.domain.cell)
     thickness = flat.domain.thickness
     layers = max(1, round(thickness / size))
     count = len(face.points)
@@ -133,7 +103,7 @@ def _plate_mesh(part: SolidPart, flat: Part, size: float) -> Tetrahedra:
         axis=1,
     ).reshape(-1, 4)
     cells = np.concatenate([prism + layer * count for layer in range(layers)])
-    ends = [np.sort(face.sides[face.labelled(NAMES[g])], axis=1) for g in (INBOARD, OUTBOARD)]
+    ends = [np.sort(sides, axis=1) for sides in (face.inboard, face.outboard)]
     walls = []
     for sides in ends:
         a, b = sides.T

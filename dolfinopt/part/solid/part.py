@@ -1,25 +1,29 @@
-"""How wide the thinnest member and the narrowest gap of a solid part are, on a raster of voxels.
-
-From the density of a solid arm to its part: a closed surface, smooth, of the same volume.
+"""The part of a solid arm: a closed surface, smooth, of its design's volume.
 
 A design that is the same over the thickness is a plate: its part is that of the plane, extruded.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from dolfinopt.density.members import WIDE, narrowest, voxel_size, widest
 from dolfinopt.errors import InputError
-from dolfinopt.part.files.triangles import extruded_facets
+from dolfinopt.mesh.geometry import Tetrahedra
+from dolfinopt.part.files.drawings import dxf_text
+from dolfinopt.part.files.step import solid_text
+from dolfinopt.part.files.triangles import MM, extruded_facets, three_mf_bytes, triangle_bytes
+from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.part import Part, check_options, make_part
-from dolfinopt.part.solid.domain import SolidDomain, read_solid_domains
+from dolfinopt.part.plane.part import PlanePart, make_part
+from dolfinopt.part.solid.domain import SolidDomain
+from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
+from dolfinopt.part.solid.stress import corner_stress, is_regular
 from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
@@ -29,12 +33,10 @@ from dolfinopt.part.solid.surface import (
     smooth_surface,
     with_volume,
 )
-from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
-    from dolfinopt.part.solid.domain import SolidDomain
+    from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.part.stress import CornerStress
 
 
 OPEN = 2.0  # cells around the arm that count as void
@@ -110,7 +112,6 @@ def _cropped(solid: np.ndarray) -> np.ndarray:
 SAME_VOLUME = 1e-4  # relative, of the part to the design
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
 HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
-GRAY = 0.02  # grayness from which on a design is no longer close to any part
 ROUNDS = 8  # of taking smoothing back where the surface would cross itself
 LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
 NARROW = 0.9  # of the width asked for, below which a member or gap is told
@@ -118,7 +119,7 @@ NARROW = 0.9  # of the width asked for, below which a member or gap is told
 
 @dataclass(frozen=True, eq=False)
 class SolidPart:
-    """The part of one solid arm.
+    """The part of one solid arm, see `part.Part`.
 
     Attributes:
         domain: the arm and its design.
@@ -137,12 +138,34 @@ class SolidPart:
     distance: float
     pieces: int
     pieces_volume: float
-    flat: Part | None = None
+    flat: PlanePart | None = None
+
+    COARSER: ClassVar[float] = 1.6  # sides of the mesh with which the one of the scene is compared
+    REFINEMENTS: ClassVar[int] = 0  # of the mesh where stress is largest
 
     @property
     def name(self) -> str:
         """The arm's name."""
         return self.domain.name
+
+    @property
+    def has_curves(self) -> bool:
+        """Whether it is extruded; other surfaces are free-form, in triangles."""
+        return self.flat is not None
+
+    @property
+    def sentence(self) -> str:
+        """Its size in words."""
+        rows = f"{len(self.surface.triangles)} triangles"
+        where = f"the isosurface at density {self.level:.3g}"
+        if self.flat is not None:
+            rows, where = f"{len(self.flat.shape.curves)} curves", "the outline"
+        widths = {"thinnest member": self.widths.member, "narrowest gap": self.widths.gap}
+        thin = [f"{name} {1e3 * w:.2g} mm" for name, w in widths.items() if w is not None]
+        return (
+            f"{1e9 * self.volume:.6g} mm3, {rows}, at most {1e3 * self.distance:.2g} mm from "
+            f"{where}, {', '.join(thin) or 'nothing thin'}"
+        )
 
     @cached_property
     def widths(self) -> Widths:
@@ -246,64 +269,55 @@ class SolidPart:
             "warnings": self.warnings,
         }
 
+    def keys(self) -> dict[str, Any]:
+        """Return the keys of its arm in part.toml, but for the mesh."""
+        _, height, thickness = map(float, np.ptp(self.surface.points, axis=0))
+        return {
+            "height": height,
+            "thickness": thickness,
+            "cell_shape": "tetrahedron",
+            "symmetric_z": False,
+            "extruded": False,
+        }
 
-def make_solid_parts(
-    scene: Scene,
-    folder: Path,
-    world: MPI.Comm,
-    tool_radius: float | None = None,
-    tolerance: float | None = None,
-    arcs: bool = False,
-) -> dict[int, SolidPart]:
-    """Make the parts of the solid arms that have a design of their own (collective).
+    def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
+        """Yield how the names of its files end, and what they hold; `name` and title of it."""
+        yield ".stl", triangle_bytes(MM * self.surface.corners, f"{title}, mm")
+        yield ".3mf", three_mf_bytes(self.surface, name)
+        if self.flat is not None:
+            shape, t = self.flat.shape, self.flat.domain.thickness
+            yield ".step", solid_text(shape, t, name, -0.5 * t)
+            yield ".dxf", dxf_text(shape)
 
-    Args:
-        scene: of the run.
-        folder: with its design.npz.
-        world: the ranks that share the arms.
-        tool_radius, tolerance, arcs: of designs that are the same over the thickness, see
-            `part.make_parts`.
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> Tetrahedra:
+        """Return tetrahedra, all about as large, see `part.Part`."""
+        return solid_mesh(self, coarser * mesh_size(self))
 
-    Returns:
-        Parts by their place among the arms, on the root; none elsewhere.
+    def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
+        """Return which places (n, 3) are away from where stress has no limit (n,)."""
+        return is_regular(self.domain, places, margin)
 
-    Raises:
-        InputError: no design in the folder, or no part can be made of it; on all ranks.
-    """
-    from dolfinopt.parallel import on_root, together
-
-    on_root(world, check_options, folder, tool_radius, tolerance)
-    domains = read_solid_domains(scene, folder, world)
-    curved = arcs or tool_radius is not None or tolerance is not None
-    with together(world):
-        for one in domains.values():
-            if curved and one.flat is None:
-                raise InputError(
-                    f"arm {one.name!r}: its design varies over the thickness, so that its part "
-                    "has no curves: leave out --tool-radius, --tolerance and --curves, or "
-                    "optimise with arms.extruded = true"
-                )
-        mine = {k: make_solid_part(one, tool_radius, tolerance, arcs) for k, one in domains.items()}
-    found: dict[int, SolidPart] = {}
-    for pieces in world.gather(mine, root=0) or ():
-        found.update(pieces)
-    return {k: found[k] for k in sorted(found)}
+    def stress(self, state: DesignState) -> CornerStress:
+        """Return the stress at the corners of the tetrahedra of its arm."""
+        return corner_stress(state)
 
 
-def make_solid_part(
-    domain: SolidDomain,
-    tool_radius: float | None = None,
-    tolerance: float | None = None,
-    arcs: bool = False,
-) -> SolidPart:
-    """Return the part of one solid arm, see `make_solid_parts`.
+def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart:
+    """Return the part of one solid arm, see `part.make_parts`.
 
     Raises:
-        InputError: it does not hang together, or no level of the density keeps its volume.
+        InputError: it does not hang together, no level of the density keeps its volume, or curves
+            are asked for that it has not.
     """
     if domain.flat is None:
+        if not curves.is_default:
+            raise InputError(
+                f"arm {domain.name!r}: its design varies over the thickness, so that its part has "
+                "no curves: leave out --tool-radius, --tolerance and --curves, or optimise with "
+                "arms.extruded = true"
+            )
         return _freeform_part(domain)
-    part = make_part(domain.flat, tool_radius, tolerance, arcs)
+    part = make_part(domain.flat, curves)
     outline, t = part.outline, domain.flat.thickness
     surface = _prism(part.shape, t, 0.5 * part.tolerance)
     lost = t * outline.islands_area

@@ -1,13 +1,11 @@
-"""Stress of solid parts where it is largest, at the corners of quadratic tetrahedra.
+"""Where the stress of solid parts is known: on their surface, away from singular edges.
 
-The mean of the cells that share the corner, weighted by their volumes; on the surface of those
-with a facet there. Where a rigid interface ends at a free surface, and at re-entrant edges of the
+Where a rigid interface ends at a free surface, and at re-entrant edges of the
 arm's own faces, stress has no limit: it grows with every refinement.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,19 +13,11 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import facet_corners
-from dolfinopt.part.plane.stress import (
-    Away,
-    CornerStress,
-    PartStress,
-    mean_at_corners,
-    stress_of_parts,
-)
 from dolfinopt.part.solid.surface import distance_to_faces
+from dolfinopt.part.stress import CornerStress, mean_at_corners
 
 if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.part.solid.domain import SolidDomain
 
 
@@ -39,35 +29,23 @@ SHARP = np.sin(np.radians(40.0))  # of the turn at a re-entrant edge
 SAMPLES = 4  # of an edge, for distances
 
 
-def solid_part_stress(
-    arms: Mapping[int, Arm], trajectory: Trajectory, domains: Mapping[int, SolidDomain]
-) -> dict[int, PartStress]:
-    """Return the stress of every part by its place among the arms, on this rank alone.
+def is_regular(domain: SolidDomain, places: np.ndarray, margin: float) -> np.ndarray:
+    """Return which places (n, 3) are away from singular edges and interfaces (n,).
 
     Args:
-        arms: meshed in quadratic tetrahedra, of solid material, reduced.
-        trajectory: of these arms; of scenarios the worst counts.
-        domains: of every arm.
+        domain: the arm.
+        places: m.
+        margin: from the interfaces, m.
     """
-    return stress_of_parts(arms, trajectory, away_from_edges(domains), corner_stress)
-
-
-def away_from_edges(domains: Mapping[int, SolidDomain]) -> Away:
-    """Return which places of solid parts count: none near singular edges and interfaces."""
-
-    def away(k: int, places: np.ndarray, margin: float) -> np.ndarray:
-        domain = domains[k]
-        far = np.ones(len(places), dtype=bool)
-        if len(edges := singular_edges(domain)):
-            share = np.linspace(0.0, 1.0, SAMPLES + 1)[:, None, None]
-            samples = ((1.0 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
-            far = cKDTree(samples).query(places)[0] >= APART * domain.cell
-        if margin > 0.0:
-            for faces in (domain.inboard, domain.outboard):
-                far &= distance_to_faces(places, faces) >= margin
-        return far
-
-    return away
+    far = np.ones(len(places), dtype=bool)
+    if len(edges := singular_edges(domain)):
+        share = np.linspace(0.0, 1.0, SAMPLES + 1)[:, None, None]
+        samples = ((1.0 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
+        far = cKDTree(samples).query(places)[0] >= APART * domain.cell
+    if margin > 0.0:
+        for faces in (domain.inboard, domain.outboard):
+            far &= distance_to_faces(places, faces) >= margin
+    return far
 
 
 def singular_edges(domain: SolidDomain) -> np.ndarray:
@@ -106,7 +84,7 @@ def _beside(domain: SolidDomain, places: np.ndarray) -> np.ndarray:
 
 
 def corner_stress(state: DesignState) -> CornerStress:
-    """Return the stress of a design in space, see `boundary_stress`."""
+    """Return the stress of a design in space, of the cells with a facet there."""
     mesh = state.mesh
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
     count = len(mesh.mesh.geometry.x)

@@ -1,0 +1,233 @@
+"""Parts of a machine's arms, plates and solids alike: made of its densities, and meshed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.mesh.arm_mesh import ArmMesh
+    from dolfinopt.part.stress import CornerStress
+
+
+FINEST = 1e-7  # m, the finest tolerance of curves: that of CAD programs
+GRAY = 0.02  # grayness from which on a design is no longer close to any part
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What is asked of the curves of parts.
+
+    Attributes:
+        tool_radius: of concave corners, m; None: a fifth of a cell.
+        tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
+        arcs: lines and arcs in place of splines.
+    """
+
+    tool_radius: float | None = None
+    tolerance: float | None = None
+    arcs: bool = False
+
+    @property
+    def is_default(self) -> bool:
+        """Whether nothing is asked."""
+        return self == DEFAULTS
+
+    def check(self) -> None:
+        """Raise InputError where a length is out of range."""
+        for name, value, least in (
+            ("--tool-radius", self.tool_radius, 0.0),
+            ("--tolerance", self.tolerance, FINEST),
+        ):
+            if value is not None and not (math.isfinite(value) and value >= least):
+                raise InputError(f"{name} = {value:g} m: expected a length of at least {least:g} m")
+
+
+DEFAULTS = Curves()
+
+
+class PartMesh(Protocol):
+    """A mesh of a part: triangles or tetrahedra."""
+
+    kind: ClassVar[str]
+
+    @property
+    def cells(self) -> np.ndarray:
+        """(m, d + 1) corners of the cells."""
+
+    def figures(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+
+    def write(self, path: Path) -> None:
+        """Write it as `arms.mesh` reads it back (.msh)."""
+
+
+class Part(Protocol):
+    """The part of one arm.
+
+    Attributes:
+        COARSER: sides of the cells of the mesh with which the one of its scene is compared.
+        REFINEMENTS: of its mesh where stress is largest, at most.
+    """
+
+    COARSER: ClassVar[float]
+    REFINEMENTS: ClassVar[int]
+
+    @property
+    def name(self) -> str:
+        """The arm's name."""
+
+    @property
+    def volume(self) -> float:
+        """Of the part, m3."""
+
+    @property
+    def has_curves(self) -> bool:
+        """Whether it is made of curves, as STEP and DXF know them."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the workshop or the designer should know, a sentence each."""
+
+    @property
+    def sentence(self) -> str:
+        """Its size in words."""
+
+    def figures(self, density: float) -> dict[str, Any]:
+        """Return the entry of part.json; `density` of the material in kg/m3."""
+
+    def keys(self) -> dict[str, Any]:
+        """Return the keys of its arm in part.toml, but for the mesh."""
+
+    def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
+        """Yield how the names of its files end, and what they hold; `name` and title of it."""
+
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> PartMesh:
+        """Return a mesh of it, on this process alone.
+
+        Args:
+            coarser: factor of the sides of all cells.
+            finer: places (n, d), m, near each of which sides are halved, once for every array.
+
+        Raises:
+            InputError: Gmsh cannot mesh it.
+        """
+
+    def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
+        """Return which places (n, d) are away from where stress has no limit (n,).
+
+        Args:
+            places: m.
+            margin: least distance from the interfaces, m.
+        """
+
+    def stress(self, state: DesignState) -> CornerStress:
+        """Return the stress at the corners of the cells of an arm with such a mesh."""
+
+
+def make_parts(
+    scene: Scene, folder: Path, curves: Curves = DEFAULTS, world: MPI.Comm | None = None
+) -> dict[int, Part]:
+    """Make the parts of the arms that have a design of their own (collective on `world`).
+
+    Each arm is whole on one rank, so that its part is the same on any number of them.
+
+    Args:
+        scene: of the run.
+        folder: with its design.npz.
+        curves: what is asked of the curves.
+        world: the ranks that share the arms; by default this one alone.
+
+    Returns:
+        Parts by their place in the chain, on the root; none elsewhere.
+
+    Raises:
+        InputError: no design in the folder, one that does not fit the scene's arms, or no part can
+            be made of it with these values; on all ranks.
+    """
+    from mpi4py import MPI
+
+    from dolfinopt.mesh.arm_mesh import arm_mesh
+    from dolfinopt.mesh.budget import check_budget
+    from dolfinopt.output.design import read_smooth_design
+    from dolfinopt.parallel import on_root, partition_arms, together
+
+    world = MPI.COMM_SELF if world is None else world
+    on_root(world, _check, folder, curves)
+    check_budget(world, scene)
+    partition = partition_arms(world, scene.cell_counts, whole=True)
+    patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
+    with together(world):
+        meshes = {
+            k: arm_mesh(partition.comm, scene.arms[k], patterns.get(k)) for k in partition.arms
+        }
+    designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
+    with together(world):
+        mine = {k: _made(scene, k, mesh, designs[k], curves) for k, mesh in meshes.items()}
+    found: dict[int, Part] = {}
+    for pieces in world.gather(mine, root=0) or ():
+        found.update(pieces)
+    return {k: found[k] for k in sorted(found)}
+
+
+def _check(folder: Path, curves: Curves) -> None:
+    """Raise InputError unless the folder has a design and the options are in range."""
+    curves.check()
+    if not (folder / "design.npz").is_file():
+        raise InputError(
+            f"{folder / 'design.npz'}: no design there; name the folder of a finished optimize or "
+            "simulate run"
+        )
+
+
+def _made(
+    scene: Scene,
+    index: int,
+    mesh: ArmMesh,
+    design: tuple[np.ndarray, np.ndarray | None],
+    curves: Curves,
+) -> Part:
+    """Return the part of an arm: a surface in space, an outline in the plane."""
+    if scene.arms[index].is_solid:
+        from dolfinopt.part.solid.domain import domain_in_scene
+        from dolfinopt.part.solid.part import make_solid_part
+
+        return make_solid_part(domain_in_scene(scene, index, mesh, *design), curves)
+    from dolfinopt.part.plane.domain import domain_of
+    from dolfinopt.part.plane.part import make_part
+
+    return make_part(domain_of(scene, index, mesh, *design), curves)
+
+
+@dataclass(frozen=True, eq=False)
+class Meshes:
+    """Meshes of parts by their place in the chain.
+
+    Attributes:
+        coarse: to tell by how much figures depend on the mesh.
+        fine: those of the parts' scene.
+    """
+
+    coarse: Mapping[int, PartMesh]
+    fine: Mapping[int, PartMesh]
+
+
+def mesh_parts(parts: Mapping[int, Part], coarse: bool = True) -> Meshes:
+    """Return the meshes of parts, on this process alone; coarse ones if they are wanted.
+
+    Raises:
+        InputError: Gmsh cannot mesh a part.
+    """
+    larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
+    return Meshes(larger, {k: one.mesh() for k, one in parts.items()})
