@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.scene import Origin, RobotScene
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.parallel import Partition
+    from dolfinopt.part.part import Part
     from dolfinopt.scene.load import Scene
     from dolfinopt.study.tables import Table
 
@@ -205,7 +206,8 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
         before: folder of an earlier run, for a table and a page of what both do.
     """
     world = start()
-    from dolfinopt.parallel import gather_cells, on_root, together
+    from dolfinopt.parallel import on_root, together
+    from dolfinopt.part.part import make_parts
 
     scene: Scene = on_root(world, scene_of, run)
     origin = on_root(world, _origin_of, scene, run)
@@ -215,14 +217,12 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     on_root(world, _check_robot, origin.file, folder, names)
     claim(world, folder, overwrite, [*names, *PAGES])
     after = _reduced(world, run, scene)
-    corners = gather_cells(after.partition, {k: _corners(arm) for k, arm in after.arms.items()})
-    densities = gather_cells(after.partition, after.x_phys)
+    parts = make_parts(scene, run, world=world)
     sides = [] if before is None else _sides(world, before, after)
     with together(world):
         if world.rank == 0:
-            cells = {k: (corners[k], densities[k]) for k in after.bodies}
             with ending_at_once():
-                files, said = _robot_files(scene, origin, folder, after.bodies, cells)
+                files, said = _robot_files(scene, origin, folder, after.bodies, parts)
                 if table is not None:
                     files = _pages(table, sides) | files
                     said.append(table.markdown())
@@ -314,13 +314,6 @@ def _pages(table: Table, sides: list[Any]) -> dict[str, bytes]:
 # -- the robot -------------------------------------------------------------------------------
 
 
-def _corners(arm: Arm) -> np.ndarray:
-    """Return the corners (n, 4 or 8, 3) of this rank's cells, m."""
-    from dolfinopt.mesh import compat
-
-    return compat.cell_coordinates(arm.mesh.mesh, arm.mesh.num_cells)
-
-
 def _origin_of(scene: Scene, run: Path) -> Origin:
     """Return where the scene's solids come from: the record is beside the trajectory."""
     from dolfinopt.exchange.urdf.scene import read_origin
@@ -335,11 +328,12 @@ def _robot_files(
     origin: Origin,
     folder: Path,
     bodies: Mapping[int, ShapeIntegrals],
-    cells: Mapping[int, tuple[np.ndarray, np.ndarray]],
+    parts: Mapping[int, Part],
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return the files by name, the robot last, and what has become of the links (root only)."""
     from dolfinopt.exchange.urdf.read import read_robot
     from dolfinopt.exchange.urdf.write import NewLink, robot_text
+    from dolfinopt.part.files.triangles import triangle_bytes
 
     before = read_robot(origin.file).links
     links, index = [], {arm.name: k for k, arm in enumerate(scene.arms)}
@@ -351,7 +345,8 @@ def _robot_files(
             continue
         frame, mesh = origin.frames[name], f"{name}.stl"
         inertia = link_inertia(scene, index[name], bodies[owner]).posed(frame)
-        files[mesh] = _surface(name, frame, *cells[owner])
+        facets = parts[owner].facets @ frame[:3, :3].T + frame[:3, 3]
+        files[mesh] = triangle_bytes(facets, f"{name}, m")
         links.append(NewLink(link, inertia, mesh))
         said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")
     files[origin.file.name] = robot_text(origin.file, links, folder)
@@ -379,15 +374,3 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
     own = Inertia(float(body.mass), *body.inertia_about_centre())
     motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
     return own + motor
-
-
-def _surface(title: str, frame: np.ndarray, corners: np.ndarray, density: np.ndarray) -> bytes:
-    """Return an arm's design as STL in its link's frame, in metres."""
-    from dolfinopt.part.files.triangles import triangle_bytes
-    from dolfinopt.part.solid.surface import design_surface
-
-    try:
-        found = design_surface(corners, density).corners
-    except InputError as error:
-        raise InputError(f"arm {title!r}: {error}") from None
-    return triangle_bytes(found @ frame[:3, :3].T + frame[:3, 3], f"{title}, m")

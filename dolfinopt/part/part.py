@@ -93,6 +93,10 @@ class Part(Protocol):
         """Of the part, m3."""
 
     @property
+    def facets(self) -> np.ndarray:
+        """Corners (n, 3, 3) of the triangles of its surface, counterclockwise from outside, m."""
+
+    @property
     def has_curves(self) -> bool:
         """Whether it is made of curves, as STEP and DXF know them."""
 

@@ -1,6 +1,6 @@
-"""STL: the surface of a part in triangles, watertight.
+"""Surfaces of parts in triangles, watertight: STL, and 3MF in millimetres.
 
-3MF (3D Manufacturing Format, core specification 1.3): surfaces of triangles, in millimetres.
+3MF (3D Manufacturing Format, core specification 1.3).
 """
 
 from __future__ import annotations
@@ -11,23 +11,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.solid.surface import Surface
 
 MM = 1e3  # of a metre
-
-
-def stl_bytes(shape: Shape, thickness: float, tolerance: float, title: str) -> bytes:
-    """Return a binary STL of the shape extruded from z = 0 to its thickness, in millimetres.
-
-    Args:
-        shape: m.
-        thickness: m.
-        tolerance: of chords in place of curves, m.
-        title: for the header.
-    """
-    corners = extruded_facets(shape.polygons(tolerance), thickness) * MM
-    return triangle_bytes(corners, f"{title}, mm")
 
 
 def triangle_bytes(corners: np.ndarray, title: str) -> bytes:

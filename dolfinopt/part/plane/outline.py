@@ -525,7 +525,7 @@ def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline
 
 
 WIDTH_STEPS = 11  # of the bisection: to a four thousandth of the height
-STRAIGHT = 1e-4  # distance of corners that are left out, heights
+WIDTH_STRAIGHT = 1e-4  # distance of corners that are left out, heights
 TIP = 0.05  # area of a piece that counts as a wider part, squares of the width
 
 
@@ -534,7 +534,7 @@ def thinnest_member(outline: Outline) -> float | None:
 
     None where nothing falls apart before the half of the height is gone.
     """
-    polygon: Any = outline.polygon.simplify(STRAIGHT * outline.domain.height)
+    polygon: Any = outline.polygon.simplify(WIDTH_STRAIGHT * outline.domain.height)
     low, high = 0.0, 0.5 * outline.domain.height
     if not _falls_apart(polygon, high):
         return None

@@ -12,7 +12,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.part.files.drawings import dxf_text, r12_text, svg_text
 from dolfinopt.part.files.step import face_text, solid_text
-from dolfinopt.part.files.triangles import stl_bytes
+from dolfinopt.part.files.triangles import MM, extruded_facets, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.domain import Domain
@@ -61,6 +61,11 @@ class PlanePart:
     def volume(self) -> float:
         """Within its curves, m3."""
         return self.shape.area * self.domain.thickness
+
+    @property
+    def facets(self) -> np.ndarray:
+        """Corners (n, 3, 3) of the triangles of the plate's surface, m; chords in the tolerance."""
+        return extruded_facets(self.shape.polygons(0.5 * self.tolerance), self.domain.thickness)
 
     @property
     def sentence(self) -> str:
@@ -143,7 +148,7 @@ class PlanePart:
         yield ".dxf", dxf_text(shape)
         yield "_r12.dxf", r12_text(shape, chord)
         yield ".svg", svg_text(shape, title)
-        yield ".stl", stl_bytes(shape, thickness, chord, title)
+        yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> BodyMesh:
         """Return triangles along its curves, see `part.Part`."""

@@ -149,6 +149,11 @@ class SolidPart:
         return self.domain.name
 
     @property
+    def facets(self) -> np.ndarray:
+        """Corners (n, 3, 3) of the triangles of its surface, m."""
+        return self.surface.corners
+
+    @property
     def has_curves(self) -> bool:
         """Whether it is extruded; other surfaces are free-form, in triangles."""
         return self.flat is not None
@@ -282,7 +287,7 @@ class SolidPart:
 
     def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
         """Yield how the names of its files end, and what they hold; `name` and title of it."""
-        yield ".stl", triangle_bytes(MM * self.surface.corners, f"{title}, mm")
+        yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
         yield ".3mf", three_mf_bytes(self.surface, name)
         if self.flat is not None:
             shape, t = self.flat.shape, self.flat.domain.thickness

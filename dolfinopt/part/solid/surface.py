@@ -25,11 +25,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.part.solid.domain import SolidDomain
 
-HALVINGS = 40  # of the interval in which the level lies
 BELOW = 0.98  # the highest level, over the highest density
 APART = 0.005  # least difference of a node's density from the level
-SAME_VOLUME = 1e-3  # relative, of the surface to the design
-CLOSE = 0.01  # likewise, beyond which there is no surface: volumes leap at plateaus of the density
 # Corners of a hexahedron, from a tensor product's order to VTK's.
 AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 
@@ -65,35 +62,6 @@ class Surface:
         return float(np.einsum("na,na->", a, np.cross(b, c)) / 6.0)
 
 
-def design_surface(corners: np.ndarray, density: np.ndarray) -> Surface:
-    """Return the surface of a solid's design, in the cells' frame.
-
-    Args:
-        corners: (n, 4 or 8, 3) of the tetrahedra or hexahedra in any order, m; common ones are
-            the same to the last bit.
-        density: (n,) of the same cells.
-
-    Raises:
-        InputError: no level of the density encloses the design's volume: it is too grey.
-    """
-    points, nodes, values = nodal_densities(corners, density)
-    volume = float(cell_volumes(corners) @ density)
-    above, below = 0.0, BELOW * float(values.max())  # levels that enclose too much and too little
-    for _ in range(HALVINGS):
-        level = 0.5 * (above + below)
-        surface = _cut(points, nodes, values, level)
-        if abs(surface.volume - volume) <= SAME_VOLUME * volume:
-            break
-        above, below = (level, below) if surface.volume > volume else (above, level)
-    if abs(surface.volume - volume) > CLOSE * volume:
-        raise InputError(
-            f"no level of its density encloses its volume, {1e9 * volume:.4g} mm3: the nearest, "
-            f"{level:.3g}, encloses {1e9 * surface.volume:.4g} mm3; the design is too grey for a "
-            'surface; optimise longer, or with design.projection = "robust"'
-        )
-    return surface
-
-
 def surface_at(
     corners: np.ndarray,
     density: np.ndarray,
@@ -103,7 +71,9 @@ def surface_at(
     """Return the surface of what is denser than a level, in the cells' frame; it may be empty.
 
     Args:
-        corners, density: as for `design_surface`.
+        corners: (n, 4 or 8, 3) of the tetrahedra or hexahedra in any order, m; common ones are
+            the same to the last bit.
+        density: (n,) of the same cells.
         level: of the density.
         fields: (n, 4 or 8, ...) values at the same corners, to be carried to the surface's points.
     """
@@ -130,7 +100,7 @@ def nodal_densities(
     """Return points (n, 3), nodes of right-handed cells, and the densities (n,) at the points.
 
     Args:
-        corners, density: as for `design_surface`.
+        corners, density: as for `surface_at`.
     """
     points, nodes = _numbers(corners)
     nodes = _right_handed(corners, nodes)
