@@ -336,20 +336,21 @@ def _sizes(
 
 
 def facing(points: np.ndarray, inward: np.ndarray, near: np.ndarray, side: float) -> np.ndarray:
-    """Return the width (n,) of members, or of gaps, beside points of an outline, m.
+    """Return the width (m,) of members, or of gaps, beside points of an outline or surface, m.
 
-    The diameter of the least circle that touches the outline at the point and goes through another
+    The diameter of the least circle, or ball, that touches it at the point and goes through another
     one, whose normal points the other way; infinite where none is near.
 
     Args:
-        points: (n, 2) m.
-        inward: (n, 2) unit normals into the material.
-        near: (n, k) neighbours of every point.
+        points: (n, d) m.
+        inward: (n, d) unit normals into the material.
+        near: (m, k) neighbours of the first m points.
         side: 1 of members, -1 of gaps.
     """
-    to = points[near] - points[:, None]
-    depth = side * np.einsum("nkd,nd->nk", to, inward)
-    across = np.einsum("nkd,nd->nk", inward[near], inward) < OPPOSED
+    own, into = points[: len(near)], inward[: len(near)]
+    to = points[near] - own[:, None]
+    depth = side * np.einsum("nkd,nd->nk", to, into)
+    across = np.einsum("nkd,nd->nk", inward[near], into) < OPPOSED
     square = np.square(to).sum(axis=2)
     across &= depth > 1e-3 * np.sqrt(square)
     width = np.divide(square, depth, out=np.full(depth.shape, np.inf), where=across)

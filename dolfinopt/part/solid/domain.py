@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dolfinopt.mesh.checks import cell_volumes, facet_corners
 from dolfinopt.part.plane.domain import Domain, domain_of
@@ -78,6 +79,16 @@ class SolidDomain:
             return False
         edges = np.abs(self.corners[:, [1, 2, 4]] - self.corners[:, :1])
         return bool((edges * (1.0 - np.eye(3))).max() <= SAME * self.cell)
+
+    @cached_property
+    def outward(self) -> np.ndarray:
+        """(n, 3) unit normals of the arm's own faces."""
+        faces, centroids = self.own, self.corners.mean(axis=1)
+        centre = faces.mean(axis=1)
+        inner = centroids[cKDTree(centroids).query(centre)[1]]
+        normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+        normal *= np.where(((centre - inner) * normal).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+        return np.asarray(normal / np.linalg.norm(normal, axis=1)[:, None])
 
     @property
     def volume(self) -> float:

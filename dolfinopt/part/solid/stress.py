@@ -54,11 +54,7 @@ def singular_edges(domain: SolidDomain) -> np.ndarray:
     count = faces.shape[1]
     points, nodes = np.unique(faces.reshape(-1, 3), axis=0, return_inverse=True)
     nodes = nodes.reshape(-1, count)
-    centre = faces.mean(axis=1)
-    normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-    inner = _beside(domain, centre)
-    normal *= np.where(((centre - inner) * normal).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    centre, normal = faces.mean(axis=1), domain.outward
     kind = np.zeros(len(faces), dtype=int)
     for value, some in ((1, domain.inboard), (2, domain.outboard)):
         kind[cKDTree(some.mean(axis=1)).query(centre)[0] < 1e-9 * domain.cell] = value
@@ -75,12 +71,6 @@ def singular_edges(domain: SolidDomain) -> np.ndarray:
     sharp = (turn > SHARP) & (rise > 0.1 * size)
     found = ends[order[pair]][sharp | (kind[one] != kind[other])]
     return np.asarray(points[found])
-
-
-def _beside(domain: SolidDomain, places: np.ndarray) -> np.ndarray:
-    """Return the centroids (n, 3) of the cells nearest to places of the surface."""
-    centroids = domain.corners.mean(axis=1)
-    return np.asarray(centroids[cKDTree(centroids).query(places)[1]])
 
 
 def corner_stress(state: DesignState) -> CornerStress:

@@ -379,7 +379,7 @@ def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:
         lacks = volume - now.volume
         if abs(lacks) <= SAME_VOLUME * volume:
             break
-        area = np.where(free[:, None], _area_vectors(now), 0.0)
+        area = np.where(free[:, None], area_vectors(now), 0.0)
         size = np.linalg.norm(area, axis=1)
         if size.sum() == 0.0:
             break
@@ -388,7 +388,7 @@ def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:
     return replace(surface, points=points)
 
 
-def _area_vectors(surface: Surface) -> np.ndarray:
+def area_vectors(surface: Surface) -> np.ndarray:
     """Return the derivative (n, 3) of the volume by the points, m2."""
     a, b, c = surface.corners.swapaxes(0, 1)
     found = np.zeros_like(surface.points)
