@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-import shapely
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
@@ -25,11 +24,11 @@ from dolfinopt.optimization.measured import LIMIT_PRICE
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
-from dolfinopt.part.part import Meshes, mesh_parts
-from dolfinopt.part.plane.free_outline import CHORD, FreeOutline, free_outline
-from dolfinopt.part.plane.mesh import BodyMesh
-from dolfinopt.part.plane.outline import thinnest_member
+from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
+from dolfinopt.part.plane.free_outline import free_outline
 from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.solid.free_surface import free_surface
+from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
@@ -65,7 +64,7 @@ class Optimized:
         ending: why it ended.
     """
 
-    parts: dict[int, PlanePart]
+    parts: dict[int, Part]
     meshes: Meshes
     iterations: int
     before: float
@@ -90,7 +89,7 @@ class Optimized:
 
 
 def optimize_parts(
-    scene: Scene, parts: Mapping[int, PlanePart], iterations: int = ITERATIONS, tell: Tell = print
+    scene: Scene, parts: Mapping[int, Part], iterations: int = ITERATIONS, tell: Tell = print
 ) -> Optimized:
     """Return parts that are better by the scene's objective and keep its limits.
 
@@ -111,7 +110,7 @@ def optimize_parts(
             f"--optimize: arm {scene.arms[k].name!r} repeats {scene.arms[pattern].name!r} "
             "(arms.pattern), and every part would get a shape of its own; leave --optimize out"
         )
-    outlines = {k: free_outline(part) for k, part in parts.items()}
+    outlines = {k: _free(part) for k, part in parts.items()}
     if not any(one.count for one in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")
     before, limits = _judged(scene, dict(parts))
@@ -123,7 +122,7 @@ def optimize_parts(
         ending = search.run(iterations - done, tell, done)
         done += search.steps
         state = search.best
-        made = {k: _part(one) for k, one in state.outlines.items()}
+        made = {k: one.made for k, one in state.outlines.items()}
         value, limits = _judged(scene, made)
         if _rank(scene, value, limits) < _rank(scene, *found[1:]):
             found = made, value, limits
@@ -151,7 +150,7 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-def _judged(scene: Scene, parts: dict[int, PlanePart]) -> tuple[float, tuple[Limit, ...]]:
+def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[float, tuple[Limit, ...]]:
     """Return objective and limits of parts on refined meshes, stress that of the outline."""
     meshes = mesh_parts(parts)
     coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
@@ -159,16 +158,64 @@ def _judged(scene: Scene, parts: dict[int, PlanePart]) -> tuple[float, tuple[Lim
     return state.evaluation.objective, column.limits
 
 
-def _part(outline: FreeOutline) -> PlanePart:
-    """Return the part with these curves, and what is measured of it."""
-    part, chord = outline.part, CHORD * outline.part.domain.cell
-    outer, *holes = outline.shape.polygons(chord)
-    polygon = shapely.Polygon(outer, holes)
-    drawn = replace(part.outline, polygon=polygon)
-    old, *gaps = part.shape.polygons(chord)
-    apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
-    shape = replace(outline.shape, apart=float(apart))
-    return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
+def _free(part: Part) -> FreeForm:
+    """Return what moves of a part."""
+    if isinstance(part, PlanePart):
+        return free_outline(part)
+    assert isinstance(part, SolidPart)
+    return free_surface(part, part.mesh(SIDES))
+
+
+class FreeForm(Protocol):
+    """The outline or surface of a part as variables x: moves s = F x along normals, m."""
+
+    @property
+    def part(self) -> Part:
+        """That it was made of."""
+
+    @property
+    def current(self) -> Part:
+        """The part with this form."""
+
+    @property
+    def made(self) -> Part:
+        """The part with this form, and what is measured of it."""
+
+    @property
+    def count(self) -> int:
+        """Number of variables."""
+
+    @property
+    def size(self) -> float:
+        """Area of a plate, m2, or volume, m3."""
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether it can be a part: nothing crosses."""
+
+    def filtered(self, x: np.ndarray) -> np.ndarray:
+        """Return s = F x (count,)."""
+
+    def by_x(self, by_s: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, count) by x from those by s."""
+
+    def moved(self, s: np.ndarray) -> FreeForm:
+        """Return the form moved outwards by s (count,)."""
+
+    def room(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far (count,) it may move inwards and outwards in a step, m."""
+
+    def meshed(self, coarser: float) -> tuple[FreeForm, PartMesh]:
+        """Return a new mesh of it, and it: variables may be others then."""
+
+    def followed(self, mesh: Any) -> PartMesh:
+        """Return the mesh of a form nearby, moved to this one."""
+
+    def by_s(self, mesh: Any, by_nodes: np.ndarray) -> np.ndarray:
+        """Return derivatives (count,) by s from those by the places of the nodes of its mesh."""
+
+    def size_by_s(self) -> np.ndarray:
+        """Return the derivative (count,) of the size by s."""
 
 
 # -- the problem at one outline ----------------------------------------------------------------
@@ -187,8 +234,8 @@ class State:
         shares: relative constraints of the volumes.
     """
 
-    outlines: Mapping[int, FreeOutline]
-    bodies: Mapping[int, BodyMesh]
+    outlines: Mapping[int, FreeForm]
+    bodies: Mapping[int, PartMesh]
     simulated: Simulated
     limits: tuple[Limit, ...]
     smooth: np.ndarray
@@ -220,7 +267,7 @@ class Problem:
     tightened: Mapping[str, float]
 
     def evaluated(
-        self, outlines: Mapping[int, FreeOutline], bodies: Mapping[int, BodyMesh], *start: Any
+        self, outlines: Mapping[int, FreeForm], bodies: Mapping[int, PartMesh], *start: Any
     ) -> State:
         """Return what the machine does; on meshes that are made anew where none are given.
 
@@ -228,9 +275,11 @@ class Problem:
             InputError: an outline cannot be meshed.
             ConvergenceError: the machine cannot be simulated.
         """
-        parts = {k: replace(one.part, shape=one.shape) for k, one in outlines.items()}
         if not bodies:
-            bodies = {k: part.mesh(SIDES) for k, part in parts.items()}
+            anew = {k: one.meshed(SIDES) for k, one in outlines.items()}
+            outlines = {k: one for k, (one, _) in anew.items()}
+            bodies = {k: mesh for k, (_, mesh) in anew.items()}
+        parts = {k: one.current for k, one in outlines.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
@@ -255,10 +304,10 @@ class Problem:
         return self.tightened.get(one.name, 1.0 + RESERVE)
 
     def _outline_stress(
-        self, simulated: Simulated, outlines: Mapping[int, FreeOutline]
+        self, simulated: Simulated, outlines: Mapping[int, FreeForm]
     ) -> tuple[OutlineStress, Analysis]:
         """Return the stress on the outlines as a response, and what it is computed from."""
-        parts = {k: replace(one.part, shape=one.shape) for k, one in outlines.items()}
+        parts = {k: one.current for k, one in outlines.items()}
         one = simulated
         given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
         p = max(one.scene.objective.stress_exponent, STRESS_EXPONENT)
@@ -266,16 +315,16 @@ class Problem:
         return OutlineStress(options, parts), analysis_of(*given)
 
     def _volumes(
-        self, outlines: Mapping[int, FreeOutline]
+        self, outlines: Mapping[int, FreeForm]
     ) -> list[tuple[float, float, tuple[int, ...]]]:
         """Return area, largest area (m2) and arms of every limit of the volume."""
         share = self.scene.design.volume_fraction
         if share is None:
             return []
-        area = {k: one.shape.area for k, one in outlines.items()}
+        area = {k: one.size for k, one in outlines.items()}
         most = {
             # What the densities have: curves may have begun a little above the limit.
-            k: max(share * one.part.domain.area.sum(), one.part.domain.volume)
+            k: max(share * one.part.domain.whole, one.part.domain.volume)
             for k, one in outlines.items()
         }
         if self.scene.design.shared_volume:
@@ -303,7 +352,7 @@ class Problem:
             shares = [
                 np.concatenate(
                     [
-                        o.by_x(o.area_by_s()[None])[0] / most if k in arms else np.zeros(o.count)
+                        o.by_x(o.size_by_s()[None])[0] / most if k in arms else np.zeros(o.count)
                         for k, o in state.outlines.items()
                     ]
                 )
@@ -316,13 +365,12 @@ class Problem:
         """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""
         found = []
         for k, outline in state.outlines.items():
-            places = state.simulated.arms[k].mesh.mesh.geometry.x[:, :2]
             body = state.bodies[k]
+            mesh = state.simulated.arms[k].mesh
+            places = mesh.mesh.geometry.x[:, : mesh.dim]
             order = cKDTree(places).query(body.points)[1]
             by_s = [
-                outline.by_s(body, body.at_outline(row[k][order]))
-                if k in row
-                else np.zeros(outline.count)
+                outline.by_s(body, row[k][order]) if k in row else np.zeros(outline.count)
                 for row in rows
             ]
             found.append(outline.by_x(np.array(by_s)))
@@ -344,9 +392,17 @@ class Search:
         """Begin at a state."""
         self.problem, self.state, self.best = problem, state, state
         self.steps, self.radius, self.morphed = 0, 1.0, 0
-        self.x = np.zeros(sum(one.count for one in state.outlines.values()))
+        self.x = np.zeros(0)
         self.mma: MMAState = initial_state(self.x)
         self.falls: list[float] = []
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin the approximation anew where the variables are others."""
+        count = sum(one.count for one in self.state.outlines.values())
+        if len(self.x) != count:
+            self.x = np.zeros(count)
+            self.mma = initial_state(self.x)
 
     def run(self, iterations: int, tell: Tell, first: int) -> str:
         """Take so many steps at most; return why the search ended."""
@@ -380,10 +436,11 @@ class Search:
         one = self.state
         worst = one.values[1:].max(initial=0.0)
         words = "limits met" if worst <= EXCESS else f"{100.0 * worst:.2g} % over a limit"
-        mass = sum(o.shape.area for o in one.outlines.values())
+        scene = self.problem.scene
+        mass = sum(scene.material_of(k).density * o.current.volume for k, o in one.outlines.items())
         return (
-            f"{number} objective {one.simulated.evaluation.objective:.5g}, area "
-            f"{1e6 * mass:.5g} mm2, {words}, trust region {self.radius:.2g}"
+            f"{number} objective {one.simulated.evaluation.objective:.5g}, mass {mass:.4g} kg, "
+            f"{words}, trust region {self.radius:.2g}"
         )
 
     def _step(self, slopes: np.ndarray) -> bool:
@@ -391,6 +448,7 @@ class Search:
         if self.morphed >= MORPHED or self._worst_triangle() < QUALITY:
             self.state = self.problem.evaluated(self.state.outlines, {}, self.solutions)
             self.morphed = 0
+            self._begin()
             slopes = self.problem.slopes(self.state)
         before = self.state
         stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
@@ -448,7 +506,7 @@ class Search:
             if not outlines[k].is_valid:
                 return None
         try:
-            bodies = {k: self.state.bodies[k].morphed(one.shape) for k, one in outlines.items()}
+            bodies = {k: one.followed(self.state.bodies[k]) for k, one in outlines.items()}
             if any(one.is_folded for one in bodies.values()):
                 bodies = {}
             return self.problem.evaluated(outlines, bodies, self.solutions)

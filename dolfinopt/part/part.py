@@ -63,6 +63,18 @@ class PartMesh(Protocol):
     kind: ClassVar[str]
 
     @property
+    def points(self) -> np.ndarray:
+        """(n, d) m."""
+
+    @property
+    def quality(self) -> np.ndarray:
+        """(m,) shape of the cells, 1 of a regular one."""
+
+    @property
+    def is_folded(self) -> bool:
+        """Whether a cell is turned over or next to nothing."""
+
+    @property
     def cells(self) -> np.ndarray:
         """(m, d + 1) corners of the cells."""
 
@@ -87,6 +99,10 @@ class Part(Protocol):
     @property
     def name(self) -> str:
         """The arm's name."""
+
+    @property
+    def domain(self) -> Any:
+        """The arm and its design."""
 
     @property
     def volume(self) -> float:

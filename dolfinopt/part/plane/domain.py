@@ -390,6 +390,11 @@ class Domain:
         return float(4.0 * self.x_phys * (1.0 - self.x_phys) @ self.area / self.area.sum())
 
     @property
+    def whole(self) -> float:
+        """All that material may fill, m2."""
+        return float(self.area.sum())
+
+    @property
     def gray_share(self) -> float:
         """Share of the material in cells of densities between 0.1 and 0.9."""
         gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)

@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import InputError
 from dolfinopt.part.plane.curves import DEGREE, MIRROR, Line, Piece, Shape, Spline
 from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
+from dolfinopt.part.plane.outline import thinnest_member
 from dolfinopt.part.plane.part import PlanePart
 
 if TYPE_CHECKING:
@@ -164,6 +165,38 @@ class FreeOutline:
         return Shape(tuple(loops))
 
     @property
+    def current(self) -> PlanePart:
+        """The part with this outline; what is measured of it is that of `made`."""
+        return replace(self.part, shape=self.shape)
+
+    @property
+    def made(self) -> PlanePart:
+        """The part with this outline, and what is measured of it."""
+        import shapely
+
+        part, chord = self.part, CHORD * self.part.domain.cell
+        outer, *holes = self.shape.polygons(chord)
+        polygon = shapely.Polygon(outer, holes)
+        drawn = replace(part.outline, polygon=polygon)
+        old, *gaps = part.shape.polygons(chord)
+        apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
+        shape = replace(self.shape, apart=float(apart))
+        return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
+
+    @property
+    def size(self) -> float:
+        """Area, m2."""
+        return self.shape.area
+
+    def meshed(self, coarser: float) -> tuple[FreeOutline, BodyMesh]:
+        """Return the outline with a new mesh; variables stay."""
+        return self, self.current.mesh(coarser)
+
+    def followed(self, mesh: BodyMesh) -> BodyMesh:
+        """Return a mesh of an outline nearby, moved to this one."""
+        return mesh.morphed(self.shape)
+
+    @property
     def blocks(self) -> list[slice]:
         """Where the control points of every run stand among all of them."""
         ends = np.cumsum([0, *(len(run.points) for run in self.runs)])
@@ -205,7 +238,7 @@ class FreeOutline:
         ]
         return replace(self, runs=tuple(runs))
 
-    def by_s(self, mesh: BodyMesh, by_outline: np.ndarray) -> np.ndarray:
+    def by_s(self, mesh: BodyMesh, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s, per m.
 
         That nodes stand a little off the curves, so that straight sides enclose their area, is
@@ -213,8 +246,9 @@ class FreeOutline:
 
         Args:
             mesh: along the curves of this outline.
-            by_outline: (k, 2) derivatives by the first node of every side of the mesh.
+            by_nodes: (n, 2) derivatives by the places of its nodes.
         """
+        by_outline = mesh.at_outline(by_nodes)
 
         def pull(number: int, curve: Spline) -> np.ndarray:
             here = np.flatnonzero(mesh.piece == number)
@@ -224,7 +258,7 @@ class FreeOutline:
 
         return self._along_normals(pull)
 
-    def area_by_s(self) -> np.ndarray:
+    def size_by_s(self) -> np.ndarray:
         """Return the derivative (count,) of the area by s, m."""
 
         def pull(_: int, curve: Spline) -> np.ndarray:

@@ -102,6 +102,11 @@ class SolidDomain:
         return float(gray / (self.sizes.sum() + self.void))
 
     @property
+    def whole(self) -> float:
+        """All that material may fill, m3."""
+        return float(self.sizes.sum())
+
+    @property
     def gray_share(self) -> float:
         """Share of the material in cells of densities between 0.1 and 0.9."""
         gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)

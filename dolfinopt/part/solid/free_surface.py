@@ -24,9 +24,16 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.plane.mesh import facing
+from dolfinopt.part.solid.domain import SolidDomain
 from dolfinopt.part.solid.mesh import NEAR
 from dolfinopt.part.solid.part import SolidPart
-from dolfinopt.part.solid.surface import Surface, area_vectors, crossings, distance_to_faces
+from dolfinopt.part.solid.surface import (
+    Surface,
+    area_vectors,
+    crossings,
+    distance_to_faces,
+    nearest_facets,
+)
 
 REACH = 1.5  # length r over which moves are smooth, cells of the design
 FLAT = 1e-6  # of a normal, by which facets of one flat face differ, and faces from an axis
@@ -36,7 +43,6 @@ WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a 
 ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
-WORST = 0.02  # shape of a cell, 1 of a regular one, below which a mesh is folded
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +68,27 @@ class FreeSurface:
         """Number of nodes that move."""
         return len(self.nodes)
 
+    @property
+    def current(self) -> SolidPart:
+        """The part with this surface."""
+        return self.made
+
+    def meshed(self, coarser: float) -> tuple[FreeSurface, Tetrahedra]:
+        """Return the surface with a new mesh, whose nodes are other variables."""
+        mesh = self.made.mesh(coarser)
+        return free_surface(self.made, mesh), mesh
+
+    def followed(self, _: Tetrahedra) -> Tetrahedra:
+        """Return its mesh, which moved with it."""
+        return self.mesh
+
     @cached_property
     def made(self) -> SolidPart:
-        """The part with this surface."""
-        facets = self.mesh.boundary
-        used, corners = np.unique(facets, return_inverse=True)
-        surface = Surface(self.mesh.points[used], corners.reshape(-1, 3))
-        before = cKDTree(self.part.surface.corners.mean(axis=1))
-        apart = float(before.query(surface.corners.mean(axis=1))[0].max())
-        return replace(self.part, surface=surface, distance=max(apart, self.part.distance))
+        """The part with this surface: its own points follow the facets of the mesh."""
+        moves = self.frame.carried @ (self.mesh.points - self.frame.places)
+        surface = replace(self.part.surface, points=self.part.surface.points + moves)
+        far = float(np.linalg.norm(moves, axis=1).max())
+        return replace(self.part, surface=surface, distance=self.part.distance + far)
 
     @property
     def size(self) -> float:
@@ -93,7 +111,7 @@ class FreeSurface:
             step[:, a] += follower.followed(step[:, a])
         return replace(self, mesh=replace(self.mesh, points=self.mesh.points + step))
 
-    def by_s(self, by_nodes: np.ndarray) -> np.ndarray:
+    def by_s(self, _: Tetrahedra, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s from those by the places (n, 3) of all nodes."""
         found = np.zeros_like(by_nodes)
         for a, follower in enumerate(self.frame.followers):
@@ -103,19 +121,14 @@ class FreeSurface:
     def size_by_s(self) -> np.ndarray:
         """Return the derivative (count,) of the volume by s, m2."""
         vectors = area_vectors(Surface(self.mesh.points, self.mesh.boundary))
-        return self.by_s(vectors)
+        return self.by_s(self.mesh, vectors)
 
     @property
     def is_valid(self) -> bool:
         """Whether its cells are sound and its surface does not cross itself."""
-        if self.is_folded:
+        if self.mesh.is_folded:
             return False
         return not len(crossings(Surface(self.mesh.points, self.mesh.boundary)))
-
-    @property
-    def is_folded(self) -> bool:
-        """Whether a cell is next to nothing."""
-        return bool(self.mesh.quality.min() < WORST)
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Return how far (count,) nodes may move inwards and outwards in a step, m.
@@ -192,11 +205,15 @@ class Frame:
         areas: (n,) of the surface that belong to the nodes that move, m2.
         filter: solver of M + r^2 K.
         followers: of x, y and z.
+        places: (n, 3) of all nodes when the mesh was made, m.
+        carried: from moves of the nodes to those of the points of the part's surface.
     """
 
     areas: np.ndarray
     filter: Any
     followers: tuple[Follower, Follower, Follower]
+    places: np.ndarray
+    carried: sp.csr_matrix
 
 
 def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:
@@ -237,7 +254,8 @@ def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:
         solver = splu(graph[inner][:, inner].tocsc())
         followers.append(Follower(inner, graph[inner][:, ~inner], solver))
     areas, solver = _filter(points, facets[free], nodes, REACH * domain.cell)
-    frame = Frame(areas, solver, (followers[0], followers[1], followers[2]))
+    carried = _carried(part.surface.points, domain, near, points, facets, own)
+    frame = Frame(areas, solver, (followers[0], followers[1], followers[2]), points, carried)
     return FreeSurface(part, mesh, nodes, along[nodes], frame)
 
 
@@ -264,6 +282,29 @@ def _held(
     held[facets[~straight]] = True
     held[mesh.inboard] = held[mesh.outboard] = True
     return held, across
+
+
+def _carried(
+    surface: np.ndarray,
+    domain: SolidDomain,
+    near: float,
+    points: np.ndarray,
+    facets: np.ndarray,
+    own: np.ndarray,
+) -> sp.csr_matrix:
+    """Return the weights (n, m) of mesh nodes in the moves of a surface's points.
+
+    Those of the nearest facet; on the arm's own faces of the nearest one there.
+    """
+    on_own = distance_to_faces(surface, domain.own) < near
+    weights = sp.lil_matrix((len(surface), len(points)))
+    for some, among in ((on_own, facets[own]), (~on_own, facets)):
+        if some.any():
+            which, shares = nearest_facets(surface[some], points, among)
+            rows = np.flatnonzero(some)
+            for corner in range(3):
+                weights[rows, among[which, corner]] = shares[:, corner]
+    return weights.tocsr()
 
 
 def _graph(mesh: Tetrahedra) -> sp.csr_matrix:
