@@ -105,10 +105,6 @@ def part(
     target = out or folder / "part"
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
-    if optimize and any(scene.arms[k].is_solid for k in scene.cell_counts):
-        raise InputError(
-            f"--optimize: of arms in the plane alone; the arms of {folder} are solids; leave it out"
-        )
     claim(world, target, overwrite, file_names(scene), scene=scene)
     with _stages(world) as say:
         say("outlines and surfaces")
@@ -187,12 +183,10 @@ class Made:
     def optimized(self, run: Path, iterations: int, check: bool, say: Say) -> Made:
         """Return it with optimised shapes, the parts before beside them in the check."""
         from dolfinopt.part.optimize import optimize_parts
-        from dolfinopt.part.plane.part import PlanePart
 
         say("shapes")
-        plates = {k: one for k, one in self.parts.items() if isinstance(one, PlanePart)}
         found = optimize_parts(
-            self.scene, plates, iterations, lambda line: click.echo(line, err=True)
+            self.scene, self.parts, iterations, lambda line: click.echo(line, err=True)
         )
         click.echo(found.sentence)
         after = replace(self, parts=found.parts, meshes=found.meshes, shape=found, check=None)

@@ -23,10 +23,11 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from dolfinopt.mesh.geometry import Tetrahedra
+from dolfinopt.part.plane.free_outline import FreeOutline
 from dolfinopt.part.plane.mesh import facing
 from dolfinopt.part.solid.domain import SolidDomain
-from dolfinopt.part.solid.mesh import NEAR
-from dolfinopt.part.solid.part import SolidPart
+from dolfinopt.part.solid.mesh import NEAR, PlateMesh
+from dolfinopt.part.solid.part import SolidPart, plate_part
 from dolfinopt.part.solid.surface import (
     Surface,
     area_vectors,
@@ -214,6 +215,81 @@ class Frame:
     followers: tuple[Follower, Follower, Follower]
     places: np.ndarray
     carried: sp.csr_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class FreePlate:
+    """The outline of a plate in space, meshed in prisms: variables are those of the outline.
+
+    Attributes:
+        solid: the arm and its design.
+        outline: of the plate.
+    """
+
+    solid: SolidDomain
+    outline: FreeOutline
+
+    @property
+    def part(self) -> SolidPart:
+        """That it was made of."""
+        return plate_part(self.solid, self.outline.part)
+
+    @property
+    def current(self) -> SolidPart:
+        """The part with this outline."""
+        return plate_part(self.solid, self.outline.current)
+
+    @property
+    def made(self) -> SolidPart:
+        """The part with this outline, and what is measured of it."""
+        return plate_part(self.solid, self.outline.made)
+
+    @property
+    def count(self) -> int:
+        """Number of control points."""
+        return self.outline.count
+
+    @property
+    def size(self) -> float:
+        """Volume, m3."""
+        return self.outline.size * self.outline.part.domain.thickness
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether the outline can be that of a part."""
+        return self.outline.is_valid
+
+    def filtered(self, x: np.ndarray) -> np.ndarray:
+        """Return s = F x (count,), m."""
+        return self.outline.filtered(x)
+
+    def by_x(self, by_s: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, count) by x from those by s."""
+        return self.outline.by_x(by_s)
+
+    def moved(self, s: np.ndarray) -> FreePlate:
+        """Return the plate with control points moved outwards by s (count,), m."""
+        return replace(self, outline=self.outline.moved(s))
+
+    def room(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far (count,) control points may move inwards and outwards, m."""
+        return self.outline.room()
+
+    def meshed(self, coarser: float) -> tuple[FreePlate, Tetrahedra]:
+        """Return it with a new mesh; variables stay."""
+        return self, self.current.mesh(coarser)
+
+    def followed(self, mesh: PlateMesh) -> PlateMesh:
+        """Return a mesh of a plate nearby, moved to this one."""
+        return mesh.followed(self.outline.shape)
+
+    def by_s(self, mesh: PlateMesh, by_nodes: np.ndarray) -> np.ndarray:
+        """Return derivatives (count,) by s from those by the places (n, 3) of all nodes."""
+        return self.outline.by_s(mesh.face, mesh.at_face(by_nodes))
+
+    def size_by_s(self) -> np.ndarray:
+        """Return the derivative (count,) of the volume by s, m2."""
+        return self.outline.size_by_s() * self.outline.part.domain.thickness
 
 
 def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:

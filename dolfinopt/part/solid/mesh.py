@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra, tetrahedra_of
+from dolfinopt.part.plane.curves import Shape
+from dolfinopt.part.plane.mesh import BodyMesh
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
@@ -57,9 +59,9 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
     for angle, share in TRIES:
         try:
             if part.flat is None:
-                mesh = _freeform_mesh(part, share * size, np.radians(angle))
+                mesh: Tetrahedra = _freeform_mesh(part, share * size, np.radians(angle))
             else:
-                mesh = _plate_mesh(part, part.flat, share * size)
+                mesh = _plate_mesh(part.flat, share * size)
         except InputError as error:
             reason = str(error)
             continue
@@ -84,11 +86,37 @@ def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     return tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
 
 
-def _plate_mesh(part: SolidPart, flat: PlanePart, size: float) -> Tetrahedra:
-    """Return prisms over the triangles of a plate, each cut in three."""
-    face = flat.mesh(size / flat.domain.cell)
+@dataclass(frozen=True, eq=False)
+class PlateMesh(Tetrahedra):
+    """Prisms over the triangles of a plate, each cut in three.
+
+    Attributes:
+        face: the triangles; their points make up every layer of this mesh's.
+        thickness: of the plate, m.
+        layers: of prisms.
+    """
+
+    face: BodyMesh
+    thickness: float
+    layers: int
+
+    def followed(self, shape: Shape) -> PlateMesh:
+        """Return the mesh moved to a shape nearby."""
+        return extruded(self.face.morphed(shape), self.thickness, self.layers)
+
+    def at_face(self, by_nodes: np.ndarray) -> np.ndarray:
+        """Return derivatives (n, 2) by the face's points from those by the places of all nodes."""
+        layers = by_nodes.reshape(self.layers + 1, -1, 3)
+        return np.asarray(layers[:, :, :2].sum(axis=0))
+
+
+def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     thickness = flat.domain.thickness
-    layers = max(1, round(thickness / size))
+    return extruded(flat.mesh(size / flat.domain.cell), thickness, max(1, round(thickness / size)))
+
+
+def extruded(face: BodyMesh, thickness: float, layers: int) -> PlateMesh:
+    """Return prisms over triangles to both sides of z = 0, each cut in three."""
     count = len(face.points)
     heights = np.linspace(-0.5 * thickness, 0.5 * thickness, layers + 1)
     points = np.concatenate([np.column_stack([face.points, np.full(count, z)]) for z in heights])
@@ -111,7 +139,7 @@ def _plate_mesh(part: SolidPart, flat: PlanePart, size: float) -> Tetrahedra:
             [np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)]
         )
         walls.append(np.concatenate([wall + layer * count for layer in range(layers)]))
-    mesh = Tetrahedra(points, cells, walls[0], walls[1])
+    mesh = PlateMesh(points, cells, walls[0], walls[1], face, thickness, layers)
     turned = mesh.volumes < 0.0
     cells[turned] = cells[turned][:, [0, 1, 3, 2]]
     return mesh

@@ -322,12 +322,16 @@ def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart
                 "arms.extruded = true"
             )
         return _freeform_part(domain)
-    part = make_part(domain.flat, curves)
-    outline, t = part.outline, domain.flat.thickness
-    surface = _prism(part.shape, t, 0.5 * part.tolerance)
+    return plate_part(domain, make_part(domain.flat, curves))
+
+
+def plate_part(domain: SolidDomain, flat: PlanePart) -> SolidPart:
+    """Return the part of an arm whose design is the same over the thickness."""
+    outline, t = flat.outline, flat.domain.thickness
+    surface = _prism(flat.shape, t, 0.5 * flat.tolerance)
     lost = t * outline.islands_area
-    far = part.shape.distance
-    return SolidPart(domain, surface, outline.level, far, outline.islands, lost, part)
+    far = flat.shape.distance
+    return SolidPart(domain, surface, outline.level, far, outline.islands, lost, flat)
 
 
 def _prism(shape: Shape, thickness: float, tolerance: float) -> Surface:
