@@ -27,7 +27,7 @@ from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simula
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
 from dolfinopt.part.plane.free_outline import free_outline
 from dolfinopt.part.plane.part import PlanePart
-from dolfinopt.part.solid.free_surface import FreePlate, free_surface
+from dolfinopt.part.solid.free_surface import free_form
 from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
@@ -163,9 +163,7 @@ def _free(part: Part) -> FreeForm:
     if isinstance(part, PlanePart):
         return free_outline(part)
     assert isinstance(part, SolidPart)
-    if part.flat is not None:
-        return FreePlate(part.domain, free_outline(part.flat))
-    return free_surface(part, part.mesh(SIDES))
+    return free_form(part, SIDES)
 
 
 class FreeForm(Protocol):

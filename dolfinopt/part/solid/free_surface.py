@@ -23,7 +23,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from dolfinopt.mesh.geometry import Tetrahedra
-from dolfinopt.part.plane.free_outline import FreeOutline
+from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.mesh import facing
 from dolfinopt.part.solid.domain import SolidDomain
 from dolfinopt.part.solid.mesh import NEAR, PlateMesh
@@ -290,6 +290,13 @@ class FreePlate:
     def size_by_s(self) -> np.ndarray:
         """Return the derivative (count,) of the volume by s, m2."""
         return self.outline.size_by_s() * self.outline.part.domain.thickness
+
+
+def free_form(part: SolidPart, coarser: float) -> FreePlate | FreeSurface:
+    """Return what moves of a part: the outline of a plate, or a surface."""
+    if part.flat is not None:
+        return FreePlate(part.domain, free_outline(part.flat))
+    return free_surface(part, part.mesh(coarser))
 
 
 def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:
