@@ -54,7 +54,6 @@ from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.arms import SIZE_PARAMETER
 
 # ONELAB parameters of meshes/*.geo, without the number that orders them.
-FOLDED = 0.02  # shape of a cell, 1 of a regular one, below which a mesh is folded
 LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (m)"
 SIZE, SHAPE = SIZE_PARAMETER, "cell shape"
 
@@ -699,11 +698,6 @@ class Tetrahedra:
         edges = corners[:, pairs[:, 0]] - corners[:, pairs[:, 1]]
         volume = np.maximum(self.volumes, 0.0)
         return np.asarray(12.0 * (3.0 * volume) ** (2.0 / 3.0) / np.square(edges).sum(axis=(1, 2)))
-
-    @property
-    def is_folded(self) -> bool:
-        """Whether a cell is turned over or next to nothing."""
-        return bool(self.quality.min() < FOLDED)
 
     @property
     def boundary(self) -> np.ndarray:

@@ -7,6 +7,7 @@ on meshes of quadratic triangles along their curves or of quadratic tetrahedra i
 
 from __future__ import annotations
 
+import gc
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -100,6 +101,9 @@ def simulate_parts(
         start: `Trajectory.solutions` of parts nearby.
         changes: tables of the scene that are other than the run's.
     """
+    # Matrices of the parts before hang in cycles with their meshes; Python's collector, which does
+    # not see how large they are, would let many of them gather (17 GB of solids in a search).
+    gc.collect()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for arm, owner in zip(scene.arms, scene.owners, strict=True):

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -41,8 +41,6 @@ ITERATIONS = 60  # default, at most
 FARTHEST = 0.2  # cells that a control point moves in a step, at most
 LEAST_RADIUS = 0.02  # of the trust region, of FARTHEST, below which no step is looked for
 SETTLED, PATIENCE = 1e-3, 6  # relative fall of the objective in so many steps that ends a round
-QUALITY = 0.15  # of a triangle, 1 where it is equilateral, below which the mesh is made anew
-MORPHED = 4  # steps that one mesh follows
 SIDES = 1.0  # of the triangles over those of the fine mesh
 ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
@@ -168,6 +166,11 @@ def _free(part: Part) -> FreeForm:
 
 class FreeForm(Protocol):
     """The outline or surface of a part as variables x: moves s = F x along normals, m."""
+
+    STEPS: ClassVar[int]
+
+    def is_worn(self, mesh: Any) -> bool:
+        """Whether a mesh that followed is to be made anew."""
 
     @property
     def part(self) -> Part:
@@ -445,7 +448,7 @@ class Search:
 
     def _step(self, slopes: np.ndarray) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
-        if self.morphed >= MORPHED or self._worst_triangle() < QUALITY:
+        if self._is_worn():
             self.state = self.problem.evaluated(self.state.outlines, {}, self.solutions)
             self.morphed = 0
             self._begin()
@@ -507,7 +510,7 @@ class Search:
                 return None
         try:
             bodies = {k: one.followed(self.state.bodies[k]) for k, one in outlines.items()}
-            if any(one.is_folded for one in bodies.values()):
+            if any(one.is_worn(bodies[k]) for k, one in outlines.items()):
                 bodies = {}
             return self.problem.evaluated(outlines, bodies, self.solutions)
         except (ConvergenceError, InputError):
@@ -518,5 +521,7 @@ class Search:
         """The motion of the last state, from which the next one's is found."""
         return self.state.simulated.trajectory.solutions
 
-    def _worst_triangle(self) -> float:
-        return min(float(mesh.quality.min()) for mesh in self.state.bodies.values())
+    def _is_worn(self) -> bool:
+        """Whether meshes have followed too many steps."""
+        forms, bodies = self.state.outlines, self.state.bodies
+        return any(self.morphed >= o.STEPS or o.is_worn(bodies[k]) for k, o in forms.items())

@@ -71,10 +71,6 @@ class PartMesh(Protocol):
         """(m,) shape of the cells, 1 of a regular one."""
 
     @property
-    def is_folded(self) -> bool:
-        """Whether a cell is turned over or next to nothing."""
-
-    @property
     def cells(self) -> np.ndarray:
         """(m, d + 1) corners of the cells."""
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -37,6 +37,7 @@ REACH = 2.0  # length r over which moves are smooth, cells
 LEAST_POINTS = 8  # control points of a closed run; an open one has 3 more than it has spans
 SAMPLES = 8  # points for every control point that a run is fitted to
 STIFF = 1e-4  # of second differences of control points, where they are fitted
+WORN = 0.15  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
 CHORD = 0.005  # distance of polygons from the curves, cells
 NEAREST = 200  # places around each that may be the other side of a member or a gap
 WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
@@ -151,6 +152,8 @@ class FreeOutline:
     least: tuple[float, float]
     partner: np.ndarray | None
 
+    STEPS: ClassVar[int] = 4  # that one mesh follows
+
     @cached_property
     def shape(self) -> Shape:
         """The outline in curves."""
@@ -182,6 +185,10 @@ class FreeOutline:
         apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
         shape = replace(self.shape, apart=float(apart))
         return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
+
+    def is_worn(self, mesh: BodyMesh) -> bool:
+        """Whether a mesh is to be made anew: a triangle is folded or nearly flat."""
+        return mesh.is_folded or bool(mesh.quality.min() < WORN)
 
     @property
     def size(self) -> float:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -43,6 +43,7 @@ NEAREST, WALLS = 400, 60  # places around each that may be the other side; the a
 WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
 ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
+WORN = 0.3  # worst shape of a cell, over that when the mesh was made, that makes a new one due
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 
 
@@ -63,6 +64,8 @@ class FreeSurface:
     nodes: np.ndarray
     along: np.ndarray
     frame: Frame
+
+    STEPS: ClassVar[int] = 10  # that one mesh follows: a new one has other variables
 
     @property
     def count(self) -> int:
@@ -127,9 +130,14 @@ class FreeSurface:
     @property
     def is_valid(self) -> bool:
         """Whether its cells are sound and its surface does not cross itself."""
-        if self.mesh.is_folded:
+        if self.is_worn(self.mesh):
             return False
         return not len(crossings(Surface(self.mesh.points, self.mesh.boundary)))
+
+    def is_worn(self, mesh: Tetrahedra) -> bool:
+        """Whether the worst cell of a mesh is much worse than when it was made."""
+        made = replace(self.mesh, points=self.frame.places)
+        return bool(mesh.quality.min() < WORN * made.quality.min())
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Return how far (count,) nodes may move inwards and outwards in a step, m.
@@ -229,6 +237,8 @@ class FreePlate:
     solid: SolidDomain
     outline: FreeOutline
 
+    STEPS: ClassVar[int] = FreeOutline.STEPS
+
     @property
     def part(self) -> SolidPart:
         """That it was made of."""
@@ -258,6 +268,10 @@ class FreePlate:
     def is_valid(self) -> bool:
         """Whether the outline can be that of a part."""
         return self.outline.is_valid
+
+    def is_worn(self, mesh: PlateMesh) -> bool:
+        """Whether a mesh is to be made anew."""
+        return self.outline.is_worn(mesh.face)
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         """Return s = F x (count,), m."""
