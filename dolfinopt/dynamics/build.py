@@ -18,10 +18,10 @@ from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
-    ElasticBodies,
     JointHardware,
     Mechanism,
     Springs,
+    plane_chain,
 )
 from dolfinopt.multibody.motion import (
     RigidMotion,
@@ -39,17 +39,16 @@ from dolfinopt.scene.load import Arm, Scene
 
 def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     """Put the bodies on the scene's base, with what sits at their joints and its payload."""
-    joints = tuple(
-        JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
-        for arm in scene.arms
-    )
-    return Mechanism(
-        bodies=tuple(bodies),
-        payload_mass=scene.payload.mass,
-        payload_inertia=scene.payload.moment,
-        gravity=(scene.motion.gravity[0], scene.motion.gravity[1]),
-        joint_height=scene.motion.joint_height,
-        joints=joints if any(joint != JointHardware() for joint in joints) else (),
+    return plane_chain(
+        bodies,
+        scene.payload.mass,
+        scene.payload.moment,
+        (scene.motion.gravity[0], scene.motion.gravity[1]),
+        scene.motion.joint_height,
+        hardware=[
+            JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
+            for arm in scene.arms
+        ],
         cart_mass=scene.motion.cart_mass,
     )
 
@@ -138,7 +137,7 @@ def build_system(
     family = family_of(scene)
     if motion is None:
         motion = desired_motion(scene)
-    mechanism: ElasticBodies = family.build(scene, bodies)
+    mechanism: Mechanism = family.build(scene, bodies)
     instants = breakpoints(scene, family.curve)
     if not is_machine(scene):
         return ElasticSystem(mechanism, motion, instants)

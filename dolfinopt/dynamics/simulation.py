@@ -26,6 +26,7 @@ from dolfinopt.dynamics.newton import ONE_RUN
 from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.dimension import Plane
 from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
@@ -37,7 +38,7 @@ from dolfinopt.multibody.end_effector import (
 )
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
-from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
@@ -118,7 +119,7 @@ class Trajectory:
 
     @property
     def mechanism(self) -> Any:
-        """What moved: a `Mechanism`, in space a `SpatialMechanism`."""
+        """What moved."""
         return self.problem.mechanism
 
     @cached_property
@@ -473,7 +474,7 @@ def _by_radau(
 ) -> list[Solution | ConvergenceError]:
     """Return the solutions in their order: chains on prescribed motions together, others alone."""
     alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if isinstance(one.mechanism, Mechanism)}
+    own = {i: one for i, one in alike.items() if one.mechanism.dim is Plane}
     together, begun = list(own), [starts[i] for i in own]
     solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
     found = dict(zip(together, solved, strict=True))
@@ -582,7 +583,7 @@ class DriveForces:
 class _Prescribed:
     """Forces of inverse dynamics along a given motion; q, qd, qdd (n, N) are elastic."""
 
-    mechanism: ElasticBodies
+    mechanism: Mechanism
     motion: RigidMotion
     rates: Rates
 
@@ -768,7 +769,7 @@ class _Probe:
     """
 
     def __init__(self, system: Problem):
-        mechanism: ElasticBodies = system.mechanism
+        mechanism: Mechanism = system.mechanism
         first = system.elastic_columns.start or 0
         own = list(range(first))
         self.places: list[slice] = []

@@ -44,7 +44,7 @@ from dolfinopt.exchange.sid import (
     taylor,
 )
 from dolfinopt.multibody.measured import CENTRIFUGAL_EXCESS_SHARE, FILE_ROUNDING_SHARE
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
 from dolfinopt.multibody.spatial.mechanism import ONE, PERMUTATION, skew
 
 # Entries of J, and products of the angular velocity in the columns of Oe.
@@ -208,6 +208,21 @@ def load_body(
             found = ", ".join(f"{x:.7g}" for x in point)
             raise InputError(f"{path}: {where} is at ({found}) m, but {told}")
     return body
+
+
+def without_stiffening(body: ShapeIntegrals, source: str) -> ShapeIntegrals:
+    """Return the body of a file without its geometric stiffness.
+
+    Raises:
+        InputError: in space, where it is not told from inertia.
+    """
+    if len(body.w) == 3:
+        raise InputError(
+            f"{source}: holds geometric stiffness, which simulation.stiffening = false is to leave "
+            "out; that of a body in space is not told from its inertia in such a file: write it "
+            "without, or take true or 'auto'"
+        )
+    return linear_part(body)
 
 
 def from_sid(

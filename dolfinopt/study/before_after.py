@@ -21,8 +21,8 @@ from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, htm
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
+    from dolfinopt.multibody.mechanism import Mechanism
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-    from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
     from dolfinopt.output.views import ArmView
 
 Summary = Mapping[str, Any]  # content of summary.json
@@ -104,7 +104,7 @@ class Side:
     scene: Scene
     summary: Summary
     views: list[ArmView]  # of all arms, in the scene's order
-    mechanism: SpatialMechanism
+    mechanism: Mechanism
     t: np.ndarray  # (n,) s
     q_r: np.ndarray  # (n, joints) rad or m
     deviation: np.ndarray  # (n,) of the tool from where rigid links carry it, m

@@ -56,15 +56,23 @@ from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "sections"  # of the study's files, and of the folder of the members' meshes
 DESIGN, SAME = "design", "same mass"
-IN_PLANE = {"solid bar": FLAT_BAR}
-IN_SPACE = {
-    "solid bar": SOLID_BAR,
-    "rectangular tube": RECTANGULAR_TUBE,
-    "round tube": ROUND_TUBE,
-    "I section": I_SECTION,
+KINDS = {  # by the machine's dimension
+    2: {"solid bar": FLAT_BAR},
+    3: {
+        "solid bar": SOLID_BAR,
+        "rectangular tube": RECTANGULAR_TUBE,
+        "round tube": ROUND_TUBE,
+        "I section": I_SECTION,
+    },
 }
 BAR_CELLS = (4, 8)  # of a bar in place of an arm from a file: over its smaller side, at most
 LEAST, MOST = 0.01, 0.95  # shares: thinner walls are foil, thicker ones leave a slit
+VARIED = {
+    2: "In plane stress all parts are as thick as the arm, so that tubes and I sections are none; "
+    "the bar's height is what varies.",
+    3: "Tubes and the I have the outer sides of the arm's envelope, their walls are what varies (a "
+    f"share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is not judged.",
+}
 NEAREST, FARTHEST = 0.01, 0.5  # steps of the factor's logarithm to the other side of a limit
 CLOSE = 1e-6  # of the same: both sides are one
 STEPS = 20  # simulations at most on the way to a limit
@@ -413,8 +421,8 @@ def study_sections(
         InputError: the scene's arms cannot be replaced; nothing was computed.
     """
     label, design = on_root(world, _checked, scene, designs)
-    kinds = IN_SPACE if scene.is_spatial else IN_PLANE
-    every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds.items()]
+    kinds = KINDS[scene.dimension].items()
+    every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds]
     own = Case(scene, "simulate", design, DESIGN)
     done = run_cases([own], folder, world, shown=shown)
     computed = done.computed
@@ -558,22 +566,14 @@ def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
 
 def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
     """Return what one has to know to read the table."""
-    notes = ["Members are straight from joint to joint, uniform, without flanges or bosses."]
-    if scene.is_spatial:
-        notes.append(
-            "Tubes and the I have the outer sides of the arm's envelope, their walls are what "
-            f"varies (a share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is "
-            "not judged."
-        )
-    else:
-        notes.append(
-            "In plane stress all parts are as thick as the arm, so that tubes and I sections are "
-            "none; the bar's height is what varies."
-        )
+    notes = [
+        "Members are straight from joint to joint, uniform, without flanges or bosses.",
+        VARIED[scene.dimension],
+    ]
     if len({owner for owner in scene.owners if owner is not None}) > 1:
         notes.append("Every arm has its own size.")
-    kinds = IN_SPACE if scene.is_spatial else IN_PLANE
-    if missing := [kind for kind in kinds if kind not in {r.kind for r in rows if r.made == SAME}]:
+    found = {row.kind for row in rows if row.made == SAME}
+    if missing := [kind for kind in KINDS[scene.dimension] if kind not in found]:
         notes.append(f"No {' or '.join(missing)} in the envelope has the design's mass.")
     return notes
 

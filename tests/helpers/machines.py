@@ -214,7 +214,7 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
     strain = np.zeros(len(t))
     origins, rotations, _ = _frames(mechanism, motion, q)
-    moment = mechanism.payload_mass * origins[-1]  # first moment of all masses, complex
+    moment = np.zeros(len(t), dtype=complex)  # first moment of all masses
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         e = q[:, part]
         strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
@@ -222,9 +222,9 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
         if body.is_stiffened:
             own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:2], e)
         moment = moment + body.mass * origins[k] + rotations[k] * (own[:, 0] + 1j * own[:, 1])
-    for k, joint in enumerate(mechanism.joints):
-        moment = moment + joint.mass * origins[1 + k]
-    potential = -(np.conj(complex(*mechanism.gravity)) * moment).real
+    for (k, _), load in mechanism.loads.items():
+        moment = moment + load.mass * origins[1 + k]
+    potential = -(np.conj(complex(*mechanism.gravity[:, 0])) * moment).real
     return kinetic, strain, potential
 
 

@@ -29,9 +29,9 @@ from dolfinopt.multibody.measured import (
 )
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
 from dolfinopt.multibody.spatial.mechanism import (
+    Mechanism,
     Pose,
     RigidChain,
-    SpatialMechanism,
     end_chain,
     roll_pitch_yaw,
 )
@@ -76,7 +76,7 @@ class Frames:
         )
 
 
-def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
+def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
     """Return the frames of all bodies.
 
     Args:
