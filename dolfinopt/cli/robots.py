@@ -83,7 +83,7 @@ def import_robot(
 
 def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
     """Return the robot, its packages looked for in folders that are there."""
-    from dolfinopt.exchange.urdf.read import read_robot
+    from dolfinopt.exchange.urdf.file import read_robot
 
     for folder in package_path:
         if not folder.is_dir():
@@ -95,7 +95,7 @@ def _read(
     model: Robot, links: str, trajectory: Path, tool: str | None, boxes: bool
 ) -> tuple[RobotScene, np.ndarray, np.ndarray]:
     """Return the scene, instants (n,) and rows (n, joints) of its table."""
-    from dolfinopt.exchange.urdf.read import implausible_inertias
+    from dolfinopt.exchange.urdf.file import implausible_inertias
     from dolfinopt.exchange.urdf.robot import scene_bodies
     from dolfinopt.exchange.urdf.scene import RobotScene, read_trajectory
 
@@ -232,7 +232,7 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
 
 def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
     """Raise InputError if the new robot would replace the one it is made of, or its meshes."""
-    from dolfinopt.exchange.urdf.read import sources_of
+    from dolfinopt.exchange.urdf.file import sources_of
 
     if not file.is_file():
         return  # told by whoever reads it
@@ -331,8 +331,7 @@ def _robot_files(
     parts: Mapping[int, Part],
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return the files by name, the robot last, and what has become of the links (root only)."""
-    from dolfinopt.exchange.urdf.read import read_robot
-    from dolfinopt.exchange.urdf.write import NewLink, robot_text
+    from dolfinopt.exchange.urdf.file import NewLink, read_robot, robot_text
     from dolfinopt.part.files.triangles import triangle_bytes
 
     before = read_robot(origin.file).links

@@ -10,8 +10,8 @@ from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_
 from runs import run
 
 from dolfinopt.arms.arm import build_arms, uniform_design
+from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
-from dolfinopt.exchange.urdf.read import read_robot
 from dolfinopt.exchange.urdf.robot import (
     MASSLESS,
     Robot,

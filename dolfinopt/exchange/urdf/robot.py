@@ -239,6 +239,11 @@ def roll_pitch_yaw_of(R: np.ndarray) -> tuple[float, float, float]:
     return roll, math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0]), yaw
 
 
+def number(value: float) -> str:
+    """Return a number as files have it, zero without a sign."""
+    return repr(float(value) + 0.0)
+
+
 # -- chosen links as solids: their frames from joint to joint, and their sizes -------------------
 
 SLENDERNESS = 10.0  # length over height of a link whose geometry is not known

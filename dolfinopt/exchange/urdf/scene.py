@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.robot import GROUND, Robot, RobotJoint, SceneBody, roll_pitch_yaw_of
+from dolfinopt.exchange.urdf.robot import (
+    GROUND,
+    Robot,
+    RobotJoint,
+    SceneBody,
+    number,
+    roll_pitch_yaw_of,
+)
 from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_table
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
@@ -122,17 +129,17 @@ class RobotScene:
                 keys.insert(0, f"# {'; '.join(body.mesh.done)}")
             if body.mesh.offset > CENTRED * max(one.sides):
                 keys.append(
-                    f"interface_offset = {_number(_up(1.001 * body.mesh.offset))}  # m, of their "
+                    f"interface_offset = {number(_up(1.001 * body.mesh.offset))}  # m, of their "
                     "middles from the joints"
                 )
         return [
             "[[arms]]",
             f"name = {_string(self.arms[body.link])}",
-            f"length = {_number(body.length)}  # m, from joint to joint",
-            f"height = {_number(one.sides[0])}  # m, {by}{'' if body.mesh else ': edit them'}",
-            f"thickness = {_number(one.sides[1])}",
+            f"length = {number(body.length)}  # m, from joint to joint",
+            f"height = {number(one.sides[0])}  # m, {by}{'' if body.mesh else ': edit them'}",
+            f"thickness = {number(one.sides[1])}",
             *keys,
-            f"passive = {_number(one.passive)}  # m, kept solid at the joints: one layer of cells, "
+            f"passive = {number(one.passive)}  # m, kept solid at the joints: one layer of cells, "
             f"{DENSITY * one.ends:.3g} kg",
             f"# all solid it weighs {DENSITY * one.volume:.4g} kg; {file}: "
             f"{own.mass:.4g} kg, centre {_rounded(own.centre)}",
@@ -179,7 +186,7 @@ class RobotScene:
             *([f"# with {', '.join(map(_one_line, also))}, fixed to it"] if also else []),
             "rigid = true",
             "length = 0.0",
-            f"mass = {_number(own.mass)}",
+            f"mass = {number(own.mass)}",
             f"centre = {_list(own.centre)}",
             f"inertia = {_list(own.tensor[i] for i in INERTIA)}",
         ]
@@ -209,7 +216,7 @@ class RobotScene:
             ("effort_limit", joint.effort, force),
         ):
             if math.isfinite(value):
-                lines.append(f"{key} = {_number(value)}  # {unit}")
+                lines.append(f"{key} = {number(value)}  # {unit}")
         return lines
 
     def _rest(self) -> list[str]:
@@ -220,7 +227,7 @@ class RobotScene:
             "[motion]",
             'path = "joints"',
             f"file = {_string(TRAJECTORY)}  # t in s, the joints in rad or m",
-            f"horizon = {_number(_up(self.duration * (1.0 + SETTLING)))}  # s simulated",
+            f"horizon = {number(_up(self.duration * (1.0 + SETTLING)))}  # s simulated",
             "gravity = [0.0, 0.0, -9.81]  # m/s2, in the robot's root frame",
             "",
             "[payload]",
@@ -233,10 +240,10 @@ class RobotScene:
             "coordinates = 6  # of a solid link: those of its outboard interface alone",
             "",
             "[design]",
-            f"volume_fraction = {_number(fraction)}  # of each solid link may stay: together as "
+            f"volume_fraction = {number(fraction)}  # of each solid link may stay: together as "
             "heavy as in the URDF file" + ("" if self._weighed else ", as far as it tells"),
-            f"initial = {_number(initial)}  # density with which they begin so",
-            f"filter_radius = {_number(_up(RADIUS * side))}  # m",
+            f"initial = {number(initial)}  # density with which they begin so",
+            f"filter_radius = {number(_up(RADIUS * side))}  # m",
         ]
 
     def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
@@ -366,12 +373,8 @@ def _rounded(values: Sequence[float] | np.ndarray) -> str:
     return "[" + ", ".join(f"{float(one):.4g}" for one in _tidy(np.asarray(values))) + "]"
 
 
-def _number(value: float) -> str:
-    return repr(float(value) + 0.0)
-
-
 def _list(values: Iterable[float]) -> str:
-    return "[" + ", ".join(map(_number, values)) + "]"
+    return "[" + ", ".join(map(number, values)) + "]"
 
 
 def _string(text: str) -> str:
