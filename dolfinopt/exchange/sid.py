@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -212,55 +212,16 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
     }
     matrices = {name: getattr(data, name) for name in BODY}
     for k, node in enumerate(data.nodes, 1):
-        matrices.update({f"node{k}/{name}": getattr(node, name) for name in NODE})
+        matrices |= {f"node{k}/{name}": getattr(node, name) for name in NODE}
     for name, matrix in matrices.items():
         if matrix is not None:
-            for field in fields(Taylor):
-                arrays[f"{name}/{field.name}"] = np.asarray(getattr(matrix, field.name))
+            arrays |= {f"{name}/{key}": np.asarray(value) for key, value in vars(matrix).items()}
     return arrays
 
 
 def write_sid_npz(path: Path, data: StandardInputData) -> None:
     """Write `sid_arrays` to a file."""
     write_arrays(path, sid_arrays(data))
-
-
-def read_sid_npz(path: Path) -> StandardInputData:
-    """Read what `write_sid_npz` wrote.
-
-    Raises:
-        InputError: the file cannot be read, or an array is missing.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-        return _from_arrays(arrays)
-    except KeyError as error:
-        raise InputError(f"{path}: the array {error.args[0]!r} is missing") from None
-    except Exception as error:  # whatever a foreign file may raise
-        problem = getattr(error, "strerror", None) or type(error).__name__
-        raise InputError(f"{path}: cannot be read ({problem}); give an .sid.npz file") from None
-
-
-def _from_arrays(arrays: Mapping[str, np.ndarray]) -> StandardInputData:
-    def matrix(name: str) -> Taylor:
-        M0, M1, *numbers = (arrays[f"{name}/{field.name}"] for field in fields(Taylor))
-        return Taylor(M0, M1, *map(int, numbers))
-
-    nodes = []
-    pairs = zip(arrays["node_names"], arrays["node_rframes"], strict=True)
-    for k, (name, rframe) in enumerate(pairs, 1):
-        parts = {key: matrix(f"node{k}/{key}") for key in NODE if key != "sigma"}
-        if f"node{k}/sigma/M0" in arrays:
-            parts["sigma"] = matrix(f"node{k}/sigma")
-        nodes.append(Node(str(name), str(rframe), **parts))
-    return StandardInputData(
-        mass=float(arrays["mass"]),
-        names=tuple(map(str, arrays["names"])),
-        nodes=tuple(nodes),
-        comment=str(arrays["comment"]),
-        **{name: matrix(name) for name in BODY},
-    )
 
 
 # -- writing the text file ---------------------------------------------------------------------
@@ -467,7 +428,8 @@ class _Reader:
         once |= {name: lambda name=name: self.taylor(name, number()) for name in BODY}  # type: ignore
         self.block("modal", once, {"frame": frame}, found)
         self.complete(found, ("refmod", *BODY), "before")
-        return StandardInputData(*found.pop("refmod"), tuple(nodes.values()), **found)
+        mass, names = found.pop("refmod")
+        return StandardInputData(mass, names, tuple(nodes.values()), **found)
 
     def refmod(self) -> tuple[float, tuple[str, ...]]:
         """Return the mass and the names of the coordinates."""
@@ -511,7 +473,7 @@ class _Reader:
         once: Items = {key: partial(self.integer, 0, limits.get(key, 10_000_000)) for key in HEADER}
         self.block(name, once, {"m0": put, "m1": put}, header)
         self.complete(header, HEADER, f"of {name} before")
-        size = {"nq": nq, "3nq": 3 * nq}
+        size: dict[Any, int] = {"nq": nq, "3nq": 3 * nq}
         allowed = [tuple(size.get(n, n) for n in shape) for shape in (BODY | NODE)[name]]
         order, *shape, count, nqn, structure = (header[key] for key in HEADER)
         if tuple(shape) not in allowed:

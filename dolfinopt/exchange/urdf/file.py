@@ -185,12 +185,9 @@ def _mimic(one: Any) -> Mimic:
 
 
 def _check_mimics(file: Path, joints: list[RobotJoint]) -> None:
-    by_name = {joint.name: joint for joint in joints}
+    leading = {one.name for one in joints if one.moves and one.mimic is None}
     for joint in joints:
-        if joint.mimic is None:
-            continue
-        other = by_name.get(joint.mimic.joint)
-        if other is None or not other.moves or other.mimic is not None:
+        if joint.mimic is not None and joint.mimic.joint not in leading:
             raise InputError(
                 f"{file}: joint {joint.name!r}: follows {joint.mimic.joint!r}; expected a joint "
                 "that moves and follows no other"
@@ -443,18 +440,11 @@ INDENT = "  "
 
 @dataclass(frozen=True, eq=False)
 class NewLink:
-    """What a link is from now on.
-
-    Attributes:
-        name: of the link.
-        inertia: in the link's frame.
-        mesh: file of its surface in the link's frame, as the URDF file is to name it; None leaves
-            its shapes as they are.
-    """
+    """What a link is from now on, in its frame."""
 
     name: str
     inertia: Inertia
-    mesh: str | None = None
+    mesh: str | None = None  # file of its surface, as the URDF file names it; None: shapes stay
 
 
 def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
