@@ -180,19 +180,16 @@ PAGES = ("before_after.md", "before_after.csv", "before_after.html")
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A finished run: its scene, and the arms as its design makes them.
+    """A finished run: its scene, and the arms as its design makes them."""
 
-    Attributes:
-        folder, scene: of the run.
-        partition, arms, x_phys: its design, on this rank.
-        bodies: of all arms with a design of their own, reduced; on the root.
-    """
-
+    # folder, scene: of the run
     folder: Path
     scene: Scene
+    # partition, arms, x_phys: its design, on this rank
     partition: Partition
     arms: Mapping[int, Arm]
     x_phys: Mapping[int, np.ndarray]
+    # of all arms with a design of their own, reduced; on the root
     bodies: Mapping[int, ShapeIntegrals]
 
 

@@ -78,23 +78,14 @@ class HelmholtzFilter:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """The sides of owned cells, k = 3 or 4 a cell, 4 or 6 in space with areas and volumes.
+    """The sides of owned cells, k = 3 or 4 a cell, 4 or 6 in space with areas and volumes."""
 
-    Attributes:
-        facet: (n, k) local numbers.
-        length: (n, k) m; the face's area in space, m2.
-        normal: (n, k, d) outward unit normals.
-        arm: (n, k, d) from the cell's centroid to the side's midpoint, m.
-        area: (n,) of the cells, m2; their volume in space, m3.
-        open: (n, k) where r dy/dn = -y.
-    """
-
-    facet: np.ndarray
-    length: np.ndarray
-    normal: np.ndarray
-    arm: np.ndarray
-    area: np.ndarray
-    open: np.ndarray
+    facet: np.ndarray  # (n, k) local numbers
+    length: np.ndarray  # (n, k) m; the face's area in space, m2
+    normal: np.ndarray  # (n, k, d) outward unit normals
+    arm: np.ndarray  # (n, k, d) from the cell's centroid to the side's midpoint, m
+    area: np.ndarray  # (n,) of the cells, m2; their volume in space, m3
+    open: np.ndarray  # (n, k) where r dy/dn = -y
 
     @property
     def distance(self) -> np.ndarray:

@@ -245,19 +245,12 @@ class ShapeDerivative:
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Gradients d_b u_a of displacements at points of some cells (cells, p, b, a, k), 1/m for m.
+    """Gradients d_b u_a of displacements at points of some cells (cells, p, b, a, k), 1/m for m."""
 
-    Attributes:
-        nodal: by the nodes.
-        modes: by the condensed modes, None where there are none.
-        amplitudes: (cells, m, k) of these.
-        values: (cells, n, d, k) of the nodes.
-    """
-
-    nodal: np.ndarray
-    modes: np.ndarray | None
-    amplitudes: np.ndarray | None
-    values: np.ndarray
+    nodal: np.ndarray  # by the nodes
+    modes: np.ndarray | None  # by the condensed modes, None where there are none
+    amplitudes: np.ndarray | None  # (cells, m, k) of these
+    values: np.ndarray  # (cells, n, d, k) of the nodes
 
     @property
     def strained(self) -> np.ndarray:
@@ -267,17 +260,11 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class _Tensor:
-    """What L is multiplied by: at the points, and at the centre of the cells.
+    """What L is multiplied by: at the points, and at the centre of the cells."""
 
-    Attributes:
-        points: (cells, p, d, d).
-        centre: (cells, d, d), or 0.
-        corners: (cells, c, d) what does not go through L, or 0.
-    """
-
-    points: np.ndarray
-    centre: Any = 0.0
-    corners: Any = 0.0
+    points: np.ndarray  # (cells, p, d, d)
+    centre: Any = 0.0  # (cells, d, d), or 0
+    corners: Any = 0.0  # (cells, c, d) what does not go through L, or 0
 
     @classmethod
     def of_volume(cls, psi: np.ndarray, dim: int) -> _Tensor:

@@ -139,19 +139,12 @@ def _columns(part: slice, size: int) -> tuple[slice, slice, slice]:
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where the coordinates asked for stand among the S columns.
+    """Where the coordinates asked for stand among the S columns."""
 
-    Attributes:
-        size: S.
-        rigid: (R,) joint coordinates asked for, ascending.
-        kept: of every body, those of its coordinates that have a column.
-        bodies: of every body, their place among the S.
-    """
-
-    size: int
-    rigid: np.ndarray
-    kept: list[np.ndarray]
-    bodies: list[slice]
+    size: int  # S
+    rigid: np.ndarray  # (R,) joint coordinates asked for, ascending
+    kept: list[np.ndarray]  # of every body, those of its coordinates that have a column
+    bodies: list[slice]  # of every body, their place among the S
 
     def of_body(self, i: int) -> tuple[slice, slice, slice]:
         """Return a body's columns in [q, qd, qdd]."""

@@ -273,23 +273,15 @@ def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """All designed arms as one grid, one below the other, in m.
+    """All designed arms as one grid, one below the other, in m."""
 
-    Attributes:
-        points: (n_points, 3).
-        cells: (n_cells, corners) points around each cell, an array an arm.
-        dimension: of the cells, 2 or 3.
-        density: (all cells,).
-        arm: (all cells,) number of the arm, from 0 in the scene's order.
-        stress: (all cells,) largest von Mises stress along the motion, Pa, or None.
-    """
-
-    points: np.ndarray
-    cells: list[np.ndarray]
-    density: np.ndarray
-    arm: np.ndarray
+    points: np.ndarray  # (n_points, 3)
+    cells: list[np.ndarray]  # (n_cells, corners) points around each cell, an array an arm
+    density: np.ndarray  # (all cells,)
+    arm: np.ndarray  # (all cells,) number of the arm, from 0 in the scene's order
+    # (all cells,) largest von Mises stress along the motion, Pa, or None
     stress: np.ndarray | None = None
-    dimension: int = 2
+    dimension: int = 2  # of the cells, 2 or 3
 
     @property
     def fields(self) -> dict[str, np.ndarray]:
