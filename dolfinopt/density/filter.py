@@ -167,10 +167,9 @@ def _area_and_centroid(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _TwoPoint:
-    """A = V + r^2 L, L_ij = -length_ij / distance_ij of the facets between owned cells' centroids.
+    """A = V + r^2 L, L_ij = -length_ij / distance_ij of the facets between owned cells."""
 
-    An open side adds r^2 length / (distance + r) to the diagonal.
-    """
+    # An open side adds r^2 length / (distance + r) to the diagonal.
 
     def __init__(self, mesh: ArmMesh, sides: _Sides, r: float):
         self.area = mesh.area
@@ -219,14 +218,13 @@ def _two_point_operator(mesh: ArmMesh, r: float, leak: np.ndarray) -> PETSc.Mat:
 
 
 class _Hybrid:
-    """Values u in the facets, from which those in the cells follow.
+    """Values u in the facets, from which those in the cells follow."""
 
-    Fluxes out of a cell are r^2 W (1 y - u), with W = area G'G + S' diag(length / distance) S of
-    the gradient G = N' / area exact for linear fields, and what G leaves over, S = I - arm G.
-    From area y + r^2 1'W (1 y - u) = area x follows y = keep x + c'u, with
-    c = r^2 W1 / (area + r^2 1'W1), keep = area / (area + r^2 1'W1); fluxes into a facet add up to
-    none. Thus y = keep x + C A^-1 C' area x with A = sum r^2 W - (area + r^2 1'W1) c c'.
-    """
+    # Fluxes out of a cell are r^2 W (1 y - u), with W = area G'G + S' diag(length / distance) S of
+    # the gradient G = N' / area exact for linear fields, and what G leaves over, S = I - arm G.
+    # From area y + r^2 1'W (1 y - u) = area x follows y = keep x + c'u, with
+    # c = r^2 W1 / (area + r^2 1'W1), keep = area / (area + r^2 1'W1); fluxes into a facet add up to
+    # none. Thus y = keep x + C A^-1 C' area x with A = sum r^2 W - (area + r^2 1'W1) c c'.
 
     def __init__(self, mesh: ArmMesh, sides: _Sides, r: float):
         self.area = mesh.area

@@ -26,7 +26,6 @@ from dolfinopt.dynamics.newton import ONE_RUN
 from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.dimension import Plane
 from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
@@ -474,7 +473,7 @@ def _by_radau(
 ) -> list[Solution | ConvergenceError]:
     """Return the solutions in their order: chains on prescribed motions together, others alone."""
     alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if one.mechanism.dim is Plane}
+    own = {i: one for i, one in alike.items() if one.mechanism.dim.d == 2}
     together, begun = list(own), [starts[i] for i in own]
     solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
     found = dict(zip(together, solved, strict=True))
@@ -760,13 +759,7 @@ def load_gradient(
 
 
 class _Probe:
-    """A system whose bodies have a coordinate more for every load, which stays at zero.
-
-    Attributes:
-        system: the larger one.
-        own: (S,) places of the system's unknowns among its.
-        places: of the added coordinates of every body.
-    """
+    """A system whose bodies have a coordinate more for every load, which stays at zero."""
 
     def __init__(self, system: Problem):
         mechanism: Mechanism = system.mechanism
@@ -780,6 +773,7 @@ class _Probe:
             self.places.append(slice(end + q, end + q + more))
             end += q + more
         rest = system.num_coordinates - first - mechanism.num_coordinates
+        # (S,) places of the system's unknowns among its; `places` are the added ones of every body.
         self.own = np.array([*own, *range(end, end + rest)], dtype=int)
         self._size = end + rest
         bodies = tuple(map(_with_probes, mechanism.bodies))

@@ -284,10 +284,8 @@ def _loads(rigid: Mechanism, motion: RigidMotion, closure: Closure | None) -> li
 
 
 def _ground_force(rigid: Mechanism, motion: RigidMotion, closure: Closure) -> np.ndarray:
-    """Return what the last arm must give to the ground (n,), complex, in its end's components.
-
-    The joints that close the loop have no drive: there are as many of them as constraints.
-    """
+    """Return what the last arm must give to the ground (n,), complex, in its end's components."""
+    # The joints that close the loop have no drive: there are as many of them as constraints.
     none = np.zeros((len(motion.q), 0))
     forces = inverse_dynamics(rigid, motion, none, none, none)[1][:, -closure.count :]
     place = interface_place(rigid, motion, none)

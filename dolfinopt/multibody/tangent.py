@@ -436,10 +436,7 @@ def _sum_motions(parts: list[Motion]) -> Motion:
 def _virtual_motion(
     tree: Mechanism, links: list[Link], zeta: np.ndarray, of_forces: np.ndarray
 ) -> tuple[dict[int, Load], dict[Site, Load]]:
-    """Return displacement and rotation of every frame, and of every outboard interface.
-
-    In the components of the frame, and of the interface: what multiplies their loads.
-    """
+    """Return displacement and rotation of every frame and outboard interface, in its components."""
     moves: dict[int, Load] = {}
     ends: dict[Site, Load] = {}
     ground = tree.virtual_ground(of_forces)
@@ -461,15 +458,9 @@ def _interface_weights(
     zeta: np.ndarray,
     displaced: Motion,
 ) -> Weights:
-    """Return the derivatives (b, n) by (u, theta), their rates and variation.
-
-    Args:
-        interface: of a flexible body.
-        load: on it.
-        virtual: of the body's frame.
-        zeta: (q, n) the body's multipliers.
-        displaced: derivatives by (u, theta) and their rates through the interface's motion.
-    """
+    """Return the derivatives (b, n) by (u, theta), their rates and variation."""
+    # Of a load on a flexible body's interface, `virtual` of its frame, zeta (q, n) its multipliers;
+    # `displaced` are those by (u, theta) and their rates through the interface's motion.
     (force, moment), dim, turning = load, interface.dim, interface.turning
     p, phi = interface.virtual(virtual, zeta)
     # The load's lever, its components, and J' of the row.

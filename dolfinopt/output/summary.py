@@ -425,10 +425,7 @@ def _thinnest(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: 
 
 
 def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
-    """Return the lower faces (n_cells, 4, 2) of a box's cells, m; nan but of the lowest layer.
-
-    Collective on the arm.
-    """
+    """Return a box's cells' lower faces (n, 4, 2), m; nan above the lowest layer (collective)."""
     low = comm.allreduce(points[:, :, 2].min(initial=np.inf), op=MPI.MIN)
     high = comm.allreduce(points[:, :, 2].max(initial=-np.inf), op=MPI.MAX)
     at = points[:, :4, 2].max(axis=1, initial=-np.inf) <= low + 1e-9 * (high - low)

@@ -147,11 +147,9 @@ def _at_interfaces(
     geometric: GeometricGradient | None,
     inertial: ElasticFieldGradient | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `Products.interfaces` does of a function of a body (collective).
-
-    Modes and all other fields are T times what they are solved for, and so are their adjoints; what
-    either are multiplied by in the Lagrangian, T aside, is zero within T's range alone.
-    """
+    """Return what `Products.interfaces` does of a function of a body (collective)."""
+    # Modes and all other fields are T times what they are solved for, and so are their adjoints;
+    # what either are multiplied by in the Lagrangian, T aside, is zero within T's range alone.
     elastic, basis = state.elastic, state.basis
     T, V = elastic.substructure.T, basis.V
     by_V = by_V - elastic.stiffness_times(fields.stiffness) + elastic.mass_times(fields.mass)

@@ -249,12 +249,7 @@ def lightest(members: Members) -> Search:
 
 
 def _on_limit(members: Members, shares: Shares) -> Search:
-    """Search the least factor of all shares with which the members hold the limits.
-
-    Args:
-        members: whose.
-        shares: with a factor of 1; those that reach a bound stay there.
-    """
+    """Search the least factor of all shares with which the members hold the limits."""
     low, high = (math.log(bound / one) for bound, one in
                  ((LEAST, max(shares)), (members.most, min(shares))))  # fmt: skip
     excess: dict[float, float] = {}
@@ -271,12 +266,7 @@ def _on_limit(members: Members, shares: Shares) -> Search:
 
 
 def _next(excess: Mapping[float, float], low: float, high: float) -> float | None:
-    """Return where to look next for the least x that holds the limits; None: there is no more.
-
-    Args:
-        excess: ln(1 + excess) by x so far.
-        low, high: bounds of x.
-    """
+    """Return where to look next for the least x within the limits, by ln(1 + excess) so far."""
     first, most = min(excess), max(excess)
     up = min((at for at, value in excess.items() if value <= 0.0), default=None)
     if up is None:  # upwards, and from the most that there is down while that helps
@@ -322,14 +312,9 @@ def _balanced(
     outcomes: Sequence[Outcome],
     move: float,
 ) -> Shares:
-    """Return the shares of least mass by the power laws through the outcomes.
-
-    Args:
-        members: whose shares.
-        shares, stepped: of the outcomes: those to set out from, and with one arm's changed each.
-        outcomes: in this order.
-        move: largest change of a share's logarithm.
-    """
+    """Return the shares of least mass by the power laws through the outcomes."""
+    # The first is of the shares to set out from, the others of `stepped`, with one arm's changed;
+    # `move` is the largest change of a share's logarithm.
     base, *changed = map(limited, outcomes)
     names = [name for name in base if all(name in one for one in changed)]
     if not names:

@@ -20,14 +20,12 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from dolfinopt.exchange.urdf.robot import SceneBody, inverse
+from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-CELLS = 6000  # of a solid, about
 MOST = 20000  # of one with thin walls
-FEWEST = 4  # cells over the smaller of height and thickness
 FINE = 3  # voxels along the side of a cell
 VOXELS = 1e7  # of a link, at most
 COARSE = 64  # voxels along a link where its volume is estimated

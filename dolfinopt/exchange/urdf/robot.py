@@ -240,6 +240,8 @@ def number(value: float) -> str:
 
 # -- chosen links as solids: their frames from joint to joint, and their sizes -------------------
 
+CELLS = 6000  # of a solid, about
+FEWEST = 4  # over the smaller of height and thickness
 SLENDERNESS = 10.0  # length over height of a link whose geometry is not known
 SHORTEST = 1e-3  # m of a solid
 PARALLEL = 1e-6  # sine of the angle between axes

@@ -15,6 +15,8 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.robot import (
+    CELLS,
+    FEWEST,
     GROUND,
     Robot,
     RobotJoint,
@@ -26,8 +28,6 @@ from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_tabl
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
-CELLS = 6000  # of a solid, about
-FEWEST = 4  # over its height and over its thickness
 RADIUS = 2.0  # of the filter, in cells
 MATERIAL, DENSITY = "aluminium 6082-T6", 2700.0  # kg/m3
 FRACTION = 0.4  # of the volume of solids whose mass the file does not tell

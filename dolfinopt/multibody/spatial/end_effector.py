@@ -498,13 +498,8 @@ class Follower:
             raise self._singular(t)
 
     def _lost(self, t: float, q: np.ndarray, first: float | None = None) -> InputError:
-        """Return why the path cannot be followed to t: out of reach, or through a singularity.
-
-        Args:
-            t: an instant that is not reached, s.
-            q: (1, joints) shortly before.
-            first: the first instant that is not; default: t.
-        """
+        """Return why the path cannot be followed to t: out of reach, or at a singularity."""
+        # The joints q (1, .) are those shortly before; `first` is the first instant not reached.
         for instant in (t, t if first is None else first):
             path = end_path(np.array([instant]), self.scene)
             guess = self.spread(q[:, self.unknown], path.joints[0])
