@@ -5,11 +5,10 @@ from contextlib import redirect_stdout
 
 import numpy as np
 import pytest
-import tomllib
 from bodies import beam
 from mpi4py import MPI
 from readers import check_npz, read_as_mbdyn_does
-from runs import ROOT, overrides, refusal, run
+from runs import ROOT, overrides, refusal, run, tomllib
 
 import dolfinopt as do
 from dolfinopt.cli.shared import doubts_of_files

@@ -25,8 +25,8 @@ from dolfinopt.mesh.checks import check_cells
 from dolfinopt.mesh.geometry import TENSOR
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.machine import exponential, roll_pitch_yaw
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile

@@ -9,6 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
+from dolfinopt.multibody.machine import (
+    GROUND,
+    Joint,
+    exponential,
+    rigid_spatial_body,
+    skew,
+    spatial_mechanism,
+)
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
@@ -17,14 +25,6 @@ from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     in_space,
     plane_body,
-)
-from dolfinopt.multibody.spatial.mechanism import (
-    GROUND,
-    Joint,
-    exponential,
-    rigid_spatial_body,
-    skew,
-    spatial_mechanism,
 )
 
 # By which integrals a function of a body is differentiated.

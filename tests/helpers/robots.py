@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from runs import ROOT, run, tomllib
 
-from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     GROUND,
     about,
     build_spatial_mechanism,
     rigid_link,
     rigid_spatial_body,
 )
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.scene.load import load_scene
 
 DEMO = ROOT / "demos" / "robot.urdf"

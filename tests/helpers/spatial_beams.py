@@ -7,10 +7,7 @@ of largest deviation as Saint-Venant beams, 18.62 mm with rigid end faces (issue
 import numpy as np
 from scipy.linalg import eigh
 
-from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
     rigid_spatial_body,
@@ -18,6 +15,9 @@ from dolfinopt.multibody.spatial.mechanism import (
     skew,
     spatial_mechanism,
 )
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # Pa, -, kg/m3
 HEIGHT, THICKNESS = 0.04, 0.02  # m

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomllib
 from bodies import random_cloud, stiffened
 from mpi4py import MPI
 from readers import check_npz, mbdyn_forces, mbdyn_stiffening, random_state, read_as_mbdyn_does
 from remainders import substructure
-from runs import TWO_ARM
+from runs import TWO_ARM, tomllib
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
@@ -21,9 +20,8 @@ from dolfinopt.exchange.sid import read_sid, sid_text
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body_motion import BodyMotion, Constants
-from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
 from dolfinopt.multibody.shape_integrals import in_space, plate_moments, shape_integrals
-from dolfinopt.multibody.standard_input import load_body
+from dolfinopt.multibody.standard_input import load_body, lumped_nodes, modal_element
 from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD

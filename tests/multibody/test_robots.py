@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
     inertia_tensor,
@@ -15,6 +14,7 @@ from dolfinopt.multibody.spatial.mechanism import (
     roll_pitch_yaw,
     spatial_mechanism,
 )
+from dolfinopt.multibody.motion import RigidMotion
 
 pin = pytest.importorskip("pinocchio")
 pytestmark = pytest.mark.serial

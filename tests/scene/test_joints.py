@@ -8,7 +8,7 @@ from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, rigid_link
+from dolfinopt.multibody.machine import build_spatial_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

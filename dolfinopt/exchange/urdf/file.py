@@ -73,13 +73,13 @@ def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
 def _quiet() -> Iterator[None]:
     """Keep what yourdfpy and trimesh log to themselves: errors are told in one line."""
     loggers = [logging.getLogger(name) for name in ("yourdfpy", "yourdfpy.urdf", "trimesh")]
-    levels = [one.level for one in loggers]
+    levels = [(one, one.level) for one in loggers]
     for one in loggers:
         one.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        for one, level in zip(loggers, levels, strict=True):
+        for one, level in levels:
             one.setLevel(level)
 
 
@@ -426,10 +426,9 @@ def _of_size(link: RobotLink, principal: np.ndarray) -> Iterator[str]:
         )
     density = mass / link.volume if link.volume > 0.0 else np.inf
     if not DENSITIES[0] <= density <= DENSITIES[1]:
-        low, high = DENSITIES
         yield (
-            f"{mass:.4g} kg in {link.volume:.3g} m3 are {density:.3g} kg/m3; expected {low:g} to "
-            f"{high:g}: mass or unit of the geometry (mm?) is wrong"
+            f"{mass:.4g} kg in {link.volume:.3g} m3 are {density:.3g} kg/m3; expected "
+            f"{DENSITIES[0]:g} to {DENSITIES[1]:g}: mass or unit (mm?) of the geometry is wrong"
         )
 
 

@@ -172,9 +172,9 @@ class Robot:
         """The joints with a coordinate."""
         return tuple(joint for joint in self.joints if joint.moves)
 
-    def children(self, link: str) -> tuple[RobotJoint, ...]:
+    def children(self, link: str) -> list[RobotJoint]:
         """Return the joints on a link."""
-        return tuple(joint for joint in self.joints if joint.parent == link)
+        return [joint for joint in self.joints if joint.parent == link]
 
     def path(self, link: str) -> tuple[RobotJoint, ...]:
         """Return the joints from the ground to a link."""

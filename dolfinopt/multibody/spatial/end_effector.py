@@ -13,6 +13,13 @@ from scipy.spatial.transform import Rotation
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.machine import (
+    Mechanism,
+    Pose,
+    RigidChain,
+    end_chain,
+    roll_pitch_yaw,
+)
 from dolfinopt.multibody.measured import (
     DAMPED_ITERATIONS,
     FOLLOWED_RESIDUAL_SHARE,
@@ -28,13 +35,6 @@ from dolfinopt.multibody.measured import (
     START_GUESSES,
 )
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
-from dolfinopt.multibody.spatial.mechanism import (
-    Mechanism,
-    Pose,
-    RigidChain,
-    end_chain,
-    roll_pitch_yaw,
-)
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
 from dolfinopt.scene.load import Scene

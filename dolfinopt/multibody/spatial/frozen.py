@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.multibody.inverse_dynamics import outward_pass
-from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     ONE,
     rigid_spatial_body,
     skew,
 )
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm

@@ -1,17 +1,25 @@
-"""A scene in space as bodies and joints: rigid bodies, rotations, the chain to the end-effector."""
+"""A scene as a machine: rigid bodies and rotations in space, joints, mechanism, motion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.dimension import series
-from dolfinopt.multibody.mechanism import GROUND, Joint, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion, along_table, columns_of
+from dolfinopt.multibody.mechanism import GROUND, Joint, JointHardware, Mechanism, Site, plane_chain
+from dolfinopt.multibody.motion import (
+    RigidMotion,
+    along_table,
+    check_plane_motion,
+    columns_of,
+    curve_of_table,
+    rigid_motion,
+)
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
+from dolfinopt.paths.tables import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.arms import interface_number
@@ -288,7 +296,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
                 axis=axis / np.linalg.norm(axis),
                 origin=np.array(one.origin, dtype=float),
                 rotation=roll_pitch_yaw(one.rpy),
-                rotor=arm.rotor_inertia * arm.gear_ratio**2,
+                rotor=rotor_inertia(arm),
                 interface=interface,
             )
         )
@@ -345,3 +353,61 @@ def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 def check_joint_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's table or path cannot be followed."""
     joint_motion(np.zeros(1), scene)
+
+
+# -- how scenes become machines, by their dimension ------------------------------------------------
+
+
+def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
+    """Put the bodies on the scene's base, with what sits at their joints and its payload."""
+    return plane_chain(
+        bodies,
+        scene.payload.mass,
+        scene.payload.moment,
+        (scene.motion.gravity[0], scene.motion.gravity[1]),
+        scene.motion.joint_height,
+        hardware=[
+            JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
+            for arm in scene.arms
+        ],
+        cart_mass=scene.motion.cart_mass,
+    )
+
+
+def reflected_inertia(arm: Arm) -> float:
+    """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
+    return 0.0 if arm.joint_stiffness > 0.0 else rotor_inertia(arm)
+
+
+def rotor_inertia(arm: Arm) -> float:
+    """Return the inertia of the rotor that drives an arm's inboard joint, geared, kg m2."""
+    return arm.rotor_inertia * arm.gear_ratio**2
+
+
+@dataclass(frozen=True)
+class Family:
+    """How scenes in the plane, or in space, become machines.
+
+    Attributes:
+        build: (scene, bodies): the mechanism.
+        motion: (t, scene): the desired rigid motion at instants t (n,), s.
+        check: (scene): raises `InputError` where that motion is impossible.
+        curve: (scene): the curve through its table, and whether its parameter is time.
+    """
+
+    build: Callable[[Scene, list[ShapeIntegrals]], Mechanism]
+    motion: Callable[..., RigidMotion]
+    check: Callable[[Scene], None]
+    curve: Callable[[Scene], tuple[Curve, bool]]
+
+
+IN_PLANE = Family(build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
+
+
+def family_of(scene: Scene) -> Family:
+    """Return how the scene becomes a machine."""
+    if scene.dimension == 2:
+        return IN_PLANE
+    from dolfinopt.multibody.spatial.end_effector import curve_in_space
+
+    return Family(build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)
