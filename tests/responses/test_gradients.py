@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import fork
+from machines import demo_machine
 from mpi4py import MPI
 from remainders import taylor, wave
-from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
@@ -60,19 +59,11 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     if WORLD.rank == 0:
         for name, text in (("drives.csv", DRIVES), ("skew.geo", SKEW)):
             (folder / name).write_text(text)
-        (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
         (folder / "strokes.csv").write_text(STROKES)
         (folder / "spatial.csv").write_text(SPATIAL_STROKES)
     WORLD.barrier()
     name, quick = BASES[base]
-    told = [*quick, *(one.replace("FOLDER", str(folder)) for one in changes)]
-    if base == "fork":
-        return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
-    path = ROOT / "demos" / f"{name}.toml"
-    if base != "one_arm":
-        return do.load_scene(path, told)
-    tree = do.load_scene(path).to_tree()
-    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
+    return demo_machine(name, (*quick, *changes), folder, one_arm=base == "one_arm")
 
 
 def case(base: str, *changes: str, slow: bool = False, ranks: bool = False):

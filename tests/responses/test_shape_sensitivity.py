@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import fork
+from machines import demo_machine
 from moved_nodes import built_with, node_test, noise
 from mpi4py import MPI
 from remainders import rates, wave
-from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -33,6 +32,8 @@ QUADRILATERALS = ("arms.cells=[12,2]",)
 SHORT = ("arms.passive=0", "design.filter_radius=0", "motion.horizon=2.2", *ROUGHLY)
 LINK = ("arms.link1.cells=[5,1,1]", "arms.link2.cells=[5,1,1]", "arms.passive=0.06",
         "objective.load_cases=6", "design.filter_radius=0", *ROUGHLY)  # fmt: skip
+ROD = ("arms.rod.height=0.008", "arms.rod.passive=0", "motion.speed=60", "motion.duration=0.05",
+       "motion.horizon=0.1", *ROUGHLY)  # fmt: skip
 # Quadratic unless a case says otherwise; the outlines of tests/responses/test_gradients.py's bars.
 BAR = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
@@ -50,20 +51,7 @@ BASES = {  # scene, what makes it small, size of a move (m), whether boxes are c
     "tetrahedra": ("spatial_arm", LINK, 0.01, True),
     "hexahedra": ("spatial_arm", LINK, 0.01, False),
     "fork": ("", ("simulation.sample=0.01", *ROUGHLY[2:]), 0.005, False),
-    "slider": (
-        "slider_crank",
-        (
-            "arms.rod.cells=[12,2]",
-            "arms.rod.height=0.008",
-            "arms.rod.passive=0",
-            "motion.speed=60",
-            "motion.duration=0.05",
-            "motion.horizon=0.1",
-            *ROUGHLY,
-        ),
-        0.001,
-        False,
-    ),
+    "slider": ("slider_crank", ("arms.rod.cells=[12,2]", *ROD), 0.001, False),
 }
 BENT, LINEAR = "simulation.stiffening=true", "simulation.stiffening=false"
 GRAVITY = "motion.gravity=[0.5,-9.81]"
@@ -138,15 +126,8 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12)
         (folder / "bar.geo").write_text(BAR.replace("CELLS", str(cells + 1)))
     WORLD.barrier()
     name, quick, _, _ = BASES[base]
-    told = [one.replace("FOLDER", str(folder)) for one in (*quick, *changes)]
-    if base == "fork":
-        (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
-        return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
-    path = ROOT / "demos" / f"{name}.toml"
-    if base not in ("one arm", "lone file"):
-        return do.load_scene(path, told)
-    tree = do.load_scene(path).to_tree()
-    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
+    alone = base in ("one arm", "lone file")
+    return demo_machine(name, (*quick, *changes), folder, one_arm=alone)
 
 
 @pytest.mark.parametrize(("base", "changes"), CASES)
