@@ -425,7 +425,7 @@ class _Reader:
             self.block("frame", {}, {"node": node}, {})
 
         once: Items = {"refmod": self.refmod}
-        once |= {name: lambda name=name: self.taylor(name, number()) for name in BODY}  # type: ignore
+        once |= {key: partial(lambda name: self.taylor(name, number()), key) for key in BODY}
         self.block("modal", once, {"frame": frame}, found)
         self.complete(found, ("refmod", *BODY), "before")
         mass, names = found.pop("refmod")
