@@ -211,16 +211,13 @@ def _fit(
     filtered = arrays.get(f"{name}/filtered")
     if filtered is None:
         return density[place], None
-    if filtered.shape != density.shape or not _are_finite(filtered):
+    finite = filtered.dtype.kind in "fiu" and bool(np.isfinite(filtered).all())
+    if filtered.shape != density.shape or not finite:
         raise InputError(
             f"{path}: '{name}/filtered' has shape {filtered.shape}: expected {len(density)} finite "
             "numbers, one a cell"
         )
     return density[place], filtered.astype(float)[place]
-
-
-def _are_finite(values: np.ndarray) -> bool:
-    return values.dtype.kind in "fiu" and bool(np.isfinite(values).all())
 
 
 def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.ndarray:

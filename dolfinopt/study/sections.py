@@ -218,11 +218,6 @@ def _excess(limit: Mapping[str, Any]) -> float:
     return float(-gap if limit["bound"] == "least" else gap)
 
 
-def _worst(outcome: Outcome) -> float:
-    """Return the largest of `limited`; inf of a case that failed."""
-    return max(limited(outcome).values(), default=math.inf)
-
-
 def lightest(members: Members) -> Search:
     """Search the lightest members that hold the limits; yield shares, take their outcomes.
 
@@ -256,7 +251,7 @@ def _on_limit(members: Members, shares: Shares) -> Search:
     x: float | None = 0.0
     while x is not None and len(excess) < STEPS:
         [outcome] = yield [members.scaled(shares, x)]
-        excess[x] = _worst(outcome)
+        excess[x] = max(limited(outcome).values(), default=math.inf)  # of one that failed
         x = _next(excess, low, high)
     held = [at for at, value in excess.items() if value <= 0.0]
     if held:
