@@ -44,3 +44,16 @@ BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
 # Of one block, so that it stays in the cache.
 CHUNK_POINTS = 2048
 CHUNK_INSTANTS = 64
+
+# -- buckling: instants and modes ------------------------------------------------------------
+
+BUCKLING_PEAKS = 3  # instants of an arm that count in the smooth value, at most
+BUCKLING_PROMINENCE = 0.1  # of the largest value, by which peaks over time stand out
+# Of the largest 1 / factor, below which a peak does not count: to the power 20 it is 1 %.
+BUCKLING_PEAK_SHARE = 0.8
+BUCKLING_MODES = 4  # of an instant: of several equal struts all
+BUCKLING_ROUNDS = 4  # of looking for a worse instant by the modes of those before
+BUCKLING_RANK_SHARE = 1e-8  # of energies, below which modes of several instants are the same
+# Derivatives of the smooth value that count, of the largest one.
+BUCKLING_WEIGHT_SHARE = 1e-8
+LARGEST_FACTOR = 1e3  # above, nothing buckles: it tells nothing of a machine
