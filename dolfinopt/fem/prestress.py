@@ -4,8 +4,8 @@ K0 = int s sigma(u)_ab d_a v . d_b w dV, sigma of unit Young's modulus, with wha
 rigid interfaces adds to it, see `geometric_stiffness.FaceRotation`. `UnitLoads` has the same in few
 modes and of every unit load; here all nodes count, so that a strut buckles by itself.
 
-The modulus s of the cells is Young's modulus less that of void: with the trace of stiffness that
-void has it would buckle by itself, in modes that no part has.
+The modulus s of the cells falls faster towards void than Young's: void would buckle by itself, in
+modes that no part has.
 Source: Neves, Rodrigues & Guedes (1995), doi:10.1007/BF01743530; Gao & Ma (2015),
 doi:10.1007/s00158-015-1274-1.
 """
@@ -26,17 +26,30 @@ TENSOR = {2: [0, 2, 2, 1], 3: [0, 3, 5, 3, 1, 4, 5, 4, 2]}  # places of sigma_ab
 
 
 @dataclass(frozen=True, eq=False)
+class StressedModulus:
+    """The modulus s of cells whose stress stiffens them.
+
+    Attributes:
+        value: (n_cells,) s, Pa.
+        slope: (n_cells,) ds / dE.
+    """
+
+    value: np.ndarray
+    slope: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Prestress:
     """Displacements of one design at p instants, whose stress stiffens or softens it.
 
     Attributes:
         fields: of all loads on the design.
-        young: (n_cells,) s, Pa.
+        modulus: of the cells.
         a: (p, m) coefficients of `LoadFields.columns`.
     """
 
     fields: LoadFields
-    young: np.ndarray
+    modulus: StressedModulus
     a: np.ndarray
 
     @property
@@ -72,7 +85,7 @@ class Prestress:
         count, n = cells.shape
         D = points.derivatives.reshape(count, -1, dim, n)
         s = np.einsum("ekj,ej->ek", points.stress, u[cells].reshape(count, -1))
-        s = (s * self.young[:, None]).reshape(count, D.shape[1], -1)
+        s = (s * self.modulus.value[:, None]).reshape(count, D.shape[1], -1)
         sigma = s[:, :, TENSOR[dim]].reshape(count, -1, dim, dim)
         elements = D.swapaxes(2, 3) @ (sigma @ D)
         rows, columns = np.repeat(cells, n, axis=1).ravel(), np.tile(cells, n).ravel()
@@ -82,7 +95,7 @@ class Prestress:
     def stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (p, q, q) in motions V (n_nodes, d, q) (collective on the arm's ranks)."""
         tensor, arm = self.arm.substructure.stress_tensor, self.arm
-        own = arm.comm.allreduce(tensor.of(self.u, self.young, V).stiffness())
+        own = arm.comm.allreduce(tensor.of(self.u, self.modulus.value, V).stiffness())
         return own + self._face.stiffness(self.rotation, V)
 
     def gradient(self, V: np.ndarray, by_K0: np.ndarray) -> PrestressGradient:
@@ -93,7 +106,7 @@ class Prestress:
             by_K0: (p, q, q).
         """
         arm, fields = self.arm, self.fields
-        known = arm.substructure.stress_tensor.of(self.u, self.young, V)
+        known = arm.substructure.stress_tensor.of(self.u, self.modulus.value, V)
         by_modes, by_u, direct, _ = known.gradient(by_K0)
         face = self._face.gradient(self.rotation, V, by_K0)
         by_u = by_u + face.by_fields
@@ -111,7 +124,7 @@ class Prestress:
             stress=self,
             modes=V,
             by_K0=by_K0,
-            direct=direct,
+            direct=direct * self.modulus.slope,
             by_modes=by_modes,
             by_columns=by_columns,
             by_a=arm.comm.allreduce(by_a),
@@ -128,7 +141,7 @@ class PrestressGradient:
     Attributes:
         stress: whose K0 it is.
         modes, by_K0: (n_nodes, d, q) and (p, q, q), as given.
-        direct: (n_cells,) by the modulus s, modes and fields held.
+        direct: (n_cells,) by Young's modulus through s, modes and fields held.
         by_modes: (n_nodes, d, q) by the modes, interfaces' coordinates aside.
         by_columns: (n_nodes, d, m) by `LoadFields.columns`.
         by_a: (p, m) by their coefficients; of all ranks.

@@ -24,7 +24,7 @@ from dolfinopt.arms.buckling import BucklingModes, buckling_modes
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.density.interpolation import interpolate
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.fem.prestress import Prestress, PrestressGradient
+from dolfinopt.fem.prestress import Prestress, PrestressGradient, StressedModulus
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BUCKLING_MODES,
@@ -35,6 +35,7 @@ from dolfinopt.responses.measured import (
     BUCKLING_ROUNDS,
     BUCKLING_WEIGHT_SHARE,
     LARGEST_FACTOR,
+    VOID_STRESS_SHARE,
 )
 from dolfinopt.responses.products import Pair, Products
 from dolfinopt.responses.response import (
@@ -108,11 +109,17 @@ def worst_instants(values: np.ndarray, share: float = 0.0) -> list[int]:
     return [int(n) for n in first if values[n] >= share * values[first[0]]]
 
 
-def stressed_modulus(state: DesignState) -> np.ndarray:
-    """Return the modulus (n_cells,) whose stress stiffens: Young's without that of void, Pa."""
-    law = state.scene.interpolation
+def stressed_modulus(state: DesignState) -> StressedModulus:
+    """Return the modulus of the cells whose stress stiffens.
+
+    With r = E / E_0 less that of void, and e = `VOID_STRESS_SHARE`, s = E_0 r^2 (1 + e) / (r + e):
+    Young's where there is material, and less than any share of it towards void.
+    """
+    law, solid, e = state.scene.interpolation, state.solid.young_modulus, VOID_STRESS_SHARE
     void = interpolate(np.zeros(1), law.law, law.penalty, law.floor).stiffness
-    return np.asarray(state.elastic.young - state.solid.young_modulus * void)
+    r = state.elastic.young / solid - void
+    share = (1.0 + e) * r / (r + e)
+    return StressedModulus(solid * r * share, share * (r + 2.0 * e) / (r + e))
 
 
 def _ritz(state: DesignState, a: np.ndarray, known: Mapping[int, BucklingModes]) -> np.ndarray:

@@ -84,7 +84,7 @@ def by_densities(state: DesignState, products: Products) -> np.ndarray:
         energies += elastic.cell_stiffness_products(left, right)
     for left, right in products.mass:
         masses += elastic.cell_mass_products(left, right)
-    if products.prestress is not None:  # its modulus has the slope of Young's
+    if products.prestress is not None:
         energies += products.prestress.direct
     found = state.young_slope * energies + state.density_slope * masses
     return found if products.densities is None else found + products.densities

@@ -48,7 +48,7 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
         by_corners += shape.stress(stress.points, stress.by_stress, stress.fields)
     if (one := products.prestress) is not None:
         by_corners += shape.geometric_stiffness(
-            one.stress.u, one.modes, one.by_K0, one.stress.young
+            one.stress.u, one.modes, one.by_K0, one.stress.modulus.value
         )
     by_points = np.zeros_like(elastic.points)
     if products.places is not None:
