@@ -1,7 +1,7 @@
 """Buckling of the arms along the motion: the factor by which the loads of an instant may grow.
 
-mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.buckling`), K0 by the static
-stress of an instant, u = U a with the fields U of all loads (`fem.stress`) and their coefficients a.
+mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.buckling`), with K0 by the
+static stress of an instant, u = U a: the fields U of all loads (`fem.stress`) times coefficients a.
 phi'K phi being 1, mu changes by
 
     dmu = -phi'(dK0 + mu dK) phi,
@@ -12,7 +12,7 @@ Source: Rodrigues, Guedes & Bendsoe (1995), doi:10.1007/BF01742705.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -30,6 +30,7 @@ from dolfinopt.responses.measured import (
     BUCKLING_MODES,
     BUCKLING_PEAK_SHARE,
     BUCKLING_PEAKS,
+    BUCKLING_PLATEAU,
     BUCKLING_PROMINENCE,
     BUCKLING_RANK_SHARE,
     BUCKLING_ROUNDS,
@@ -83,20 +84,28 @@ def pressed(state: DesignState, loads: ArmLoads, stiffer: float) -> list[Pressed
     instant that mu is at least their Ritz value: where that has its peaks modes are computed next,
     until the peaks are known.
     """
-    a, fields = loads.coefficients / stiffer, state.load_fields
+    a, fields, modulus = loads.coefficients / stiffer, state.load_fields, stressed_modulus(state)
     energies = state.elastic.energy_matrix(fields.columns)
-    known: dict[int, BucklingModes] = {}
-    young = stressed_modulus(state)
     peaks = worst_instants(np.einsum("nk,kl,nl->n", a, energies, a))
-    for _ in range(BUCKLING_ROUNDS):
-        for n in peaks:
-            if n not in known:
-                stress = Prestress(fields, young, a[n : n + 1])
-                known[n] = buckling_modes(stress, BUCKLING_MODES)
-        peaks = worst_instants(_ritz(state, a, known), BUCKLING_PEAK_SHARE) if known else []
-        if all(n in known for n in peaks):
+    known: dict[int, BucklingModes] = {}
+    for left in reversed(range(BUCKLING_ROUNDS)):
+        new = [n for n in peaks if n not in known]
+        for n in new:
+            known[n] = buckling_modes(Prestress(fields, modulus, a[n : n + 1]), BUCKLING_MODES)
+        if not (new and left):
             break
-    return [Pressed(loads, n, stiffer, known[n]) for n in peaks if n in known]
+        values = _ritz(state, a, known)
+        peaks = [_nearby(values, n, known) for n in worst_instants(values, BUCKLING_PEAK_SHARE)]
+    return [Pressed(loads, n, stiffer, known[n]) for n in peaks]
+
+
+def _nearby(values: np.ndarray, peak: int, known: Iterable[int]) -> int:
+    """Return a known instant of the same peak of values (n,), where it is as high as that."""
+    for n in known:
+        first, last = sorted((n, peak))
+        if values[first : last + 1].min() >= (1.0 - BUCKLING_PLATEAU) * values[peak]:
+            return n
+    return peak
 
 
 def worst_instants(values: np.ndarray, share: float = 0.0) -> list[int]:
