@@ -57,9 +57,9 @@ BUCKLING_ROUNDS = 4  # of looking for a worse instant by the modes of those befo
 BUCKLING_RANK_SHARE = 1e-8  # of energies, below which modes of several instants are the same
 # Derivatives of the smooth value that count, of the largest one.
 BUCKLING_WEIGHT_SHARE = 1e-8
-# Part of solid's stiffness at which the stress of a cell stiffens half as much as it would: so light
+# Part of solid stiffness at which the stress of a cell stiffens half as much as it would: so light
 # a cell, x = 0.1 with the default law, buckles with a strut beside it, not by itself. Of a gap that
-# closes void's own modes come at 2.6 times the load, with x = 0.01 in it at 4.3, those of solid at
-# 555 and 423; a strut of x = 0.5 loses 1 % of its stress.
+# closes, void buckles by itself at 2.6 times the load, with x = 0.01 in it at 4.3 times; with this
+# share solid does, at 555 and 423 times. A strut of x = 0.5 loses 1 % of its stress.
 VOID_STRESS_SHARE = 1e-3
 LARGEST_FACTOR = 1e3  # above, nothing buckles: it tells nothing of a machine
