@@ -1,13 +1,13 @@
 """Geometric stiffness of one arm's full mesh by the stress of given displacements.
 
-K0 = int s sigma(u)_ab d_a v . d_b w dV, sigma of unit Young's modulus, with what the rotation of the
-rigid interfaces adds to it, see `geometric_stiffness.FaceRotation`. `UnitLoads` has the same in few
+K0 = int s sigma(u)_ab d_a v . d_b w dV, sigma of unit Young's modulus, with what the rotation of
+the rigid interfaces adds, see `geometric_stiffness.FaceRotation`. `UnitLoads` has the same in few
 modes and of every unit load; here all nodes count, so that a strut buckles by itself.
 
 The modulus s of the cells falls faster towards void than Young's: void would buckle by itself, in
 modes that no part has.
-Source: Neves, Rodrigues & Guedes (1995), doi:10.1007/BF01743530; Gao & Ma (2015),
-doi:10.1007/s00158-015-1274-1.
+Source: Neves, Rodrigues & Guedes, Struct. Optim. 10 (1995) 71-78; Gao & Ma, Comput. Struct. 157
+(2015) 142-152; Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
     ADJOINT_ITERATIONS,
     ADJOINT_TOLERANCE,
-    BUCKLING_TOLERANCE,
     EIGEN_TOLERANCE,
     EIGENVALUE_GAP,
     GUARD_VECTORS,
@@ -352,16 +351,23 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
     return pairs
 
 
-def largest_eigenpairs(pencil: Pencil, product: Columns, count: int) -> Pairs:
+def largest_eigenpairs(
+    pencil: Pencil,
+    product: Columns,
+    count: int,
+    tolerance: float,
+    start: np.ndarray | None = None,
+) -> Pairs:
     """Return the `count` largest eigenvalues of A phi = mu K phi and their vectors.
 
-    By SLEPc's Krylov-Schur on K^-1 A. Those far below 1 are right to `BUCKLING_TOLERANCE` alone: of
-    an A without positive eigenvalues they crowd at zero.
+    By SLEPc's Krylov-Schur on K^-1 A.
 
     Args:
         pencil: K.
         product: A times a vector, symmetric, of any sign.
         count: number of eigenpairs.
+        tolerance: absolute, of the eigenvalues' residuals.
+        start: (rows, k) vectors nearby, or None.
 
     Returns:
         Eigenvalues (count,) descending, and K-orthonormal vectors (owned rows, count).
@@ -372,7 +378,7 @@ def largest_eigenpairs(pencil: Pencil, product: Columns, count: int) -> Pairs:
     arm = pencil.arm
     with arm.profile.phase("eigenproblem"), closing(_Largest(pencil, product)) as problem:
         for space, restarts in _searches(count, warm=False):
-            pairs = problem.search(count, space, restarts)
+            pairs = problem.search(count, space, restarts, tolerance, start)
             if len(pairs[0]) == count:
                 break
     arm.profile.counts.eigenproblems += 1
@@ -397,7 +403,9 @@ class _Largest:
         self.stiffness.destroy()
         self.matrix.destroy()
 
-    def search(self, count: int, space: int, restarts: int) -> Pairs:
+    def search(
+        self, count: int, space: int, restarts: int, tolerance: float, start: np.ndarray | None
+    ) -> Pairs:
         """Return what a subspace of `space` vectors finds: up to `count` values and vectors."""
         eps = SLEPc.EPS().create(self.pencil.arm.comm)
         eps.setOperators(self.matrix, self.stiffness)
@@ -406,13 +414,15 @@ class _Largest:
         size = self.stiffness.getSize()[0]
         eps.setDimensions(min(count, size), min(size, space))
         eps.setConvergenceTest(SLEPc.EPS.Conv.ABS)
-        eps.setTolerances(BUCKLING_TOLERANCE, restarts)
+        eps.setTolerances(tolerance, restarts)
         transform = eps.getST()
         transform.setType(SLEPc.ST.Type.SHIFT)
         ksp = _as_ksp(self.stiffness, self.pencil.inverse)
         transform.setKSP(ksp)
         vector = self.stiffness.createVecLeft()
-        first = _filled(vector, _ramp(self.pencil, vector.getLocalSize()))
+        rows = vector.getLocalSize()
+        guess = _ramp(self.pencil, rows) if start is None else _initial(self.pencil, start)
+        first = _filled(vector, guess)
         eps.setInitialSpace([first])
         eps.solve()
         found = min(eps.getConverged(), count)

@@ -23,8 +23,6 @@ LOBPCG_INDEPENDENT_SHARE = 1e-12
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
 # equal to 1e-8 on any number of ranks; each further digit costs a fraction of a step.
 EIGEN_TOLERANCE = 1e-12
-# Residual of buckling modes by the energy of their stress: 1 / factor is right to it.
-BUCKLING_TOLERANCE = 1e-9
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 EIGENVALUE_GAP = 1e-6

@@ -7,7 +7,7 @@ phi'K phi being 1, mu changes by
     dmu = -phi'(dK0 + mu dK) phi,
 
 K0 by the cells and by u, which goes through the fields' adjoints and the motion as stress does.
-Source: Rodrigues, Guedes & Bendsoe (1995), doi:10.1007/BF01742705.
+Source: Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def pressed(state: DesignState, loads: ArmLoads, stiffer: float) -> list[Pressed
     for left in reversed(range(BUCKLING_ROUNDS)):
         new = [n for n in peaks if n not in known]
         for n in new:
-            known[n] = buckling_modes(Prestress(fields, modulus, a[n : n + 1]), BUCKLING_MODES)
+            stress = Prestress(fields, modulus, a[n : n + 1])
+            known[n] = buckling_modes(stress, BUCKLING_MODES, 1.0 / LARGEST_FACTOR)
         if not (new and left):
             break
         values = _ritz(state, a, known)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dolfinopt.part.buckling import Buckling
 from mpi4py import MPI
 from parts import folder_with, frame
 from runs import run
@@ -14,7 +15,6 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.views import canonical_order
 from dolfinopt.part import check as checks
-from dolfinopt.part.buckling import Buckling
 from dolfinopt.part.check import check_parts, crisp
 from dolfinopt.part.part import make_parts, mesh_parts
 

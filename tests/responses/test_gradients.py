@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from remainders import taylor, wave
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.scene.tables.objective import EXACT_ONLY, NEEDS
+from dolfinopt.scene.tables.objective import EXACT_ONLY, NEEDS, ObjectiveKind
 
 WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
@@ -82,6 +83,7 @@ COMPLIANCE, DEVIATION, STRESS = (
 )
 EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
 SETTLING, ORIENTATION = "objective.kind=settling", "objective.kind=orientation"
+BUCKLING = "objective.kind=buckling"
 IN_STROKES = ("motion.path=joints", "motion.file='FOLDER/strokes.csv'")
 STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
@@ -218,9 +220,19 @@ CASES = [
     case("pin", ORIENTATION, slow=True),
     case("fork", ORIENTATION),
     case("space", ORIENTATION, TWO_IN_SPACE, HELD, slow=True),
+    # Buckling: of the chain of derivatives all parts.
+    case("two_arm", BUCKLING, BENT, *LOADED, ranks=True),
+    case("one_arm", BUCKLING, LINEAR, MODAL, ranks=True),
+    case("two_arm", BUCKLING, "interpolation.law=simp", "arms.arm2.design=arm1"),
+    case("two_arm", BUCKLING, TWO, slow=True),
+    case("controlled", BUCKLING),
+    case("slider", BUCKLING),
+    case("fork", BUCKLING),
+    case("space", BUCKLING, slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
-      for kind in NEEDS for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
+      for kind in get_args(ObjectiveKind)
+      for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
 ]  # fmt: skip
 
 

@@ -89,6 +89,9 @@ CASES = [
     case("one arm", "stress", BENT, GRAVITY, ranks=True),
     case("one arm", "deviation", LINEAR, MODAL, ranks=True),
     case("lone file", "stress", BENT, GRAVITY, ranks=True),
+    case("triangles", "buckling", BENT, GRAVITY, "payload.inertia=0.05", ranks=True),
+    case("triangles", "buckling", LINEAR, MODAL),
+    case("one arm", "buckling", BENT, GRAVITY, ranks=True),
     case("controlled", "esl", LINEAR),
     case("controlled", "deviation", BENT),
     case("controlled", "settling", BENT, slow=True),
@@ -98,6 +101,7 @@ CASES = [
       for name in ("incompatible", "linear", "quadratic")),
     case("quadrilaterals", "mass", KEPT, LINEAR),
     case("quadrilaterals", "stress", BENT),
+    case("quadrilaterals", "buckling", BENT),
     case("tetrahedra", "mass", KEPT),
     case("tetrahedra", "static"),
     case("tetrahedra", "eigenfrequency"),
@@ -106,15 +110,18 @@ CASES = [
     case("tetrahedra", "settling", LINEAR, "motion.dwells=[[0.1,0.2]]", slow=True),
     case("tetrahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
     case("tetrahedra", "stress", BENT, slow=True),
+    case("tetrahedra", "buckling", LINEAR, slow=True),
     case("hexahedra", "mass", KEPT),
     case("hexahedra", "static"),
     case("hexahedra", "compliance", LINEAR),
     case("hexahedra", "deviation", BENT, slow=True),
     case("hexahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
     case("hexahedra", "stress", BENT, slow=True),
+    case("hexahedra", "buckling", LINEAR, slow=True),
     # Two outboard interfaces; a closed loop.
     case("fork", "deviation", BENT),
     case("fork", "eigenfrequency"),
+    case("fork", "buckling", BENT),
     case("slider", "deviation", GRAVITY),
     case("slider", "stress", BENT, slow=True),
 ]  # fmt: skip
@@ -148,7 +155,7 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("kind", "part"),
     [("effort", "places"), ("compliance", "interfaces"), ("stress", "volumes"),
-     ("stress", "stress"), ("compliance", "geometric_stiffness")],
+     ("stress", "stress"), ("compliance", "geometric_stiffness"), ("buckling", "prestress")],
 )  # fmt: skip
 def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
     """Each part of the chain alone: remainders become of first order."""
