@@ -96,7 +96,8 @@ def pressed(state: DesignState, loads: ArmLoads, stiffer: float) -> list[Pressed
         if not (new and left):
             break
         values = _ritz(state, a, known)
-        peaks = [_nearby(values, n, known) for n in worst_instants(values, BUCKLING_PEAK_SHARE)]
+        highest = worst_instants(values, BUCKLING_PEAK_SHARE)
+        peaks = list(dict.fromkeys(_nearby(values, n, known) for n in highest))
     return [Pressed(loads, n, stiffer, known[n]) for n in peaks]
 
 

@@ -60,7 +60,7 @@ def factor_of(state, load: int, size: float) -> float:
 
 @pytest.mark.serial
 def test_bar_buckles_at_eulers_force(bar):
-    """Clamped and free; shear lowers it by F / (k G A), 0.06 %. The next, nine times it, is left out."""
+    """Clamped and free; shear lowers it by F / (k G A), 0.06 %. The next one is far behind."""
     state, bending = bar
     euler = np.pi**2 * bending / (4.0 * LENGTH**2)
     found = buckling_modes(under(state, FORCE, -euler / 10.0), 3)

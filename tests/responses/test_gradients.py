@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from machines import demo_machine
 from mpi4py import MPI
-from remainders import taylor, wave
+from remainders import hold_instants, taylor, wave
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
@@ -241,6 +241,7 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
     """Along a random and a smooth direction; the gradient by ESL points the same way."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    hold_instants(monkeypatch)
     scene = scene_of(base, changes, shared_tmp_path)
     # Forces are made of accelerations, which leave more rounding.
     steps = (1e-3, 2.5e-4) if scene.objective.kind in EXACT_ONLY else (4e-4, 1e-4)

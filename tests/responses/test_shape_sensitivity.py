@@ -13,7 +13,7 @@ import pytest
 from machines import demo_machine
 from moved_nodes import built_with, node_test, noise
 from mpi4py import MPI
-from remainders import rates, wave
+from remainders import hold_instants, rates, wave
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -142,6 +142,7 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
     """Along random moves of all nodes of uneven meshes, those of interfaces included."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    hold_instants(monkeypatch)
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)  # one arm on two ranks is cut in two
     scene = scene_of(base, changes, shared_tmp_path)
     _, _, size, cut = BASES[base]
@@ -160,6 +161,7 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
 def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
     """Each part of the chain alone: remainders become of first order."""
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    hold_instants(monkeypatch)
     if part == "geometric_stiffness":
 
         def none(shape: ShapeDerivative, *_: object) -> np.ndarray:
