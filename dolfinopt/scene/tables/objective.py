@@ -510,8 +510,10 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "effort": MOTION,
     "peak_force": MOTION,
 }
-# Those whose gradient is always the exact one: of most no equivalent static load tells anything.
-EXACT_ONLY = frozenset({"effort", "peak_force", "buckling"})
+# Forces of drives, of which no equivalent static load tells anything: their gradient is always the
+# exact one, and so is that of buckling.
+FORCES = frozenset({"effort", "peak_force"})
+EXACT_ONLY = FORCES | {"buckling"}
 # What uses an option of [objective]: as objective, and under [constraints].
 OPTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "worst": (("esl",), ("esl",)),
