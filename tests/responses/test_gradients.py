@@ -226,7 +226,7 @@ CASES = [
     case("two_arm", BUCKLING, "interpolation.law=simp", "arms.arm2.design=arm1"),
     case("two_arm", BUCKLING, TWO, slow=True),
     case("controlled", BUCKLING),
-    case("slider", BUCKLING, LINEAR),
+    case("slider", BUCKLING, GRAVITY, "motion.speed=30"),
     case("fork", BUCKLING),
     case("space", BUCKLING, slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
