@@ -180,19 +180,12 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class _Packed:
-    """An exception on its way to other ranks.
+    """An exception on its way to other ranks."""
 
-    Attributes:
-        rank: where it was raised.
-        pickled: the exception, or its nearest relative that can be pickled.
-        text: its traceback.
-        gave_up: another rank's failure was the reason.
-    """
-
-    rank: int
-    pickled: bytes
-    text: str
-    gave_up: bool
+    rank: int  # where it was raised
+    pickled: bytes  # the exception, or its nearest relative that can be pickled
+    text: str  # its traceback
+    gave_up: bool  # another rank's failure was the reason
 
     def exception(self) -> BaseException:
         error: BaseException = pickle.loads(self.pickled)

@@ -26,7 +26,8 @@ from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.inverse_dynamics import Stiffening
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, rigid_bar
+from dolfinopt.multibody.machine import RIGID_ARMS
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
@@ -547,22 +548,10 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
         body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body
-        if scene.is_spatial:
-            raise InputError(
-                f"{arm.sid}: holds geometric stiffness, which simulation.stiffening = false is to "
-                "leave out; that of a body in space is not told from its inertia in such a file: "
-                "write it without, or take true or 'auto'"
-            )
-        return linear_part(body)
-    if scene.is_spatial:
-        from dolfinopt.multibody.spatial.mechanism import rigid_link
+        from dolfinopt.multibody.standard_input import without_stiffening
 
-        return rigid_link(arm, scene.material_of(index).density)
-    mass = arm.mass
-    if mass is None:
-        mass = scene.material_of(index).density * arm.length * arm.height * arm.thickness
-    assert not isinstance(arm.inertia, tuple)  # the scene would have refused it
-    return rigid_bar(arm.length, arm.height, mass, arm.inertia)
+        return without_stiffening(body, arm.sid)
+    return RIGID_ARMS[scene.dimension](arm, scene.material_of(index).density)
 
 
 # -- arms that repeat another's design: densities travel from cell to cell, gradients back -------

@@ -133,9 +133,8 @@ def _why(scene: Scene, index: int) -> str:
 
 def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
-    from dolfinopt.multibody.mbdyn import lumped_nodes, modal_element
     from dolfinopt.multibody.shape_integrals import in_space, plate_moments
-    from dolfinopt.multibody.standard_input import to_sid
+    from dolfinopt.multibody.standard_input import lumped_nodes, modal_element, to_sid
 
     body = arm.reduce(x_phys)
     title = f"{arm.mesh.name} of {arm.scene.name}"

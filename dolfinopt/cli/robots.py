@@ -83,7 +83,7 @@ def import_robot(
 
 def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
     """Return the robot, its packages looked for in folders that are there."""
-    from dolfinopt.exchange.urdf.read import read_robot
+    from dolfinopt.exchange.urdf.file import read_robot
 
     for folder in package_path:
         if not folder.is_dir():
@@ -95,7 +95,7 @@ def _read(
     model: Robot, links: str, trajectory: Path, tool: str | None, boxes: bool
 ) -> tuple[RobotScene, np.ndarray, np.ndarray]:
     """Return the scene, instants (n,) and rows (n, joints) of its table."""
-    from dolfinopt.exchange.urdf.read import implausible_inertias
+    from dolfinopt.exchange.urdf.file import implausible_inertias
     from dolfinopt.exchange.urdf.robot import scene_bodies
     from dolfinopt.exchange.urdf.scene import RobotScene, read_trajectory
 
@@ -180,19 +180,16 @@ PAGES = ("before_after.md", "before_after.csv", "before_after.html")
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A finished run: its scene, and the arms as its design makes them.
+    """A finished run: its scene, and the arms as its design makes them."""
 
-    Attributes:
-        folder, scene: of the run.
-        partition, arms, x_phys: its design, on this rank.
-        bodies: of all arms with a design of their own, reduced; on the root.
-    """
-
+    # folder, scene: of the run
     folder: Path
     scene: Scene
+    # partition, arms, x_phys: its design, on this rank
     partition: Partition
     arms: Mapping[int, Arm]
     x_phys: Mapping[int, np.ndarray]
+    # of all arms with a design of their own, reduced; on the root
     bodies: Mapping[int, ShapeIntegrals]
 
 
@@ -232,7 +229,7 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
 
 def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
     """Raise InputError if the new robot would replace the one it is made of, or its meshes."""
-    from dolfinopt.exchange.urdf.read import sources_of
+    from dolfinopt.exchange.urdf.file import sources_of
 
     if not file.is_file():
         return  # told by whoever reads it
@@ -331,8 +328,7 @@ def _robot_files(
     parts: Mapping[int, Part],
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return the files by name, the robot last, and what has become of the links (root only)."""
-    from dolfinopt.exchange.urdf.read import read_robot
-    from dolfinopt.exchange.urdf.write import NewLink, robot_text
+    from dolfinopt.exchange.urdf.file import NewLink, read_robot, robot_text
     from dolfinopt.part.files.triangles import triangle_bytes
 
     before = read_robot(origin.file).links

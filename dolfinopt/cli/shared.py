@@ -286,10 +286,7 @@ def _stress(summary: Mapping[str, Any]) -> str:
 
 
 def _contacts(summary: Mapping[str, Any]) -> str:
-    """Return in how many corners and edges alone cells meet, and a comma; "" where there are none.
-
-    E.g. "22 pieces by faces and 52 contacts without one, ".
-    """
+    """Return in how many corners and edges alone cells meet, and a comma; "" where in none."""
     found = summary["contacts"].values()
     count = sum(one["corners"] + one["edges"] for one in found)
     if not count:

@@ -203,13 +203,9 @@ def _components(count: int, pairs: np.ndarray) -> np.ndarray:
 
 
 def _split(keys: np.ndarray, kept: np.ndarray, pairs: np.ndarray) -> dict[int, list[np.ndarray]]:
-    """Return the cells at every key, in groups that pairs join, where there is more than one.
-
-    Args:
-        keys: (n, k) corners or edges of the cells.
-        kept: (n,) True for the cells that count.
-        pairs: (p, 2) of these cells that are joined at all keys that they have in common.
-    """
+    """Return the cells at every key, in groups that pairs join, where there is more than one."""
+    # keys (n, k) are corners or edges of the cells; those of `kept` (n,) count, and pairs (p, 2) of
+    # them are joined at all keys that they have in common.
     n, k = keys.shape
     first, second = pairs.T
     which, i, j = np.nonzero(keys[first][:, :, None] == keys[second][:, None, :])

@@ -78,23 +78,14 @@ class HelmholtzFilter:
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """The sides of owned cells, k = 3 or 4 a cell, 4 or 6 in space with areas and volumes.
+    """The sides of owned cells, k = 3 or 4 a cell, 4 or 6 in space with areas and volumes."""
 
-    Attributes:
-        facet: (n, k) local numbers.
-        length: (n, k) m; the face's area in space, m2.
-        normal: (n, k, d) outward unit normals.
-        arm: (n, k, d) from the cell's centroid to the side's midpoint, m.
-        area: (n,) of the cells, m2; their volume in space, m3.
-        open: (n, k) where r dy/dn = -y.
-    """
-
-    facet: np.ndarray
-    length: np.ndarray
-    normal: np.ndarray
-    arm: np.ndarray
-    area: np.ndarray
-    open: np.ndarray
+    facet: np.ndarray  # (n, k) local numbers
+    length: np.ndarray  # (n, k) m; the face's area in space, m2
+    normal: np.ndarray  # (n, k, d) outward unit normals
+    arm: np.ndarray  # (n, k, d) from the cell's centroid to the side's midpoint, m
+    area: np.ndarray  # (n,) of the cells, m2; their volume in space, m3
+    open: np.ndarray  # (n, k) where r dy/dn = -y
 
     @property
     def distance(self) -> np.ndarray:
@@ -176,10 +167,9 @@ def _area_and_centroid(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _TwoPoint:
-    """A = V + r^2 L, L_ij = -length_ij / distance_ij of the facets between owned cells' centroids.
+    """A = V + r^2 L, L_ij = -length_ij / distance_ij of the facets between owned cells."""
 
-    An open side adds r^2 length / (distance + r) to the diagonal.
-    """
+    # An open side adds r^2 length / (distance + r) to the diagonal.
 
     def __init__(self, mesh: ArmMesh, sides: _Sides, r: float):
         self.area = mesh.area
@@ -228,14 +218,13 @@ def _two_point_operator(mesh: ArmMesh, r: float, leak: np.ndarray) -> PETSc.Mat:
 
 
 class _Hybrid:
-    """Values u in the facets, from which those in the cells follow.
+    """Values u in the facets, from which those in the cells follow."""
 
-    Fluxes out of a cell are r^2 W (1 y - u), with W = area G'G + S' diag(length / distance) S of
-    the gradient G = N' / area exact for linear fields, and what G leaves over, S = I - arm G.
-    From area y + r^2 1'W (1 y - u) = area x follows y = keep x + c'u, with
-    c = r^2 W1 / (area + r^2 1'W1), keep = area / (area + r^2 1'W1); fluxes into a facet add up to
-    none. Thus y = keep x + C A^-1 C' area x with A = sum r^2 W - (area + r^2 1'W1) c c'.
-    """
+    # Fluxes out of a cell are r^2 W (1 y - u), with W = area G'G + S' diag(length / distance) S of
+    # the gradient G = N' / area exact for linear fields, and what G leaves over, S = I - arm G.
+    # From area y + r^2 1'W (1 y - u) = area x follows y = keep x + c'u, with
+    # c = r^2 W1 / (area + r^2 1'W1), keep = area / (area + r^2 1'W1); fluxes into a facet add up to
+    # none. Thus y = keep x + C A^-1 C' area x with A = sum r^2 W - (area + r^2 1'W1) c c'.
 
     def __init__(self, mesh: ArmMesh, sides: _Sides, r: float):
         self.area = mesh.area

@@ -272,9 +272,7 @@ def widest(inside: np.ndarray, h: float) -> tuple[float, Place]:
 
 
 def _depth(inside: np.ndarray, h: float) -> np.ndarray:
-    """Return the distance of the voxels' centres from the boundary, m; 0 outside.
-
-    The boundary runs between two centres; a width of an even number of voxels has its middle
-    between two, too: a quarter of a voxel is what is left on average.
-    """
+    """Return the distance of the voxels' centres from the boundary, m; 0 outside."""
+    # The boundary runs between two centres; a width of an even number of voxels has its middle
+    # between two, too: a quarter of a voxel is what is left on average.
     return np.asarray(np.maximum(ndimage.distance_transform_edt(inside) - 0.25, 0.0) * h)

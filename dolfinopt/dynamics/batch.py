@@ -44,7 +44,7 @@ from dolfinopt.dynamics.measured import (
 from dolfinopt.dynamics.newton import Iterate, Tuning, newton_batch
 from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.body_motion import Scale
+from dolfinopt.multibody.body_motion import Constants, Scale
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -119,13 +119,12 @@ def _content(system: ElasticSystem) -> tuple[Any, ...]:
     mechanism = system.mechanism
     own = [(np.trace(b.K), np.trace(b.D), b.mass) for b in mechanism.bodies]
     stiffness = sum(k for k, _, _ in own)
-    speed = system.breakpoints[-1] ** 2 * stiffness / (mechanism.payload_mass + 1e-300)
+    payload = _payload(system)
+    speed = system.breakpoints[-1] ** 2 * stiffness / (payload[0] + 1e-300)
     motion = system.motion(np.array(system.breakpoints) * 0.37)
     return (
         -float(speed),
-        mechanism.payload_mass,
-        mechanism.payload_inertia,
-        *mechanism.gravity,
+        *payload,
         *(float(x) for row in own for x in row),
         *system.breakpoints,
         *(float(x) for x in motion.q.ravel()),
@@ -278,7 +277,7 @@ class BatchSystem:
     Attributes:
         members: as given.
         modes: of the first; its bodies' D is the damping's shape, see `scales`.
-        payload: (R, 4) mass, inertia, g_x, g_y.
+        payload: (R, 4) mass and inertia at the end-effector, g_x, g_y.
         scales: (R, bodies, 3) of mass, stiffness and damping.
     """
 
@@ -323,13 +322,13 @@ class BatchSystem:
 
     def _mechanism(self, times: int) -> Mechanism:
         """Return that of all systems at `times` instants each, one system after the other."""
+        mechanism = self.modes.system.mechanism
         payload = np.repeat(self.payload, times, axis=0).T.copy()
         scales = np.repeat(self.scales, times, axis=0).transpose(1, 2, 0).copy()
         return replace(
-            self.modes.system.mechanism,
-            payload_mass=payload[0],
-            payload_inertia=payload[1],
-            gravity=(payload[2], payload[3]),
+            mechanism,
+            loads={**mechanism.loads, mechanism.end: Constants.of_point(*payload[:2])},
+            gravity=payload[2:],
             scales=tuple(Scale(*one) for one in scales),
         )
 
@@ -435,11 +434,27 @@ def _same_hardware(system: ElasticSystem, other: ElasticSystem) -> bool:
     """Return whether all is equal that a `BatchSystem` takes from its first system alone."""
     one, two = system.mechanism, other.mechanism
     return (
-        one.joints == two.joints
-        and one.cart_mass == two.cart_mass
-        and one.joint_height == two.joint_height
+        np.array_equal(one.rotors, two.rotors)
+        and np.array_equal(one.origin, two.origin)
+        and one.loads.keys() == two.loads.keys()
+        and all(
+            _point(load) == _point(two.loads[site])
+            for site, load in one.loads.items()
+            if site != one.end
+        )
         and len(system.breakpoints) == len(other.breakpoints)
     )
+
+
+def _point(load: Constants) -> tuple[float, float]:
+    """Return mass and inertia of what is carried at an interface in the plane, kg, kg m2."""
+    return float(load.mass), float(load.W_rest[0, 0])
+
+
+def _payload(system: ElasticSystem) -> tuple[float, ...]:
+    """Return what differs between scenarios: mass and inertia at the end-effector, gravity."""
+    mechanism = system.mechanism
+    return *_point(mechanism.loads[mechanism.end]), *map(float, mechanism.gravity[:, 0])
 
 
 def _shape_of_damping(body: ShapeIntegrals) -> np.ndarray:
@@ -466,7 +481,5 @@ def batch_of(systems: Sequence[ElasticSystem], scales: Sequence[np.ndarray]) -> 
     first = systems[0]
     bodies = tuple(replace(b, D=_shape_of_damping(b)) for b in first.mechanism.bodies)
     modes = modes_of(replace(first, mechanism=replace(first.mechanism, bodies=bodies)))
-    payload = [
-        (m.payload_mass, m.payload_inertia, *m.gravity) for m in (p.mechanism for p in systems)
-    ]
-    return BatchSystem(tuple(systems), modes, np.array(payload, dtype=float), np.array(scales))
+    payload = np.array([_payload(system) for system in systems])
+    return BatchSystem(tuple(systems), modes, payload, np.array(scales))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
@@ -15,43 +14,22 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import SAME_INSTANT_SHARE, TABLE_BREAKPOINTS_LIMIT
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import largest_change
+from dolfinopt.multibody.machine import family_of, rotor_inertia
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
-    ElasticBodies,
-    JointHardware,
     Mechanism,
     Springs,
 )
 from dolfinopt.multibody.motion import (
     RigidMotion,
     breakpoints,
-    check_plane_motion,
-    curve_of_table,
     rests,
-    rigid_motion,
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.paths.tables import TIME, Curve, read_table
+from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.load import Arm, Scene
-
-
-def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
-    """Put the bodies on the scene's base, with what sits at their joints and its payload."""
-    joints = tuple(
-        JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
-        for arm in scene.arms
-    )
-    return Mechanism(
-        bodies=tuple(bodies),
-        payload_mass=scene.payload.mass,
-        payload_inertia=scene.payload.moment,
-        gravity=(scene.motion.gravity[0], scene.motion.gravity[1]),
-        joint_height=scene.motion.joint_height,
-        joints=joints if any(joint != JointHardware() for joint in joints) else (),
-        cart_mass=scene.motion.cart_mass,
-    )
 
 
 def soft_joints(scene: Scene) -> dict[int, Arm]:
@@ -60,53 +38,9 @@ def soft_joints(scene: Scene) -> dict[int, Arm]:
     return {k: arm for k, arm in pairs if k is not None and arm.joint_stiffness > 0.0}
 
 
-def reflected_inertia(arm: Arm) -> float:
-    """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
-    return 0.0 if arm.joint_stiffness > 0.0 else rotor_inertia(arm)
-
-
-def rotor_inertia(arm: Arm) -> float:
-    """Return the inertia of the rotor that drives an arm's inboard joint, geared, kg m2."""
-    return arm.rotor_inertia * arm.gear_ratio**2
-
-
 def is_machine(scene: Scene) -> bool:
     """Return whether rigid coordinates are unknown: by control, a closed loop, soft joints."""
     return scene.control is not None or scene.closure is not None or bool(soft_joints(scene))
-
-
-@dataclass(frozen=True)
-class Family:
-    """How scenes in the plane, or in space, become machines.
-
-    Attributes:
-        build: (scene, bodies): the mechanism.
-        motion: (t, scene): the desired rigid motion at instants t (n,), s.
-        check: (scene): raises `InputError` where that motion is impossible.
-        curve: (scene): the curve through its table, and whether its parameter is time.
-    """
-
-    build: Callable[[Scene, list[ShapeIntegrals]], Any]
-    motion: Callable[..., RigidMotion]
-    check: Callable[[Scene], None]
-    curve: Callable[[Scene], tuple[Curve, bool]]
-
-
-IN_PLANE = Family(build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
-
-
-def family_of(scene: Scene) -> Family:
-    """Return how the scene becomes a machine."""
-    if not scene.is_spatial:
-        return IN_PLANE
-    from dolfinopt.multibody.spatial.end_effector import curve_in_space
-    from dolfinopt.multibody.spatial.mechanism import (
-        build_spatial_mechanism,
-        check_joint_motion,
-        joint_motion,
-    )
-
-    return Family(build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)
 
 
 def check_motion(scene: Scene) -> None:
@@ -138,7 +72,7 @@ def build_system(
     family = family_of(scene)
     if motion is None:
         motion = desired_motion(scene)
-    mechanism: ElasticBodies = family.build(scene, bodies)
+    mechanism: Mechanism = family.build(scene, bodies)
     instants = breakpoints(scene, family.curve)
     if not is_machine(scene):
         return ElasticSystem(mechanism, motion, instants)

@@ -57,7 +57,7 @@ class ElasticSystem:
     """Elastic residual of a mechanism = 0 over a horizon, rigid coordinates prescribed.
 
     Attributes:
-        mechanism: a `Mechanism`, in space a `SpatialMechanism`; N elastic coordinates.
+        mechanism: N elastic coordinates.
         motion: rigid coordinates at given instants (n,) s.
         breakpoints: ascending instants, first 0 and last the horizon, between which the
             prescribed motion is smooth; steps end there. s.

@@ -191,16 +191,12 @@ def _newmark(
 
 
 class _Newton:
-    """Modified Newton's method: owns the inverse tangent, kept from step to step.
+    """Modified Newton's method: owns the inverse tangent, kept from step to step."""
 
-    The tangent is renewed where an iteration leaves more than `ALPHA_CONTRACTION_LIMIT` of the
-    residual. A step ends on the residual that its last correction is expected to leave, by the
-    contraction observed so far and trusted less with every step: rate^0.8, Hairer & Wanner (1996),
-    IV.8, doi:10.1007/978-3-642-05221-7. Most steps cost one evaluation of it.
-
-    Attributes:
-        iterations: corrections made.
-    """
+    # The tangent is renewed where an iteration leaves more than `ALPHA_CONTRACTION_LIMIT` of the
+    # residual. A step ends on the residual that its last correction is expected to leave, by the
+    # contraction observed so far and trusted less with every step: rate^0.8, Hairer & Wanner
+    # (1996), IV.8, doi:10.1007/978-3-642-05221-7. Most steps cost one evaluation of it.
 
     def __init__(self, flexibility: np.ndarray, weights: Parameters, enough: float) -> None:
         """Take K^-1 and `enough`, the residual that may be left in a step, see `_norm`."""

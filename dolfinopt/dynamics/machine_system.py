@@ -24,7 +24,7 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.end_effector import interface_place, place_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Closure, Drives, ElasticBodies, repeated
+from dolfinopt.multibody.mechanism import Closure, Drives, Mechanism, repeated
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
@@ -216,7 +216,7 @@ class MachineSystem:
     """See the module.
 
     Attributes:
-        mechanism: a `Mechanism`, in space a `SpatialMechanism`; N elastic coordinates.
+        mechanism: N elastic coordinates.
         motion: desired rigid coordinates at given instants (n,) s.
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
@@ -315,7 +315,7 @@ class MachineSystem:
         return feed_forward(self.rigid, desired, self.drives, self.closure)
 
     @cached_property
-    def rigid(self) -> ElasticBodies:
+    def rigid(self) -> Mechanism:
         """The mechanism with rigid arms of the same mass and inertia."""
         return self.mechanism.rigid
 

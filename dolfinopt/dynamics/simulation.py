@@ -37,7 +37,7 @@ from dolfinopt.multibody.end_effector import (
 )
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
-from dolfinopt.multibody.mechanism import Closure, ElasticBodies, Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
@@ -118,7 +118,7 @@ class Trajectory:
 
     @property
     def mechanism(self) -> Any:
-        """What moved: a `Mechanism`, in space a `SpatialMechanism`."""
+        """What moved."""
         return self.problem.mechanism
 
     @cached_property
@@ -473,7 +473,7 @@ def _by_radau(
 ) -> list[Solution | ConvergenceError]:
     """Return the solutions in their order: chains on prescribed motions together, others alone."""
     alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if isinstance(one.mechanism, Mechanism)}
+    own = {i: one for i, one in alike.items() if one.mechanism.dim.d == 2}
     together, begun = list(own), [starts[i] for i in own]
     solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
     found = dict(zip(together, solved, strict=True))
@@ -582,7 +582,7 @@ class DriveForces:
 class _Prescribed:
     """Forces of inverse dynamics along a given motion; q, qd, qdd (n, N) are elastic."""
 
-    mechanism: ElasticBodies
+    mechanism: Mechanism
     motion: RigidMotion
     rates: Rates
 
@@ -759,16 +759,10 @@ def load_gradient(
 
 
 class _Probe:
-    """A system whose bodies have a coordinate more for every load, which stays at zero.
-
-    Attributes:
-        system: the larger one.
-        own: (S,) places of the system's unknowns among its.
-        places: of the added coordinates of every body.
-    """
+    """A system whose bodies have a coordinate more for every load, which stays at zero."""
 
     def __init__(self, system: Problem):
-        mechanism: ElasticBodies = system.mechanism
+        mechanism: Mechanism = system.mechanism
         first = system.elastic_columns.start or 0
         own = list(range(first))
         self.places: list[slice] = []
@@ -779,6 +773,7 @@ class _Probe:
             self.places.append(slice(end + q, end + q + more))
             end += q + more
         rest = system.num_coordinates - first - mechanism.num_coordinates
+        # (S,) places of the system's unknowns among its; `places` are the added ones of every body.
         self.own = np.array([*own, *range(end, end + rest)], dtype=int)
         self._size = end + rest
         bodies = tuple(map(_with_probes, mechanism.bodies))

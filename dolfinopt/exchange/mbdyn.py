@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,23 +59,14 @@ INVARIANTS = (14, 15, 16, 17, 18)
 STIFFENING = 19  # the group that linear bodies do not have
 
 
-@dataclass(frozen=True, eq=False)
-class Invariants:
-    """Integrals over the mass that couple q modes Phi to the motion of the frame, SI units.
+class Invariants(NamedTuple):
+    """Integrals over the mass that couple q modes to the motion of the frame, see the module."""
 
-    Attributes:
-        three: (3, q) int Phi_j.
-        four: (3, q) int X x Phi_j.
-        five: (3, q, q) int Phi_j x Phi_k.
-        eight: (3, 3, q) -int X~ Phi_j~.
-        nine: (3, 3, q, q) int Phi_j~ Phi_k~.
-    """
-
-    three: np.ndarray
-    four: np.ndarray
-    five: np.ndarray
-    eight: np.ndarray
-    nine: np.ndarray
+    three: np.ndarray  # (3, q)
+    four: np.ndarray  # (3, q)
+    eight: np.ndarray  # (3, 3, q)
+    five: np.ndarray  # (3, q, q)
+    nine: np.ndarray  # (3, 3, q, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,27 +139,16 @@ def fem_text(element: ModalElement) -> str:
     group(12, [*inertia, *_rows(element.inertia)])
     group(13, _rows(element.D))
     if element.invariants is not None:
-        for number, matrix in zip(INVARIANTS, _packed(element.invariants), strict=True):
-            group(number, _rows(matrix))
+        for number, matrix in zip(INVARIANTS, element.invariants, strict=True):
+            # Rows outermost, within them modes j, then k, then columns of what is (3, 3, ...).
+            rows = np.moveaxis(matrix, 1, -1) if number in (16, 18) else matrix
+            group(number, _rows(rows.reshape(-1, rows.shape[-1])))
     if len(element.loads):
         matrices = [str(len(element.loads))]
         for load, matrix in zip(element.loads, element.stiffening, strict=True):
             matrices += [str(load), *_rows(matrix)]
         group(STIFFENING, matrices)
     return "\n".join(lines) + "\n"
-
-
-def _packed(invariants: Invariants) -> tuple[np.ndarray, ...]:
-    """Return the numbers of groups 14 to 18 in MBDyn's order, as rows of the file."""
-    # Rows of the invariants are outermost; within them modes j, then k, then columns.
-    one, q = invariants, invariants.three.shape[1]
-    return (
-        one.three,
-        one.four,
-        one.eight.transpose(0, 2, 1).reshape(-1, 3),
-        one.five.reshape(-1, q),
-        one.nine.transpose(0, 2, 3, 1).reshape(-1, 3),
-    )
 
 
 def _rows(values: np.ndarray) -> list[str]:

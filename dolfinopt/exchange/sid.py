@@ -29,17 +29,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from dolfinopt.disk import write_arrays, write_text
 from dolfinopt.errors import InputError
 
-T = TypeVar("T")
+Items = dict[str, Callable[[], Any]]  # how the items of a block are read
 MOST = 500  # coordinates: every matrix is kept with its derivative by all of them
 
 _END = re.compile(r"end\s+(?:of\s+)?(\w+)\s*$", re.IGNORECASE)
@@ -212,55 +212,16 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
     }
     matrices = {name: getattr(data, name) for name in BODY}
     for k, node in enumerate(data.nodes, 1):
-        matrices.update({f"node{k}/{name}": getattr(node, name) for name in NODE})
+        matrices |= {f"node{k}/{name}": getattr(node, name) for name in NODE}
     for name, matrix in matrices.items():
         if matrix is not None:
-            for field in fields(Taylor):
-                arrays[f"{name}/{field.name}"] = np.asarray(getattr(matrix, field.name))
+            arrays |= {f"{name}/{key}": np.asarray(value) for key, value in vars(matrix).items()}
     return arrays
 
 
 def write_sid_npz(path: Path, data: StandardInputData) -> None:
     """Write `sid_arrays` to a file."""
     write_arrays(path, sid_arrays(data))
-
-
-def read_sid_npz(path: Path) -> StandardInputData:
-    """Read what `write_sid_npz` wrote.
-
-    Raises:
-        InputError: the file cannot be read, or an array is missing.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-        return _from_arrays(arrays)
-    except KeyError as error:
-        raise InputError(f"{path}: the array {error.args[0]!r} is missing") from None
-    except Exception as error:  # whatever a foreign file may raise
-        problem = getattr(error, "strerror", None) or type(error).__name__
-        raise InputError(f"{path}: cannot be read ({problem}); give an .sid.npz file") from None
-
-
-def _from_arrays(arrays: Mapping[str, np.ndarray]) -> StandardInputData:
-    def matrix(name: str) -> Taylor:
-        M0, M1, *numbers = (arrays[f"{name}/{field.name}"] for field in fields(Taylor))
-        return Taylor(M0, M1, *map(int, numbers))
-
-    nodes = []
-    pairs = zip(arrays["node_names"], arrays["node_rframes"], strict=True)
-    for k, (name, rframe) in enumerate(pairs, 1):
-        parts = {key: matrix(f"node{k}/{key}") for key in NODE if key != "sigma"}
-        if f"node{k}/sigma/M0" in arrays:
-            parts["sigma"] = matrix(f"node{k}/sigma")
-        nodes.append(Node(str(name), str(rframe), **parts))
-    return StandardInputData(
-        mass=float(arrays["mass"]),
-        names=tuple(map(str, arrays["names"])),
-        nodes=tuple(nodes),
-        comment=str(arrays["comment"]),
-        **{name: matrix(name) for name in BODY},
-    )
 
 
 # -- writing the text file ---------------------------------------------------------------------
@@ -388,17 +349,26 @@ class _Reader:
             return
         raise InputError(f"{self.path}, line {len(self.lines)}: the file ends, expected {expected}")
 
-    def block(self, name: str, items: Mapping[str, Callable[[], None]]) -> None:
-        """Read the items of a block up to its end."""
-        choices = ", ".join(map(repr, [*items, f"end {name}"]))
-        known = {key.lower(): read for key, read in items.items()}
+    def block(self, name: str, once: Items, often: Items, found: dict[str, Any]) -> dict[str, Any]:
+        """Read the items of a block up to its end; into `found` those that may stand once."""
+        choices = ", ".join(map(repr, [*once, *often, f"end {name}"]))
+        known = {key.lower(): key for key in (*once, *often)}
         while True:
             self.next(choices)
             if self.end == name.lower():
-                return
-            if self.name not in known:
+                return found
+            if (key := known.get(self.name)) is None:
                 raise self.fail(choices)
-            known[self.name]()
+            if key in found:
+                raise self.fail(f"{key!r} only once")
+            value = (once[key] if key in once else often[key])()
+            if key in once:
+                found[key] = value
+
+    def complete(self, found: Mapping[str, Any], names: Iterable[str], told: str) -> None:
+        for name in names:
+            if name not in found:
+                raise self.fail(f"{name!r} {told}")
 
     def real(self) -> float:
         value = (self.value or "").lower().replace("d", "e")
@@ -419,105 +389,75 @@ class _Reader:
 
     def place(self, shape: tuple[int, ...]) -> tuple[int, ...]:
         """Return the indices in parentheses, counted from zero."""
-        allowed = ", ".join(f"1..{n}" for n in shape)
         parts = (self.indices or "").split(",")
-        if not all(re.fullmatch(r"\s*\d+\s*", part) for part in parts):
-            raise self.fail(f"indices ({allowed})")
-        index = tuple(int(part) - 1 for part in parts)
-        if len(index) != len(shape) or not all(0 <= i < n for i, n in zip(index, shape)):
-            raise self.fail(f"indices ({allowed})")
-        return index
-
-    def once(self, found: dict[str, T], name: str, read: Callable[[], T]) -> Callable[[], None]:
-        """Return what reads an item that may stand only once."""
-
-        def item() -> None:
-            if name in found:
-                raise self.fail(f"{name!r} only once")
-            found[name] = read()
-
-        return item
-
-    def complete(self, found: Mapping[str, Any], names: Iterable[str], told: str) -> None:
-        for name in names:
-            if name not in found:
-                raise self.fail(f"{name!r} {told}")
+        counted = len(parts) == len(shape) and all(re.fullmatch(r"\s*\d+\s*", x) for x in parts)
+        if not counted or not all(1 <= int(x) <= n for x, n in zip(parts, shape, strict=True)):
+            raise self.fail(f"indices ({', '.join(f'1..{n}' for n in shape)})")
+        return tuple(int(x) - 1 for x in parts)
 
     def part(self) -> StandardInputData:
         """Read the whole file: a comment, then the part."""
         while self.name != "part" or self.value is not None:
             self.next("'part'")
         comment = self.lines[0].split("modes:", 1)[-1].strip() if self.number > 1 else ""
-        found: dict[str, StandardInputData] = {}
-        self.block("part", {"modal": self.once(found, "modal", self.modal)})
+        found = self.block("part", {"modal": self.modal}, {}, {})
         if not found:
             raise self.fail("'new modal' before")
         return replace(found["modal"], comment=comment)
 
     def modal(self) -> StandardInputData:
-        head: dict[str, tuple[float, tuple[str, ...]]] = {}
+        found: dict[str, Any] = {}
         nodes: dict[str, Node] = {}
-        matrices: dict[str, Any] = {}
 
         def number() -> int:
-            if not head:
+            if not found:
                 raise self.fail("'refmod' first, which has the number of coordinates")
-            return len(head["refmod"][1])
-
-        def matrix(name: str) -> Callable[[], None]:
-            return self.once(matrices, name, lambda: self.taylor(name, number()))
-
-        items = {"refmod": self.once(head, "refmod", self.refmod)}
-        items["frame"] = lambda: self.frame(nodes, number())
-        items |= {name: matrix(name) for name in BODY}
-        self.block("modal", items)
-        self.complete(head | matrices, ("refmod", *BODY), "before")
-        return StandardInputData(*head["refmod"], tuple(nodes.values()), **matrices)
-
-    def refmod(self) -> tuple[float, tuple[str, ...]]:
-        """Return the mass and the names of the coordinates."""
-        mass: dict[str, float] = {}
-        count: dict[str, int] = {}
-        names: dict[int, str] = {}
-
-        def name() -> None:
-            if not count:
-                raise self.fail("'nelastq' before the names")
-            (k,) = self.place((count["nelastq"],))
-            names[k] = self.value or ""
-
-        items = {
-            "mass": self.once(mass, "mass", self.real),
-            "nelastq": self.once(count, "nelastq", partial(self.integer, 0, MOST)),
-            "ielastq": name,
-        }
-        self.block("refmod", items)
-        self.complete(mass | count, ("mass", "nelastq"), "before")
-        return mass["mass"], tuple(names.get(k, "") for k in range(count["nelastq"]))
-
-    def frame(self, nodes: dict[str, Node], nq: int) -> None:
-        """Add the nodes of one frame block."""
+            return len(found["refmod"][1])
 
         def node() -> None:
             name = self.value or ""
             if not name or name in nodes:
                 raise self.fail("'new node =' and a name of its own")
-            nodes[name] = self.node(name, nq)
+            nodes[name] = self.node(name, number())
 
-        self.block("frame", {"node": node})
+        def frame() -> None:
+            number()
+            self.block("frame", {}, {"node": node}, {})
+
+        once: Items = {"refmod": self.refmod}
+        once |= {key: partial(lambda name: self.taylor(name, number()), key) for key in BODY}
+        self.block("modal", once, {"frame": frame}, found)
+        self.complete(found, ("refmod", *BODY), "before")
+        mass, names = found.pop("refmod")
+        return StandardInputData(mass, names, tuple(nodes.values()), **found)
+
+    def refmod(self) -> tuple[float, tuple[str, ...]]:
+        """Return the mass and the names of the coordinates."""
+        found: dict[str, Any] = {}
+        names: dict[int, str] = {}
+
+        def name() -> None:
+            if "nelastq" not in found:
+                raise self.fail("'nelastq' before the names")
+            (k,) = self.place((found["nelastq"],))
+            names[k] = self.value or ""
+
+        once: Items = {"mass": self.real, "nelastq": partial(self.integer, 0, MOST)}
+        self.block("refmod", once, {"ielastq": name}, found)
+        self.complete(found, once, "before")
+        return found["mass"], tuple(names.get(k, "") for k in range(found["nelastq"]))
 
     def node(self, name: str, nq: int) -> Node:
         rframe = [""]
-        found: dict[str, Taylor] = {}
-        items: dict[str, Callable[[], None]] = {"rframe": lambda: rframe.append(self.value or "")}
-        items |= {key: self.once(found, key, partial(self.taylor, key, nq)) for key in NODE}
-        self.block("node", items)
+        once: Items = {key: partial(self.taylor, key, nq) for key in NODE}
+        often: Items = {"rframe": lambda: rframe.append(self.value or "")}
+        found = self.block("node", once, often, {})
         self.complete(found, (key for key in NODE if key != "sigma"), f"of node {name} before")
         return Node(name, rframe[-1], **found)
 
     def taylor(self, name: str, nq: int) -> Taylor:
-        """Read one matrix."""
-        header: dict[str, int] = {}
+        """Read one matrix, check its dimensions and fill it."""
+        header: dict[str, Any] = {}
         entries: dict[str, dict[tuple[int, ...], float]] = {"m0": {}, "m1": {}}
 
         def put() -> None:
@@ -530,45 +470,28 @@ class _Reader:
             known[index] = self.real()
 
         limits = {"order": 1, "nqn": 0, "structure": UNIT}
-        items = {
-            key: self.once(header, key, partial(self.integer, 0, limits.get(key, 10_000_000)))
-            for key in HEADER
-        }
-        self.block(name, items | {"m0": put, "m1": put})
+        once: Items = {key: partial(self.integer, 0, limits.get(key, 10_000_000)) for key in HEADER}
+        self.block(name, once, {"m0": put, "m1": put}, header)
         self.complete(header, HEADER, f"of {name} before")
-        return self.assembled(name, nq, header, entries)
-
-    def assembled(
-        self,
-        name: str,
-        nq: int,
-        header: Mapping[str, int],
-        entries: Mapping[str, Mapping[tuple[int, ...], float]],
-    ) -> Taylor:
-        """Check the dimensions and fill the matrices."""
-        size = {"nq": nq, "3nq": 3 * nq}
-        allowed = [
-            tuple(size[n] if isinstance(n, str) else n for n in shape)
-            for shape in (BODY | NODE)[name]
-        ]
-        shape = (header["nrow"], header["ncol"])
-        if shape not in allowed:
+        size: dict[Any, int] = {"nq": nq, "3nq": 3 * nq}
+        allowed = [tuple(size.get(n, n) for n in shape) for shape in (BODY | NODE)[name]]
+        order, *shape, count, nqn, structure = (header[key] for key in HEADER)
+        if tuple(shape) not in allowed:
             choices = " or ".join(f"{rows} x {cols}" for rows, cols in allowed)
             raise self.fail(f"{name} of {choices}, not {shape[0]} x {shape[1]}, for nelastq = {nq}")
-        order, structure = header["order"], header["structure"]
-        if header["nq"] != nq and (order > 0 or header["nq"] != 0):
-            raise self.fail(f"nq = {nq} of {name}, not {header['nq']}")
+        if count != nq and (order > 0 or count != 0):
+            raise self.fail(f"nq = {nq} of {name}, not {count}")
         first, second = entries["m0"], entries["m1"]
         if second and order == 0:
             raise self.fail(f"no m1 in {name}, which is of order 0")
         if first and structure == ZERO:
             raise self.fail(f"no m0 in {name}, whose structure 0 says zero")
         M0 = np.eye(*shape) if structure == UNIT and not first else np.zeros(shape)
-        M1 = np.zeros((shape[0], header["nq"], shape[1]))
+        M1 = np.zeros((shape[0], count, shape[1]))
         for (row, col), value in first.items():
             M0[row, col] = value
             if structure == SYMMETRIC and shape[0] == shape[1] and (col, row) not in first:
                 M0[col, row] = value
         for index, value in second.items():
             M1[index] = value
-        return Taylor(M0, M1, order, structure, header["nqn"])
+        return Taylor(M0, M1, order, structure, nqn)

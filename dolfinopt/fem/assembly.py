@@ -533,20 +533,13 @@ class StressTensor:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """Some of the cells, so many that what is made of them stays in the cache.
+    """Some of the cells, so many that what is made of them stays in the cache."""
 
-    Attributes:
-        cells: which.
-        young: theirs.
-        a: (r, d, q, cells) differences of the modes.
-        u: (r, d, loads, cells) those of the fields.
-        force: (bc, loads, cells) what E times the products of differences is multiplied by.
-    """
-
-    cells: slice
-    young: np.ndarray
-    a: np.ndarray
-    u: np.ndarray
+    cells: slice  # which
+    young: np.ndarray  # theirs
+    a: np.ndarray  # (r, d, q, cells) differences of the modes
+    u: np.ndarray  # (r, d, loads, cells) those of the fields
+    # (bc, loads, cells) what E times the products of differences is multiplied by
     force: np.ndarray
 
 

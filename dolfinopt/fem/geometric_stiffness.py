@@ -258,7 +258,7 @@ class GeometricGradient:
     @property
     def by_inertia(self) -> np.ndarray:
         """Fields whose products with dM 1_x and dM X are the part by the mass (n_nodes, d, 2)."""
-        return _by_inertia(self._by_loads[:, :, : self.loads.num_frame])
+        return by_inertia(self._by_loads[:, :, : self.loads.num_frame])
 
     @property
     def by_modal_inertia(self) -> np.ndarray:
@@ -286,7 +286,7 @@ def _fold(
     return np.tensordot(psi, outboard, ((0, 1), (0, 1)))
 
 
-def _by_inertia(adjoint: np.ndarray) -> np.ndarray:
+def by_inertia(adjoint: np.ndarray) -> np.ndarray:
     """Return what the inertial loads' adjoints multiply dM 1_x and dM X by (n_nodes, d, 2)."""
     # M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
     out = np.zeros((*adjoint.shape[:2], 2))

@@ -200,7 +200,8 @@ def tabulate_cells(form: Any, constants: list[float], coordinates: np.ndarray) -
     else:
         integral = compiled.integrals(0)[0]
     kernel = integral.tabulate_tensor_float64
-    sizes = [_element_size(space) for space in form.function_spaces]
+    maps = [space.dofmap for space in form.function_spaces]
+    sizes = [one.dof_layout.num_dofs * one.index_map_bs for one in maps]  # dofs of a cell
     matrices = np.zeros((len(coordinates), sizes[0], sizes[1]))
     coordinates = np.ascontiguousarray(coordinates, dtype=np.float64)
     values = np.asarray(constants, dtype=np.float64)
@@ -220,8 +221,3 @@ def _cffi() -> Any:
     import cffi
 
     return cffi.FFI()
-
-
-def _element_size(space: Any) -> int:
-    """Return the number of dofs of a cell, components included."""
-    return space.dofmap.dof_layout.num_dofs * space.dofmap.index_map_bs

@@ -217,11 +217,10 @@ def _tokens(text: str) -> list[_Token]:
 
 
 class _Checker:
-    """Rules for a token and its neighbours.
+    """Rules for a token and its neighbours."""
 
-    They look at no more than one statement, and Gmsh's parser jumps only between statements: a
-    file that keeps them does so from wherever the parser goes on after a jump or an error.
-    """
+    # They look at no more than one statement, and Gmsh's parser jumps only between statements: a
+    # file that keeps them does so from wherever the parser goes on after a jump or an error.
 
     def __init__(self, tokens: list[_Token]) -> None:
         self.tokens = tokens

@@ -423,13 +423,10 @@ def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
     """
     with _telling_where(_where(arm)):
         with silent_terminal():
-            groups = (_read_step if _is_step(arm) else _read_groups)(gmsh, arm)
+            step = Path(str(arm.mesh)).suffix.lower() in (".step", ".stp")
+            groups = (_read_step if step else _read_groups)(gmsh, arm)
         _set_groups(gmsh, groups, arm)
         return _checked(gmsh, groups, arm)
-
-
-def _is_step(arm: Arm) -> bool:
-    return Path(str(arm.mesh)).suffix.lower() in (".step", ".stp")
 
 
 def _mesh(gmsh: Any, arm: Arm) -> None:
@@ -786,7 +783,8 @@ def _meshed(
             raise InputError(f"the {NAMES[group]} interface is lost in its faces")
     found = _cells(model, solid, chosen)
     volumes = found.volumes
-    expected = np.einsum("na,na->", *_fans(points[triangles])) / 6.0
+    a, b, c = points[triangles].swapaxes(0, 1)  # each with the origin a tetrahedron
+    expected = np.einsum("na,na->", a, np.cross(b, c)) / 6.0
     if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST_VOLUME_SHARE * expected:
         raise InputError("its cells do not fill it")
     return found
@@ -829,11 +827,6 @@ def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahed
         for group in (INBOARD, OUTBOARD)
     ]
     return Tetrahedra(points[used], cells.reshape(-1, 4), *facets)
-
-
-def _fans(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a and b x c of triangles, whose products are six times the volume within."""
-    return corners[:, 0], np.cross(corners[:, 1], corners[:, 2])
 
 
 class InterfaceMesh(Protocol):

@@ -4,5 +4,5 @@
 (rigid coordinates that follow a path) -> `inverse_dynamics` (forces and elastic residual).
 The recursion, by the dimension of the world (`dimension`): `body_motion` (one body), `kinematics`
 (from body to body). Derivatives: `tangent` by coordinates and by the bodies' integrals;
-`end_effector`, its place and theirs. Other programs: `mbdyn`, `standard_input`.
+`end_effector`, its place and theirs. Other programs: `standard_input`.
 """

@@ -108,9 +108,17 @@ class Constants:
     def of_point(cls, mass: PerInstant, inertia: PerInstant) -> Constants:
         """Return those of a mass (kg) with rotary inertia (kg m2) at the origin, in the plane."""
         found = cls(rigid_body(0.0, np.zeros(2), 0.0, np.zeros(2)))
+        if np.ndim(mass) or np.ndim(inertia):  # then each has its own at every instant
+            mass, inertia = (x.copy() for x in np.broadcast_arrays(mass, inertia))
         inertia = np.atleast_1d(inertia)
         found.mass, found.W_rest = mass, np.stack([inertia, np.zeros_like(inertia)])
         return found
+
+    def __getitem__(self, part: slice | np.ndarray) -> Constants:
+        """Return them at some of the instants: a point's, of which each has its own."""
+        if not isinstance(self.mass, np.ndarray):
+            return self
+        return self.of_point(self.mass[part], self.W_rest[0, part])
 
     @cached_property
     def bent(self) -> np.ndarray:

@@ -158,6 +158,14 @@ class Plane:
         """Return the angles (1, n) of rotations (2, 2, n), from -pi to pi."""
         return np.arctan2(R[1, 0], R[0, 0])[None]
 
+    @staticmethod
+    def softness(B: np.ndarray, K: np.ndarray, point: np.ndarray) -> float:
+        """Return how far an interface of modes B (3, q) at `point` goes by a unit force across."""
+        # Or a third of the arm's length squared times its rotation by a unit moment, which is the
+        # same of a cantilever, and not zero of an arm whose frame is its chord.
+        soft = B @ np.linalg.solve(K, B.T)
+        return max(float(soft[1, 1]), float(soft[2, 2]) * float(point @ point) / 3.0)
+
 
 _TRANSPOSED = np.arange(9).reshape(3, 3).T.ravel()
 
@@ -287,6 +295,12 @@ class Space:
 
         out: np.ndarray = Rotation.from_matrix(np.moveaxis(R, -1, 0)).as_rotvec().T
         return out
+
+    @staticmethod
+    def softness(B: np.ndarray, K: np.ndarray, point: np.ndarray) -> float:
+        """Return how far an interface of modes B (6, q) goes by a unit force, at most."""
+        soft = B[:3] @ np.linalg.solve(K, B[:3].T)
+        return float(np.linalg.eigvalsh(0.5 * (soft + soft.T))[-1])
 
 
 def _add_skew(A: np.ndarray, v: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.dimension import Turning, product
 from dolfinopt.multibody.kinematics import MovingJoint
 from dolfinopt.multibody.measured import LEAST_INSTANTS
-from dolfinopt.multibody.mechanism import GROUND, ElasticBodies, Mechanism, Site, several
+from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site, several
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -23,12 +23,12 @@ def lengths(vectors: np.ndarray) -> np.ndarray:
     return out
 
 
-def end_effector(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the end-effector's position (n, d), m, of the flexible mechanism; q (n, N)."""
     return Posed(mechanism, motion.q, q).interface(*mechanism.way[-1])[0].T
 
 
-def deviation(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
+def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
     """Return the flexible minus the equivalent rigid end-effector (n, d), m.
 
     Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
@@ -38,7 +38,7 @@ def deviation(mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray) -> n
 
 
 def end_rotation(
-    mechanism: ElasticBodies, motion: RigidMotion, q: np.ndarray, desired: RigidMotion
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, desired: RigidMotion
 ) -> np.ndarray:
     """Return the rotation vectors log(R R_0') of the end-effector (n, r), r = 1 or 3, rad.
 
@@ -53,13 +53,13 @@ def end_rotation(
     R = Posed(mechanism, motion.q, q).interface(*end)[1]
     rigid = Posed(mechanism, desired.q, np.zeros_like(q)).interface(*end)[1]
     apart = _turned(R, rigid.swapaxes(0, 1))
-    dim = mechanism.tree.constants[0].dim
+    dim = mechanism.constants[0].dim
     vectors = dim.rotation_vector(apart.reshape(dim.d, dim.d, -1))
     return np.broadcast_to(vectors.T, (len(q), dim.r))
 
 
 def end_effector_gradient(
-    mechanism: ElasticBodies,
+    mechanism: Mechanism,
     motion: RigidMotion,
     q: np.ndarray,
     weights: np.ndarray,
@@ -85,7 +85,7 @@ def end_effector_gradient(
     end = posed.interface(*mechanism.way[-1])[0]
     by_q, by_rigid = np.zeros_like(q), np.zeros_like(motion.q)
     by_bodies = [{"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies]
-    if (cart := mechanism.tree.cart_coordinate) is not None:
+    if (cart := mechanism.cart_coordinate) is not None:
         by_rigid[:, cart] = weights[:, 0]
     for i, number in mechanism.way:
         joint, origin, R = posed.body(i)
@@ -140,9 +140,9 @@ class Posed:
     Rotations, to the ground's frame, are (d, d, n), or (d, d) where they are the same in all poses.
     """
 
-    def __init__(self, mechanism: ElasticBodies, q_r: np.ndarray, q: np.ndarray) -> None:
+    def __init__(self, mechanism: Mechanism, q_r: np.ndarray, q: np.ndarray) -> None:
         """Take the poses."""
-        self.tree, self.q_r, self.q = mechanism.tree, q_r, q
+        self.mechanism, self.q_r, self.q = mechanism, q_r, q
         base = mechanism.base(q_r)
         self._still = base, base, base  # no motion is asked for
         self._interfaces: dict[Site, tuple[np.ndarray, np.ndarray]] = {}
@@ -153,7 +153,7 @@ class Posed:
     def body(self, i: int) -> tuple[MovingJoint, np.ndarray, np.ndarray]:
         """Return the joint of body i, the place (d, n) and the rotation of its frame."""
         if i not in self._bodies:
-            joint = self.tree.joints[i]
+            joint = self.mechanism.joints[i]
             place, R = self.interface(joint.parent, joint.interface)
             k = joint.coordinate
             moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
@@ -165,8 +165,8 @@ class Posed:
     def section(self, i: int, number: int) -> Section:
         """Return an outboard interface of body i."""
         if (i, number) not in self._sections:
-            e = self.q[:, self.tree.slices[i]].T
-            self._sections[i, number] = Section(self.tree.constants[i], number, e)
+            e = self.q[:, self.mechanism.slices[i]].T
+            self._sections[i, number] = Section(self.mechanism.constants[i], number, e)
         return self._sections[i, number]
 
     def interface(self, i: int, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -264,7 +264,7 @@ def _frames(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
     """Return origins (the last one the end's), rotations and (shift, rotation) by the modes."""
-    origins = [motion.q[:, 0] + 1j * mechanism.joint_height]
+    origins = [motion.q[:, 0] + 1j * mechanism.origin[1]]
     rotations: list[np.ndarray] = []
     shifts: list[tuple[np.ndarray, np.ndarray]] = []
     outer = np.ones(len(q), dtype=complex)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from dolfinopt.multibody.body_motion import BodyMotion, Load
 from dolfinopt.multibody.end_effector import interface_place
 from dolfinopt.multibody.kinematics import Interface, MovingJoint
-from dolfinopt.multibody.mechanism import GROUND, Closure, ElasticBodies, Mechanism, Site, Tree
+from dolfinopt.multibody.mechanism import GROUND, Closure, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
@@ -39,7 +38,7 @@ class Link:
     carried: dict[int, BodyMotion]
 
 
-def outward_pass(tree: Tree, motion: RigidMotion, rates: Rates) -> list[Link]:
+def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Link]:
     """Return all bodies as they move, in the tree's order."""
     count = len(motion.q)
     joints, elastic = instants_last((motion.q, motion.qd, motion.qdd)), instants_last(rates)
@@ -88,7 +87,7 @@ class Loads:
 
 
 def inward_pass(
-    tree: Tree, links: list[Link], driven: bool = True, pull: Mapping[Site, Load] = NOTHING
+    tree: Mechanism, links: list[Link], driven: bool = True, pull: Mapping[Site, Load] = NOTHING
 ) -> Loads:
     """Return the loads of all bodies; on frames, unless `driven`, those that deform a body.
 
@@ -138,7 +137,7 @@ def interface_pushes(link: Link, outboard: dict[int, Load]) -> dict[int, np.ndar
 
 
 def inverse_dynamics(
-    mechanism: Any, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the generalised force of every coordinate.
 
@@ -151,7 +150,7 @@ def inverse_dynamics(
         Elastic residual (n, N), zero when the equations of motion hold, and what drives the joints
         (n, joints), N m of revolute and N of prismatic ones.
     """
-    tree: Tree = mechanism.tree
+    tree: Mechanism = mechanism
     links = outward_pass(tree, motion, (q, qd, qdd))
     loads = inward_pass(tree, links)
     drives = [links[i].joint.drive(loads.joints[i]) for i in tree.movable]
@@ -164,18 +163,18 @@ def inverse_dynamics(
 
 
 def elastic_residual(
-    mechanism: Any, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
     """Return the elastic residual (n, N) of `inverse_dynamics` alone."""
-    links = outward_pass(mechanism.tree, motion, (q, qd, qdd))
-    return elastic_rows(links, inward_pass(mechanism.tree, links, driven=False))
+    links = outward_pass(mechanism, motion, (q, qd, qdd))
+    return elastic_rows(links, inward_pass(mechanism, links, driven=False))
 
 
 # -- what loads every body: its frame's acceleration, and from outboard ------------------------
 
 
 def body_loads(
-    mechanism: Any, motion: RigidMotion, rates: Rates, pull: Mapping[Site, Load] = NOTHING
+    mechanism: Mechanism, motion: RigidMotion, rates: Rates, pull: Mapping[Site, Load] = NOTHING
 ) -> list[np.ndarray]:
     """Return what loads every body in the order of its K0 and K0_outboard (n, P).
 
@@ -187,8 +186,8 @@ def body_loads(
         mechanism, motion, rates: as for `inverse_dynamics`.
         pull: see `inward_pass`.
     """
-    links = outward_pass(mechanism.tree, motion, rates)
-    return _body_loads(links, inward_pass(mechanism.tree, links, pull=pull).outboard)
+    links = outward_pass(mechanism, motion, rates)
+    return _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
 
 
 def _body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.ndarray]:
@@ -202,20 +201,20 @@ def _body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.n
     return found
 
 
-def is_loaded_at_rest(mechanism: Any, motion: RigidMotion) -> bool:
+def is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
     """Return whether anything loads the bodies while they are not deformed."""
     rest = np.zeros((len(motion.q), mechanism.num_coordinates))
     return any(p.any() for p in body_loads(mechanism, motion, (rest, rest, rest)))
 
 
-def load_coefficients(mechanism: Any, motion: RigidMotion, rates: Rates) -> list[np.ndarray]:
+def load_coefficients(mechanism: Mechanism, motion: RigidMotion, rates: Rates) -> list[np.ndarray]:
     """Return c (n, P + g q) of every body: what loads its nodes, as inertia acts.
 
     c = -(p, alpha_c z + beta_c z' + trace_c z''), p of `body_loads`, c before the modes, z being
     the displacement along them, see `body_motion`. See `dynamics.simulation`.
     """
-    links = outward_pass(mechanism.tree, motion, rates)
-    loads = _body_loads(links, inward_pass(mechanism.tree, links).outboard)
+    links = outward_pass(mechanism, motion, rates)
+    loads = _body_loads(links, inward_pass(mechanism, links).outboard)
     found = []
     for link, p in zip(links, loads, strict=True):
         elastic = link.body.accelerations(link.body.z)
@@ -243,7 +242,7 @@ class Stiffening:
 
 
 def largest_change(
-    mechanism: ElasticBodies, motion: RigidMotion, closure: Closure | None = None
+    mechanism: Mechanism, motion: RigidMotion, closure: Closure | None = None
 ) -> float:
     """Return the largest |eigenvalue| of K^-1 sum_p p K0_p over arms and instants.
 
@@ -271,12 +270,11 @@ def stiffness_change(body: ShapeIntegrals, p: np.ndarray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _loads(rigid: ElasticBodies, motion: RigidMotion, closure: Closure | None) -> list[np.ndarray]:
+def _loads(rigid: Mechanism, motion: RigidMotion, closure: Closure | None) -> list[np.ndarray]:
     """Return what loads every body (n, loads); in the plane a_x, a_y, wd, -w^2, F_x, F_y, T."""
     none = np.zeros((len(motion.q), 0))
     pull: dict[Site, Load] = {}
     if closure is not None:
-        assert isinstance(rigid, Mechanism)
         force = _ground_force(rigid, motion, closure)
         pull[len(rigid.bodies) - 1, 0] = (
             np.stack([force.real, force.imag]),
@@ -286,10 +284,8 @@ def _loads(rigid: ElasticBodies, motion: RigidMotion, closure: Closure | None) -
 
 
 def _ground_force(rigid: Mechanism, motion: RigidMotion, closure: Closure) -> np.ndarray:
-    """Return what the last arm must give to the ground (n,), complex, in its end's components.
-
-    The joints that close the loop have no drive: there are as many of them as constraints.
-    """
+    """Return what the last arm must give to the ground (n,), complex, in its end's components."""
+    # The joints that close the loop have no drive: there are as many of them as constraints.
     none = np.zeros((len(motion.q), 0))
     forces = inverse_dynamics(rigid, motion, none, none, none)[1][:, -closure.count :]
     place = interface_place(rigid, motion, none)

@@ -51,7 +51,7 @@ STALLED_GAIN = 1e-9  # part by which the distance falls in one of them, below wh
 START_GUESSES = 10  # the first as stated, the others around it at random
 KEPT_INSTANT_SETS = 16  # whose joints are kept: the integrator asks for the same ones again
 
-# -- standard_input, mbdyn -------------------------------------------------------------------
+# -- standard_input --------------------------------------------------------------------------
 
 # How far matrices that must be symmetric, or zero, may be from it, relative to their largest
 # entry, and places to a length: finite elements leave 1e-12, files with six digits 1e-6.

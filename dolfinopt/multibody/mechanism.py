@@ -1,4 +1,9 @@
-"""A cart that carries a chain of flexible arms and a payload: what inverse dynamics works on.
+"""A tree of rigid and flexible bodies in the plane or in space: what inverse dynamics works on.
+
+Every body hangs on its parent's outboard interface, or on the ground, by one joint, whose frame is
+placed as in URDF; the body's own frame is the joint's. What a body carries at an outboard interface
+without a joint (payload, motor) is a rigid body in the interface's frame. Source: Featherstone,
+Rigid Body Dynamics Algorithms (2008); Schwertassek & Wallrapp (1999).
 
 Plane vectors are complex numbers: v = v_x + i v_y, so S v = i v, a rotation by phi multiplies by
 exp(i phi), u . v = Re(conj(u) v) and the moment of a force F about the origin of its lever u is
@@ -7,7 +12,7 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -22,15 +27,12 @@ from dolfinopt.multibody.body_motion import (
     Motion,
     PerInstant,
     Scale,
-    at,
 )
-from dolfinopt.multibody.dimension import DIMENSIONS
+from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
-
     from dolfinopt.multibody.motion import RigidMotion
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
@@ -235,33 +237,104 @@ class Joint:
         return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
+def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
+    """Return the diagonal of a matrix that has nothing else, or the matrix."""
+    diagonal = np.diagonal(A)
+    return diagonal if np.count_nonzero(A) == np.count_nonzero(diagonal) else A
+
+
+def product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
+    """Return x A (n, q) of a matrix, or of its diagonal."""
+    return x * A if A.ndim == 1 else x @ A
+
+
 @dataclass(frozen=True, eq=False)
-class Tree:
-    """Bodies and the joints that hold them, as the recursion goes along them.
+class Mechanism:
+    """Bodies, the joints that hold them, what they carry, and gravity; in the plane or in space.
+
+    Loads, gravity and scales may differ from instant to instant: several mechanisms in one.
 
     Attributes:
-        constants: of the bodies.
-        slices: their places among the N elastic coordinates.
+        bodies: in the order of the elastic coordinates.
         joints: that hold them, in the same order.
-        loads: what they carry at interfaces without a joint, by (body, interface).
+        loads: what they carry at interfaces without a joint, in the interfaces' frames.
         gravity: (d, 1), or (d, n) of instants that differ, m/s2.
-        cart: mass of a cart on the x axis that carries the ground's frame, kg, the first rigid
-            coordinate; None without one.
-        scales: of every body, or none.
+        end: the end-effector's interface.
+        origin: (d,) of the ground's frame, which a cart moves along x, m.
+        cart: its mass, kg, of the first rigid coordinate; None without one.
+        scales: of every body's elastic rows, forces and moments, or none.
     """
 
-    constants: tuple[Constants, ...]
-    slices: tuple[slice, ...]
+    bodies: tuple[ShapeIntegrals, ...]
     joints: tuple[Joint, ...]
     loads: Mapping[Site, Constants]
     gravity: np.ndarray
+    end: Site
+    origin: np.ndarray
     cart: float | None = None
     scales: tuple[Scale, ...] = ()
 
+    def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
+        """Return it at some of the instants."""
+        loads = {site: one[part] for site, one in self.loads.items()}
+        alike = all(one is self.loads[site] for site, one in loads.items())
+        if alike and not self.scales and self.gravity.shape[1] == 1:
+            return self
+        gravity = self.gravity if self.gravity.shape[1] == 1 else self.gravity[:, part]
+        scales = tuple(scale[part] for scale in self.scales)
+        return replace(self, loads=loads, gravity=gravity, scales=scales)
+
+    @property
+    def rigid(self) -> Mechanism:
+        """The same of bodies of the same mass and inertia that do not deform."""
+        return replace(self, bodies=tuple(body.rigid_part for body in self.bodies))
+
+    # -- coordinates -------------------------------------------------------------------------
+
+    @property
+    def dim(self) -> Dimension:
+        """What differs between the plane and space."""
+        return DIMENSIONS[len(self.gravity)][0]
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Each body's place in the vector of all elastic coordinates."""
+        ends = np.cumsum([0, *(body.num_modes for body in self.bodies)])
+        return tuple(slice(a, b) for a, b in pairwise(ends))
+
     @property
     def num_coordinates(self) -> int:
-        """Number N."""
-        return self.slices[-1].stop if self.slices else 0
+        """Number N of elastic coordinates of all bodies."""
+        return sum(body.num_modes for body in self.bodies)
+
+    @property
+    def num_rigid(self) -> int:
+        """Number R of rigid coordinates, of cart and joints."""
+        return len(self.rotors)
+
+    @cached_property
+    def movable(self) -> tuple[int, ...]:
+        """The bodies whose joints have a coordinate, in the order of these."""
+        found = [(j.coordinate, i) for i, j in enumerate(self.joints) if j.coordinate is not None]
+        return tuple(i for _, i in sorted(found))
+
+    @property
+    def cart_coordinate(self) -> int | None:
+        """Place of the cart among the rigid coordinates, None without one."""
+        return None if self.cart is None else 0
+
+    @cached_property
+    def rotors(self) -> np.ndarray:
+        """Mass of the cart and reflected inertia of every rigid coordinate's drive (R,)."""
+        cart = [] if self.cart is None else [self.cart]
+        return np.array([*cart, *(self.joints[i].rotor for i in self.movable)])
+
+    # -- how the recursions go along it ------------------------------------------------------
+
+    @cached_property
+    def constants(self) -> tuple[Constants, ...]:
+        """The bodies' integrals as the equations use them."""
+        return tuple(map(Constants, self.bodies))
 
     @cached_property
     def sites(self) -> tuple[tuple[int, ...], ...]:
@@ -298,137 +371,69 @@ class Tree:
         return tuple(found)
 
     @cached_property
-    def movable(self) -> tuple[int, ...]:
-        """The bodies whose joints have a coordinate, in the order of these."""
-        found = [(j.coordinate, i) for i, j in enumerate(self.joints) if j.coordinate is not None]
-        return tuple(i for _, i in sorted(found))
-
-    @property
-    def cart_coordinate(self) -> int | None:
-        """Place of the cart among the rigid coordinates, None without one."""
-        return None if self.cart is None else 0
-
-    @cached_property
-    def rotors(self) -> np.ndarray:
-        """Mass of the cart and reflected inertia of every rigid coordinate's drive."""
-        cart = [] if self.cart is None else [self.cart]
-        return np.array([*cart, *(self.joints[i].rotor for i in self.movable)])
+    def way(self) -> tuple[Site, ...]:
+        """From the ground to the end-effector: every body and the interface that leads on."""
+        found = [self.end]
+        while (joint := self.joints[found[0][0]]).parent != GROUND:
+            found.insert(0, (joint.parent, joint.interface))
+        return tuple(found)
 
     def is_felt(self, i: int) -> bool:
         """Return whether a body inboard of body i deforms under its load."""
         parent = self.joints[i].parent
         if parent == GROUND:
             return False
-        return self.constants[parent].num_modes > 0 or self.is_felt(parent)
+        return self.bodies[parent].num_modes > 0 or self.is_felt(parent)
 
     def scale(self, i: int) -> Scale:
         """Return that of a body."""
         return self.scales[i] if self.scales else UNSCALED
 
+    def base(self, q_r: np.ndarray) -> np.ndarray:
+        """Return where the ground's frame is (d, n), m, for rigid coordinates (n, R)."""
+        place = np.repeat(self.origin[:, None], len(q_r), axis=1)
+        if self.cart is not None:
+            place[0] += q_r[:, 0]
+        return place
+
     def ground(self, motion: RigidMotion) -> Motion:
         """Return the motion of what the first joints sit on: that of the cart, less gravity."""
-        d, count = len(self.gravity), len(motion.q)
-        a = np.empty((d, count), dtype=motion.qdd.dtype)
+        a = np.empty((self.dim.d, len(motion.q)), dtype=motion.qdd.dtype)
         a[:] = -self.gravity
         if self.cart is not None:
             a[0] += motion.qdd[:, 0]
-        still = np.zeros((d * (d - 1) // 2, count))
+        still = np.zeros((self.dim.r, len(motion.q)))
         return a, still, still
 
     def virtual_ground(self, of_forces: np.ndarray) -> Load:
         """Return its displacement and rotation for virtual rigid coordinates (n, .)."""
-        d, count = len(self.gravity), len(of_forces)
-        p = np.zeros((d, count))
+        p = np.zeros((self.dim.d, len(of_forces)))
         if self.cart is not None:
             p[0] = of_forces[:, 0]
-        return p, np.zeros((d * (d - 1) // 2, count))
+        return p, np.zeros((self.dim.r, len(of_forces)))
 
-
-# -- a cart that carries a chain of flexible arms and a payload
-
-
-def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
-    """Return the diagonal of a matrix that has nothing else, or the matrix."""
-    diagonal = np.diagonal(A)
-    return diagonal if np.count_nonzero(A) == np.count_nonzero(diagonal) else A
-
-
-def product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """Return x A (n, q) of a matrix, or of its diagonal."""
-    return x * A if A.ndim == 1 else x @ A
-
-
-@dataclass(frozen=True)
-class JointHardware:
-    """What sits at one arm's ends besides the arm itself.
-
-    Attributes:
-        mass, inertia: at the outboard interface, kg, kg m2.
-        rotor: inertia of the rotor that drives the inboard joint, times its gear ratio squared,
-            kg m2.
-    """
-
-    mass: float = 0.0
-    inertia: float = 0.0
-    rotor: float = 0.0
-
-
-BARE = JointHardware()
-
-
-@dataclass(frozen=True, eq=False)
-class ElasticBodies:
-    """Bodies whose elastic coordinates stand one after the other in one vector.
-
-    Attributes:
-        bodies: q coordinates each.
-    """
-
-    bodies: tuple[ShapeIntegrals, ...]
-
-    @property
-    def num_rigid(self) -> int:
-        """Number of rigid coordinates."""
-        raise NotImplementedError
-
-    def __getitem__(self, part: slice | np.ndarray) -> ElasticBodies:
-        """Return it at some of the instants."""
-        raise NotImplementedError
-
-    @property
-    def tree(self) -> Tree:
-        """Itself as inverse dynamics goes along it."""
-        raise NotImplementedError
-
-    @property
-    def way(self) -> tuple[Site, ...]:
-        """From the ground to the end-effector: every body and the interface that leads on."""
-        raise NotImplementedError
-
-    def base(self, q_r: np.ndarray) -> np.ndarray:
-        """Return where the first joints' frame is (d, n), m, for rigid coordinates (n, R)."""
-        return np.zeros((len(self.tree.gravity), len(q_r)))
+    # -- how stiff and how large it is -------------------------------------------------------
 
     @property
     def softness(self) -> float:
-        """Largest static deflection of a body by a unit force across it, m/N."""
-        raise NotImplementedError
+        """Largest static deflection of an interface by a unit force, m/N; in the plane across."""
+        return max(
+            (
+                self.dim.softness(B, body.K, point)
+                for body, points in zip(self.bodies, (one.points for one in self.constants))
+                if body.num_modes
+                for B, point in zip(np.split(body.outboard, len(points)), points, strict=True)
+            ),
+            default=0.0,
+        )
 
     @property
     def levers(self) -> np.ndarray:
-        """Deflection of the end by unit rigid coordinates (R,), m."""
-        raise NotImplementedError
-
-    @cached_property
-    def slices(self) -> tuple[slice, ...]:
-        """Each body's place in the vector of all elastic coordinates."""
-        ends = np.cumsum([0, *(body.num_modes for body in self.bodies)])
-        return tuple(slice(a, b) for a, b in pairwise(ends))
-
-    @property
-    def num_coordinates(self) -> int:
-        """Number N of elastic coordinates of all bodies."""
-        return sum(body.num_modes for body in self.bodies)
+        """Deflection of the end by unit rigid coordinates (R,), m; at most."""
+        reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in self.constants)
+        reach += sum(float(np.linalg.norm(one.origin)) for one in self.joints)
+        slides = [self.joints[i].kind == "prismatic" for i in self.movable]
+        return np.where([True, *slides] if self.cart is not None else slides, 1.0, reach)
 
     @cached_property
     def stiffnesses(self) -> tuple[np.ndarray, ...]:
@@ -451,7 +456,7 @@ class ElasticBodies:
 
         That of its outboard interfaces in its own frame.
         """
-        lengths = [np.linalg.norm(one.points, axis=1).max() for one in self.tree.constants]
+        lengths = [np.linalg.norm(one.points, axis=1).max() for one in self.constants]
         pairs = zip(self._interfaces(q, False), lengths, strict=True)
         return np.array([largest / length if length else 0.0 for largest, length in pairs])
 
@@ -461,10 +466,10 @@ class ElasticBodies:
 
     def _interfaces(self, q: np.ndarray, turned: bool) -> Iterator[float]:
         """Yield the largest displacement, or rotation, of every body's interfaces in q (n, N)."""
-        d = len(self.tree.gravity)
+        d, b = self.dim.d, self.dim.b
         for part, body in zip(self.slices, self.bodies, strict=True):
             # Of each interface: displacements, then rotations, of which the plane has one.
-            every = (q[:, part] @ body.outboard.T).reshape(-1, 3 if d == 2 else 6)
+            every = (q[:, part] @ body.outboard.T).reshape(-1, b)
             own = every[:, d:] if turned else every[:, :d]
             yield float(np.linalg.norm(own, axis=1).max(initial=0.0))
 
@@ -472,11 +477,6 @@ class ElasticBodies:
         """Return q_e' K_ee q_e of every body (n, bodies), N m; eq. (7) of the paper; q (n, N)."""
         pairs = zip(self.bodies, (q[:, part] for part in self.slices), strict=True)
         return np.stack([np.einsum("nk,nk->n", e @ body.K, e) for body, e in pairs], axis=1)
-
-    @property
-    def rigid(self) -> Self:
-        """The same of bodies of the same mass and inertia that do not deform."""
-        return replace(self, bodies=tuple(body.rigid_part for body in self.bodies))
 
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
@@ -486,113 +486,65 @@ class ElasticBodies:
         return K
 
 
-@dataclass(frozen=True, eq=False)
-class Mechanism(ElasticBodies):
-    """A cart on a horizontal rail that carries a chain of arms and a payload.
+# -- a cart that carries a chain of flexible arms and a payload
 
-    Payload, gravity and scales may differ from instant to instant: several mechanisms in one.
+
+@dataclass(frozen=True)
+class JointHardware:
+    """What sits at one arm's ends besides the arm itself.
 
     Attributes:
+        mass, inertia: at the outboard interface, kg, kg m2.
+        rotor: inertia of the rotor that drives the inboard joint, times its gear ratio squared,
+            kg m2.
+    """
+
+    mass: float = 0.0
+    inertia: float = 0.0
+    rotor: float = 0.0
+
+
+def plane_chain(
+    bodies: Sequence[ShapeIntegrals],
+    payload_mass: PerInstant,
+    payload_inertia: PerInstant,
+    gravity: tuple[PerInstant, PerInstant],
+    joint_height: float,
+    *,
+    hardware: Sequence[JointHardware] = (),
+    cart_mass: float = 0.0,
+) -> Mechanism:
+    """Return a cart on a horizontal rail that carries a chain of arms and a payload.
+
+    Args:
         bodies: from the cart outwards.
         payload_mass: point mass at the last outboard interface, kg.
         payload_inertia: its rotary inertia, kg m2.
         gravity: (g_x, g_y), m/s2.
         joint_height: y of the first joint, m.
-        scales: of every body's elastic rows, forces and moments, or none.
-        joints: what sits at every arm's ends, or none.
+        hardware: what sits at every arm's ends, or none.
         cart_mass: kg.
     """
-
-    payload_mass: PerInstant
-    payload_inertia: PerInstant
-    gravity: tuple[PerInstant, PerInstant]
-    joint_height: float
-    scales: tuple[Scale, ...] = ()
-    joints: tuple[JointHardware, ...] = ()
-    cart_mass: float = 0.0
-
-    @property
-    def num_rigid(self) -> int:
-        """Number of rigid coordinates, of cart and joints."""
-        return 1 + len(self.bodies)
-
-    def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
-        """Return it at some of the instants."""
-        if not self.scales and not isinstance(self.payload_mass, np.ndarray):
-            return self
-        mass, inertia = (at(x, part) for x in (self.payload_mass, self.payload_inertia))
-        return replace(
-            self,
-            payload_mass=mass,
-            payload_inertia=inertia,
-            gravity=(at(self.gravity[0], part), at(self.gravity[1], part)),
-            scales=tuple(scale[part] for scale in self.scales),
-        )
-
-    @property
-    def way(self) -> tuple[Site, ...]:
-        """All arms."""
-        return tuple((k, 0) for k in range(len(self.bodies)))
-
-    def base(self, q_r: np.ndarray) -> np.ndarray:
-        """Return where the first joint is (2, n), m."""
-        return np.stack([q_r[:, 0], np.full(len(q_r), self.joint_height)])
-
-    @property
-    def softness(self) -> float:
-        """Largest static deflection of an arm's end by a unit force across it, m/N."""
-        # Or a third of the arm's length squared times the end's rotation by a unit moment, which
-        # is the same of a cantilever, and not zero of an arm whose frame is its chord.
-        found = [0.0]
-        for body in self.bodies:
-            if body.num_modes:
-                soft = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
-                square = float(body.outboard_point @ body.outboard_point)
-                found += [float(soft[1, 1]), float(soft[2, 2]) * square / 3.0]
-        return max(found)
-
-    @property
-    def levers(self) -> np.ndarray:
-        """Deflection of the end by unit rigid coordinates (1 + arms,), m."""
-        reach = sum(float(np.hypot(*body.outboard_point)) for body in self.bodies)
-        return np.array([1.0, *[reach] * len(self.bodies)])
-
-    @cached_property
-    def tree(self) -> Tree:  # type: ignore[override]
-        """Itself as inverse dynamics goes along it."""
-        joints = self.joints or (BARE,) * len(self.bodies)
-        carried = {(k, 0): self.carried(k) for k in range(len(self.bodies))}
-        gravity = np.stack(np.broadcast_arrays(*map(np.atleast_1d, self.gravity)))
-        return Tree(
-            constants=tuple(map(Constants, self.bodies)),
-            slices=self.slices,
-            joints=tuple(
-                Joint(
-                    name=f"joint {k}",
-                    kind="revolute",
-                    parent=k - 1,
-                    coordinate=1 + k,
-                    axis=np.ones(1),
-                    origin=np.zeros(2),
-                    rotation=np.eye(2),
-                    rotor=one.rotor,
-                )
-                for k, one in enumerate(joints)
-            ),
-            loads={k: Constants.of_point(*one) for k, one in carried.items() if one is not None},
-            gravity=gravity,
-            cart=self.cart_mass,
-            scales=self.scales,
-        )
-
-    def carried(self, k: int) -> tuple[PerInstant, PerInstant] | None:
-        """Return mass and inertia at the outboard interface of body k, kg, kg m2; None for none."""
-        joint = self.joints[k] if self.joints else BARE
-        if k < len(self.bodies) - 1:
-            return (joint.mass, joint.inertia) if joint.mass or joint.inertia else None
-        return self.payload_mass + joint.mass, self.payload_inertia + joint.inertia
-
-    @property
-    def rotors(self) -> np.ndarray:
-        """Mass of the cart and reflected inertia of the joints' rotors (1 + arms,), kg, kg m2."""
-        return self.tree.rotors
+    hardware, last = hardware or (JointHardware(),) * len(bodies), len(bodies) - 1
+    loads = {
+        (k, 0): Constants.of_point(one.mass, one.inertia)
+        for k, one in enumerate(hardware[:last])
+        if one.mass or one.inertia
+    }
+    if bodies:
+        own = hardware[last]
+        mass, inertia = payload_mass + own.mass, payload_inertia + own.inertia
+        loads[last, 0] = Constants.of_point(mass, inertia)
+    joints = [
+        Joint(f"joint {k}", "revolute", k - 1, 1 + k, np.ones(1), np.zeros(2), np.eye(2), one.rotor)
+        for k, one in enumerate(hardware)
+    ]
+    return Mechanism(
+        bodies=tuple(bodies),
+        joints=tuple(joints),
+        loads=loads,
+        gravity=np.stack(np.broadcast_arrays(*map(np.atleast_1d, gravity))),
+        end=(last, 0),
+        origin=np.array([0.0, joint_height]),
+        cart=cart_mass,
+    )

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from dolfinopt.multibody.inverse_dynamics import (
     outward_pass,
 )
 from dolfinopt.multibody.kinematics import Interface
-from dolfinopt.multibody.mechanism import GROUND, Site, Tree
+from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
@@ -140,19 +139,12 @@ def _columns(part: slice, size: int) -> tuple[slice, slice, slice]:
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where the coordinates asked for stand among the S columns.
+    """Where the coordinates asked for stand among the S columns."""
 
-    Attributes:
-        size: S.
-        rigid: (R,) joint coordinates asked for, ascending.
-        kept: of every body, those of its coordinates that have a column.
-        bodies: of every body, their place among the S.
-    """
-
-    size: int
-    rigid: np.ndarray
-    kept: list[np.ndarray]
-    bodies: list[slice]
+    size: int  # S
+    rigid: np.ndarray  # (R,) joint coordinates asked for, ascending
+    kept: list[np.ndarray]  # of every body, those of its coordinates that have a column
+    bodies: list[slice]  # of every body, their place among the S
 
     def of_body(self, i: int) -> tuple[slice, slice, slice]:
         """Return a body's columns in [q, qd, qdd]."""
@@ -166,7 +158,7 @@ class _Places:
         return int(place[0]), self.size + int(place[0]), 2 * self.size + int(place[0])
 
 
-def _places(tree: Tree, keep: np.ndarray | None, rigid: np.ndarray | None) -> _Places:
+def _places(tree: Mechanism, keep: np.ndarray | None, rigid: np.ndarray | None) -> _Places:
     rigid = np.zeros(0, dtype=int) if rigid is None else rigid
     keep = np.arange(tree.num_coordinates) if keep is None else keep
     ends = np.searchsorted(keep, [0, *(part.stop for part in tree.slices)])
@@ -177,7 +169,7 @@ def _places(tree: Tree, keep: np.ndarray | None, rigid: np.ndarray | None) -> _P
 
 
 def linearise(
-    mechanism: Any,
+    mechanism: Mechanism,
     motion: RigidMotion,
     q: np.ndarray,
     qd: np.ndarray,
@@ -193,7 +185,7 @@ def linearise(
         rigid: ascending joint coordinates (R,) that have columns and whose forces have rows; none
             by default.
     """
-    tree: Tree = mechanism.tree
+    tree: Mechanism = mechanism
     links = outward_pass(tree, motion, (q, qd, qdd))
     places = _places(tree, keep, rigid)
     loads = inward_pass(tree, links, driven=len(places.rigid) > 0)
@@ -206,7 +198,7 @@ _Ends = dict[Site, np.ndarray]
 
 
 def _outward_derivatives(
-    tree: Tree, links: list[Link], places: _Places
+    tree: Mechanism, links: list[Link], places: _Places
 ) -> tuple[_Derivatives, _Ends]:
     """Return the derivatives of the motion of every body and interface (d + 2 r, 3 S, n)."""
     dim, count = links[0].body.dim, links[0].body.a.shape[1]
@@ -239,7 +231,7 @@ def _outward_derivatives(
 
 
 def _inward_derivatives(
-    tree: Tree,
+    tree: Mechanism,
     links: list[Link],
     loads: Loads,
     places: _Places,
@@ -293,7 +285,7 @@ def _inward_derivatives(
 
 
 def _on_interface(
-    tree: Tree,
+    tree: Mechanism,
     links: list[Link],
     loads: Loads,
     places: _Places,
@@ -328,7 +320,7 @@ def _passed_on(link: Link, load: Load, places: _Places, moved: np.ndarray) -> np
 
 
 def _body_tangent(
-    tree: Tree,
+    tree: Mechanism,
     link: Link,
     loads: Loads,
     places: _Places,
@@ -376,7 +368,7 @@ def _by_instant(x: np.ndarray) -> np.ndarray:
 
 
 def body_gradient(
-    mechanism: Any,
+    mechanism: Mechanism,
     motion: RigidMotion,
     q: np.ndarray,
     qd: np.ndarray,
@@ -396,7 +388,7 @@ def body_gradient(
     """
     if of_forces is None:
         of_forces = np.zeros_like(motion.q)
-    tree: Tree = mechanism.tree
+    tree: Mechanism = mechanism
     links = outward_pass(tree, motion, (q, qd, qdd))
     loads = inward_pass(tree, links)
     zeta = np.ascontiguousarray(multipliers.T)
@@ -442,12 +434,9 @@ def _sum_motions(parts: list[Motion]) -> Motion:
 
 
 def _virtual_motion(
-    tree: Tree, links: list[Link], zeta: np.ndarray, of_forces: np.ndarray
+    tree: Mechanism, links: list[Link], zeta: np.ndarray, of_forces: np.ndarray
 ) -> tuple[dict[int, Load], dict[Site, Load]]:
-    """Return displacement and rotation of every frame, and of every outboard interface.
-
-    In the components of the frame, and of the interface: what multiplies their loads.
-    """
+    """Return displacement and rotation of every frame and outboard interface, in its components."""
     moves: dict[int, Load] = {}
     ends: dict[Site, Load] = {}
     ground = tree.virtual_ground(of_forces)
@@ -469,15 +458,9 @@ def _interface_weights(
     zeta: np.ndarray,
     displaced: Motion,
 ) -> Weights:
-    """Return the derivatives (b, n) by (u, theta), their rates and variation.
-
-    Args:
-        interface: of a flexible body.
-        load: on it.
-        virtual: of the body's frame.
-        zeta: (q, n) the body's multipliers.
-        displaced: derivatives by (u, theta) and their rates through the interface's motion.
-    """
+    """Return the derivatives (b, n) by (u, theta), their rates and variation."""
+    # Of a load on a flexible body's interface, `virtual` of its frame, zeta (q, n) its multipliers;
+    # `displaced` are those by (u, theta) and their rates through the interface's motion.
     (force, moment), dim, turning = load, interface.dim, interface.turning
     p, phi = interface.virtual(virtual, zeta)
     # The load's lever, its components, and J' of the row.

@@ -26,7 +26,7 @@ from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.motion import MotionResponse
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import EXACT_ONLY
+from dolfinopt.scene.tables.objective import FORCES
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -106,7 +106,7 @@ def taylor_test(
             frozen = _by_x(partition, designed, cells, x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    share = FORCE_ROUNDING if scene.objective.kind in EXACT_ONLY else OBJECTIVE_ROUNDING
+    share = FORCE_ROUNDING if scene.objective.kind in FORCES else OBJECTIVE_ROUNDING
     value = _fixed_objective(exact, partition, arms, patterns, profile, base)
     here = value(x)
     rounding = share * abs(here)

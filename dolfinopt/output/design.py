@@ -211,16 +211,13 @@ def _fit(
     filtered = arrays.get(f"{name}/filtered")
     if filtered is None:
         return density[place], None
-    if filtered.shape != density.shape or not _are_finite(filtered):
+    finite = filtered.dtype.kind in "fiu" and bool(np.isfinite(filtered).all())
+    if filtered.shape != density.shape or not finite:
         raise InputError(
             f"{path}: '{name}/filtered' has shape {filtered.shape}: expected {len(density)} finite "
             "numbers, one a cell"
         )
     return density[place], filtered.astype(float)[place]
-
-
-def _are_finite(values: np.ndarray) -> bool:
-    return values.dtype.kind in "fiu" and bool(np.isfinite(values).all())
 
 
 def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.ndarray:
@@ -273,23 +270,15 @@ def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """All designed arms as one grid, one below the other, in m.
+    """All designed arms as one grid, one below the other, in m."""
 
-    Attributes:
-        points: (n_points, 3).
-        cells: (n_cells, corners) points around each cell, an array an arm.
-        dimension: of the cells, 2 or 3.
-        density: (all cells,).
-        arm: (all cells,) number of the arm, from 0 in the scene's order.
-        stress: (all cells,) largest von Mises stress along the motion, Pa, or None.
-    """
-
-    points: np.ndarray
-    cells: list[np.ndarray]
-    density: np.ndarray
-    arm: np.ndarray
+    points: np.ndarray  # (n_points, 3)
+    cells: list[np.ndarray]  # (n_cells, corners) points around each cell, an array an arm
+    density: np.ndarray  # (all cells,)
+    arm: np.ndarray  # (all cells,) number of the arm, from 0 in the scene's order
+    # (all cells,) largest von Mises stress along the motion, Pa, or None
     stress: np.ndarray | None = None
-    dimension: int = 2
+    dimension: int = 2  # of the cells, 2 or 3
 
     @property
     def fields(self) -> dict[str, np.ndarray]:

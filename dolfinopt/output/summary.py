@@ -102,27 +102,20 @@ def summarise(
 
 @dataclass(frozen=True)
 class _Traits:
-    """What is known of one design beside its motion.
+    """What is known of one design beside its motion."""
 
-    Attributes:
-        volume_fraction, grayness: of the physical densities.
-        cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3.
-        notes: of the mesh.
-        contacts: how the design cut at one half hangs together.
-        widths: of member and gap of the design cut at one half.
-        frequency: first one of the arm by itself, Hz; None where it is not reduced.
-        error: by how much that of the reduced model exceeds it, relative.
-    """
-
+    # volume_fraction, grayness: of the physical densities
     volume_fraction: float
     grayness: float
+    # cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3
     cell_size: float
     volume: float
-    notes: tuple[str, ...]
-    contacts: Contacts
-    widths: Widths = (None, None)
+    notes: tuple[str, ...]  # of the mesh
+    contacts: Contacts  # how the design cut at one half hangs together
+    widths: Widths = (None, None)  # of member and gap of the design cut at one half
+    # first one of the arm by itself, Hz; None where it is not reduced
     frequency: float | None = None
-    error: float | None = None
+    error: float | None = None  # by how much that of the reduced model exceeds it, relative
 
 
 def _gather_traits(run: Simulated) -> dict[int, _Traits]:
@@ -179,24 +172,16 @@ def _size(width: Width | None) -> float | None:
 
 @dataclass(frozen=True)
 class _Narrow:
-    """A width that an optimised design misses.
+    """A width that an optimised design misses."""
 
-    Attributes:
-        arm: its name.
-        what: "member" or "gap".
-        width, asked: m.
-        place: (d,) where it is, m.
-        to: accuracy of the width, m.
-        fixed: whether no design changes what is there.
-    """
-
-    arm: str
-    what: str
+    arm: str  # its name
+    what: str  # "member" or "gap"
+    # width, asked: m
     width: float
     asked: float
-    place: tuple[float, ...]
-    to: float
-    fixed: bool
+    place: tuple[float, ...]  # (d,) where it is, m
+    to: float  # accuracy of the width, m
+    fixed: bool  # whether no design changes what is there
 
     @property
     def sentence(self) -> str:
@@ -440,10 +425,7 @@ def _thinnest(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: 
 
 
 def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
-    """Return the lower faces (n_cells, 4, 2) of a box's cells, m; nan but of the lowest layer.
-
-    Collective on the arm.
-    """
+    """Return a box's cells' lower faces (n, 4, 2), m; nan above the lowest layer (collective)."""
     low = comm.allreduce(points[:, :, 2].min(initial=np.inf), op=MPI.MIN)
     high = comm.allreduce(points[:, :, 2].max(initial=-np.inf), op=MPI.MAX)
     at = points[:, :4, 2].max(axis=1, initial=-np.inf) <= low + 1e-9 * (high - low)

@@ -136,7 +136,7 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
         names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
         units |= {f"closure_force_{name}": "N" for name in names}
         units |= {"slider_position": "m"} if scene.closure.kind == "slider" else {}
-    ends = [f"_{axis}" for axis in "xyz"] if scene.is_spatial else [""]
+    ends = [""] if trajectory.mechanism.dim.r == 1 else [f"_{axis}" for axis in axes]
     return units | {f"rotation{end}": "rad" for end in ends}
 
 

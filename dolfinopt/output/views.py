@@ -123,7 +123,7 @@ def _views(
     for index, owner in enumerate(scene.owners):
         name = scene.arms[index].name
         if owner is None:
-            views.append(_fixed_view(scene, index))
+            views.append(FIXED_VIEWS[scene.dimension](scene.arms[index], fixed_body(scene, index)))
             continue
         order = canonical_order(centroids[owner])
         around = AROUND[corners[owner].shape[1:]]
@@ -163,11 +163,6 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
         if pattern.symmetric:
             found.append((region.kind, points * scale * [1.0, -1.0]))
     return tuple(found)
-
-
-def _fixed_view(scene: Scene, index: int) -> ArmView:
-    """Return an arm without a design: a bar, in space a box from inboard to outboard."""
-    return FIXED_VIEWS[scene.dimension](scene.arms[index], fixed_body(scene, index))
 
 
 def _box_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:

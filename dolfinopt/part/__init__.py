@@ -1,6 +1,6 @@
 """From density to part: the outline or surface of every arm, what it does, files for the workshop.
 
 plane, solid: parts of plates and of solid arms, from their design to their mesh and its stress.
-check: the machine with the parts beside the one with the densities. buckling: of plane parts.
+check: the machine with the parts beside the one with the densities.
 optimize: the scene's objective within its limits, by the parts' free curves. files: all formats.
 """

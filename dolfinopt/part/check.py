@@ -23,11 +23,11 @@ from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.output.views import ArmView, gather_views
-from dolfinopt.part.buckling import Buckling, lowest_buckling
 from dolfinopt.part.files.scene_file import scene_data, toml_text
 from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
+from dolfinopt.responses.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report
@@ -71,7 +71,7 @@ class Column:
     stressed: str
     limits: tuple[Limit, ...]
     trajectory: Trajectory
-    buckling: Buckling | None = None
+    buckling: LeastBuckling | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ def part_column(
 
 
 def column_of(
-    one: Simulated, peak: Peak | None, arm: str, buckling: Buckling | None = None
+    one: Simulated, peak: Peak | None, arm: str, buckling: LeastBuckling | None = None
 ) -> Column:
     """Return the figures of a machine whose largest stress is known, with the arm that has it."""
     limits = [

@@ -265,7 +265,7 @@ class PlaneStage:
         self.axes.set_title(note, loc="right", fontsize=11)
         self.ghost = self.axes.plot([], [], color=GREY, lw=1.0, marker="o", ms=2.5)[0]
         self.trace = self.axes.plot([], [], color=ORANGE, lw=1.5, visible=not slides)[0]
-        mass = float(motion.mechanism.payload_mass)
+        mass = float(motion.mechanism.loads[motion.mechanism.end].mass)
         carries = mass > 0.0 and motion.closure is None
         sizes = (7.0, 11.0 if carries else 6.0)
         self.cast = Cast(self.axes, motion, opaque=True, sizes=sizes)

@@ -68,7 +68,7 @@ def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.nd
         place (n, arms + 1), m: the origins of the frames, then the end-effector; and swing
         (n, arms) = exp(i angle from +x) of the frames.
     """
-    place = [q_r[:, 0] + 1j * mechanism.joint_height]
+    place = [q_r[:, 0] + 1j * mechanism.origin[1]]
     swing = []
     turn = np.ones(len(q_r), dtype=complex)  # of the outboard tangent of the arm before
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies)):

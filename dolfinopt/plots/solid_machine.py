@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
+from dolfinopt.multibody.mechanism import GROUND, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.multibody.spatial.end_effector import Frames, body_frames
-from dolfinopt.multibody.spatial.mechanism import GROUND, SpatialMechanism
 from dolfinopt.output.views import ArmView
 from dolfinopt.part.solid.surface import Surface
 from dolfinopt.plots.animation import FRAMES, frame_numbers, round_magnification
@@ -60,20 +60,20 @@ class Assembly:
         size: of the machine, m.
     """
 
-    mechanism: SpatialMechanism
+    mechanism: Mechanism
     surfaces: tuple[Surface | None, ...]
     size: float
 
     @property
     def carries(self) -> bool:
         """Whether there is a load at the end-effector."""
-        load = self.mechanism.tree.loads.get((self.mechanism.end, self.mechanism.end_interface))
+        load = self.mechanism.loads.get(self.mechanism.end)
         return load is not None and load.body.mass > 0.0
 
     @property
     def up(self) -> np.ndarray:
         """The axis of the world (3,) that gravity points against most; z without gravity."""
-        gravity = self.mechanism.gravity
+        gravity = self.mechanism.gravity[:, 0]
         k = int(np.argmax(np.abs(gravity))) if gravity.any() else 2
         return (-np.sign(gravity[k]) or 1.0) * np.eye(3)[k]
 
@@ -84,9 +84,7 @@ class Assembly:
         return first - height * self.up
 
 
-def assemble(
-    views: Sequence[ArmView], mechanism: SpatialMechanism, *, modes: bool = False
-) -> Assembly:
+def assemble(views: Sequence[ArmView], mechanism: Mechanism, *, modes: bool = False) -> Assembly:
     """Return the machine with its links' material; `modes` as for `material`."""
     size = sum(
         float(np.linalg.norm(body.points, axis=1).max() + np.linalg.norm(joint.origin))
@@ -98,7 +96,7 @@ def assemble(
 
 def solid_machine_figure(
     views: Sequence[ArmView],
-    mechanism: SpatialMechanism,
+    mechanism: Mechanism,
     t: np.ndarray,
     q_r: np.ndarray,
     title: str,
@@ -291,7 +289,7 @@ def make_solid_film(
     frames: int = FRAMES,
 ) -> SolidFilm:
     """Choose frames evenly from the instants and magnify the deformation; see `draw_motion`."""
-    given = cast(SpatialMechanism, trajectory.mechanism)
+    given = cast(Mechanism, trajectory.mechanism)
     # Interfaces move linearly with the coordinates, as surfaces do.
     mechanism = replace(given, bodies=tuple(map(linear_part, given.bodies)))
     machine = assemble(views, mechanism, modes=True)

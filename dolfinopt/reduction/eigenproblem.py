@@ -351,6 +351,91 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
     return pairs
 
 
+def largest_eigenpairs(
+    pencil: Pencil,
+    product: Columns,
+    count: int,
+    tolerance: float,
+    start: np.ndarray | None = None,
+) -> Pairs:
+    """Return the `count` largest eigenvalues of A phi = mu K phi and their vectors.
+
+    By SLEPc's Krylov-Schur on K^-1 A.
+
+    Args:
+        pencil: K.
+        product: A times a vector, symmetric, of any sign.
+        count: number of eigenpairs.
+        tolerance: absolute, of the eigenvalues' residuals.
+        start: (rows, k) vectors nearby, or None.
+
+    Returns:
+        Eigenvalues (count,) descending, and K-orthonormal vectors (owned rows, count).
+
+    Raises:
+        ConvergenceError: SLEPc found fewer.
+    """
+    arm = pencil.arm
+    with arm.profile.phase("eigenproblem"), closing(_Largest(pencil, product)) as problem:
+        for space, restarts in _searches(count, warm=False):
+            pairs = problem.search(count, space, restarts, tolerance, start)
+            if len(pairs[0]) == count:
+                break
+    arm.profile.counts.eigenproblems += 1
+    if len(pairs[0]) < count:
+        raise ConvergenceError(
+            f"arm {arm.mesh.name!r}: only {len(pairs[0])} of {count} buckling modes converged; "
+            "raise interpolation.floor or leave constraints.buckling out"
+        )
+    return pairs
+
+
+class _Largest:
+    """A phi = mu K phi in SLEPc; see `largest_eigenpairs`."""
+
+    def __init__(self, pencil: Pencil, product: Columns):
+        self.pencil = pencil
+        self.stiffness = _matrix(pencil, pencil.stiffness)
+        self.matrix = _matrix(pencil, product)
+
+    def close(self) -> None:
+        """Destroy the matrices, see `_Eigenproblem.close`."""
+        self.stiffness.destroy()
+        self.matrix.destroy()
+
+    def search(
+        self, count: int, space: int, restarts: int, tolerance: float, start: np.ndarray | None
+    ) -> Pairs:
+        """Return what a subspace of `space` vectors finds: up to `count` values and vectors."""
+        eps = SLEPc.EPS().create(self.pencil.arm.comm)
+        eps.setOperators(self.matrix, self.stiffness)
+        eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+        eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
+        size = self.stiffness.getSize()[0]
+        eps.setDimensions(min(count, size), min(size, space))
+        eps.setConvergenceTest(SLEPc.EPS.Conv.ABS)
+        eps.setTolerances(tolerance, restarts)
+        transform = eps.getST()
+        transform.setType(SLEPc.ST.Type.SHIFT)
+        ksp = _as_ksp(self.stiffness, self.pencil.inverse)
+        transform.setKSP(ksp)
+        vector = self.stiffness.createVecLeft()
+        rows = vector.getLocalSize()
+        guess = _ramp(self.pencil, rows) if start is None else _initial(self.pencil, start)
+        first = _filled(vector, guess)
+        eps.setInitialSpace([first])
+        eps.solve()
+        found = min(eps.getConverged(), count)
+        values, vectors = np.empty(found), np.empty((vector.getLocalSize(), found))
+        for k in range(found):
+            values[k] = eps.getEigenpair(k, vector).real
+            vectors[:, k] = vector.array
+        order = np.argsort(-values, kind="stable")
+        for one in (eps, transform, ksp, vector, first):
+            one.destroy()
+        return values[order], vectors[:, order]
+
+
 def _is_dense(pairs: Pairs, count: int) -> bool:
     """Return whether a search may have passed over modes: some are missing, or nearly equal."""
     values = pairs[0]

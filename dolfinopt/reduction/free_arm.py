@@ -118,7 +118,8 @@ class FreeOperators:
         assert outboard is not None
         return rows[: self.arm.num_interior], outboard
 
-    def _joined(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+    def joined(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+        """Return the vector of interior rows and outboard coordinates."""
         return np.concatenate([interior, outboard]) if self.last else interior
 
     def solve(self, right: np.ndarray) -> np.ndarray:
@@ -132,7 +133,7 @@ class FreeOperators:
         interior, outboard = self.split(right)
         lift = self.arm.comm.allreduce(self.free.psi.T @ interior)
         tip = self.free.schur_inverse @ (outboard + lift)
-        return self._joined(inverse(interior) + self.free.psi @ tip, tip)
+        return self.joined(inverse(interior) + self.free.psi @ tip, tip)
 
     def stiffness_times(self, rows: np.ndarray) -> np.ndarray:
         """Return T'KT times a vector."""
@@ -150,4 +151,4 @@ class FreeOperators:
         """Return [A_II, A_Ib; A_Ib', A_bb] times a vector, given A_II times its interior."""
         interior, outboard = self.split(rows)
         lower = self.arm.comm.allreduce(coupling.T @ interior)
-        return self._joined(inner + coupling @ outboard, lower + corner @ outboard)
+        return self.joined(inner + coupling @ outboard, lower + corner @ outboard)

@@ -106,22 +106,15 @@ def _inputs(free: FreeArm) -> Rows:
 
 @dataclass(frozen=True, eq=False)
 class _Reduced:
-    """K^-1 M in a Krylov space, diagonal: scalar resonances.
+    """K^-1 M in a Krylov space, diagonal: scalar resonances."""
 
-    Attributes:
-        theta: (r,) eigenvalues, 1 / (natural frequency)^2, s2.
-        vectors: (r, r) eigenvectors in the space's columns.
-        inputs: (r, 6) coordinates of K^-1 B.
-        beyond: (k, r) what K^-1 M makes of the eigenvectors outside the space; lengths are
-            square roots of energy.
-        damping: beta, s.
-    """
-
-    theta: np.ndarray
-    vectors: np.ndarray
-    inputs: np.ndarray
+    theta: np.ndarray  # (r,) eigenvalues, 1 / (natural frequency)^2, s2
+    vectors: np.ndarray  # (r, r) eigenvectors in the space's columns
+    inputs: np.ndarray  # (r, 6) coordinates of K^-1 B
+    # (k, r) what K^-1 M makes of the eigenvectors outside the space; lengths are square roots of
+    # energy
     beyond: np.ndarray
-    damping: float
+    damping: float  # beta, s
 
     @classmethod
     def of(cls, space: InverseSpace, damping: float) -> _Reduced:

@@ -106,19 +106,12 @@ _Group = Callable[[FreeArm], Rows]
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Columns of K_w^-1 f and what became of them.
+    """Columns of K_w^-1 f and what became of them."""
 
-    Attributes:
-        omega: shift, rad/s.
-        group: the inputs f, or None for f = M V.
-        columns: (k,) which of the inputs, or of V.
-        expansion: of K_w^-1 f in V, its new columns included.
-    """
-
-    omega: float
-    group: _Group | None
-    columns: np.ndarray
-    expansion: Expansion
+    omega: float  # shift, rad/s
+    group: _Group | None  # the inputs f, or None for f = M V
+    columns: np.ndarray  # (k,) which of the inputs, or of V
+    expansion: Expansion  # of K_w^-1 f in V, its new columns included
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ import numpy as np
 from dolfinopt.arms.arm import fixed_body
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
+from dolfinopt.multibody.machine import family_of
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.products import Products
@@ -162,7 +163,6 @@ def _chain(analysis: Analysis) -> Chain:
 def _tree(analysis: Analysis) -> FrozenTree:
     """Freeze the machine in space in the pose at the middle of its motion (collective)."""
     from dolfinopt.multibody.spatial.frozen import FrozenTree, rigid_integrals_in_space
-    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, joint_motion
 
     scene, partition = analysis.scene, analysis.partition
     with together(partition.world):
@@ -174,8 +174,8 @@ def _tree(analysis: Analysis) -> FrozenTree:
             fixed_body(scene, place) if owner is None else owned[owner]
             for place, owner in enumerate(scene.owners)
         ]
-        motion = joint_motion(np.array([0.5 * scene.motion.duration]), scene)
-        return FrozenTree(build_spatial_mechanism(scene, bodies), motion, scene.objective.attached)
+        motion = family_of(scene).motion(np.array([0.5 * scene.motion.duration]), scene)
+        return FrozenTree(family_of(scene).build(scene, bodies), motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)
 

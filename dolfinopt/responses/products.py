@@ -20,6 +20,7 @@ import numpy as np
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.fem.geometric_stiffness import GeometricGradient
+    from dolfinopt.fem.prestress import PrestressGradient
 
 Pair = tuple[np.ndarray, np.ndarray]  # l and r, each (n_nodes, d, k)
 
@@ -54,6 +55,7 @@ class Products:
         densities: (n_cells,) by the physical densities otherwise than by K and M; None: 0.
         volumes: (n_cells,) by the cells' areas, in space volumes, likewise; None: 0.
         stress: of stress, whose operator depends on the cells' shape.
+        prestress: of K0 of the full mesh, whose pairs of fields are among `stiffness` and `mass`.
     """
 
     stiffness: tuple[Pair, ...] = ()
@@ -64,6 +66,7 @@ class Products:
     densities: np.ndarray | None = None
     volumes: np.ndarray | None = None
     stress: StressProduct | None = None
+    prestress: PrestressGradient | None = None
 
 
 # From products to a gradient by variables of the design: by its cells, or by its nodes.
@@ -81,5 +84,7 @@ def by_densities(state: DesignState, products: Products) -> np.ndarray:
         energies += elastic.cell_stiffness_products(left, right)
     for left, right in products.mass:
         masses += elastic.cell_mass_products(left, right)
+    if products.prestress is not None:
+        energies += products.prestress.direct
     found = state.young_slope * energies + state.density_slope * masses
     return found if products.densities is None else found + products.densities

@@ -19,7 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -129,11 +129,12 @@ class Response(ABC):
         """Return the unit of the true value of that name, and of its limit."""
         return cls.limit_unit or cls.unit
 
-    def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
+    def restricted(self, limits: Sequence[Any]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of those values that have a limit, and these limits.
 
         Args:
-            limits: of every value, None where it has none.
+            limits: of every value, None where it has none; or what the scene states in place of
+                one number.
         """
         return self, tuple(one for one in limits if one is not None)
 
@@ -200,7 +201,7 @@ FILES = {
     ),
     **dict.fromkeys(("effort", "peak_force"), "drives"),
     **dict.fromkeys(("eigenfrequency", "first_frequency"), "frequency"),
-    "tip_deflection": "static",
+    **dict.fromkeys(("stiffness", "tip_deflection"), "static"),
     "volume_fraction": "mass",
 }
 

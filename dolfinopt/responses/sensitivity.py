@@ -74,18 +74,38 @@ def exact_gradient(
         by_columns: (n_nodes, d, columns) its derivatives by `LoadFields.columns`, where it
             depends on these, too; contributions of this rank's cells.
         by: what it is the derivative by.
-        beside: what the function depends on beside body and columns: neither K, M nor places.
+        beside: what the function depends on beside body and columns, these held.
 
     Returns:
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
         found = _body_products(state, cotangents, by_columns)
-        if beside is not None:
-            found = replace(
-                found, densities=beside.densities, volumes=beside.volumes, stress=beside.stress
-            )
-        return by(state, found)
+        return by(state, found if beside is None else _with(found, beside))
+
+
+def _with(body: Products, beside: Products) -> Products:
+    """Return the products of a function of a body and of what else it depends on."""
+    assert beside.geometric is None
+    if beside.places is None and beside.interfaces is None:
+        places, interfaces = body.places, body.interfaces
+    else:
+        assert body.places is not None and beside.places is not None
+        places, interfaces = body.places + beside.places, partial(_both, body, beside)
+    return replace(
+        beside,
+        stiffness=(*body.stiffness, *beside.stiffness),
+        mass=(*body.mass, *beside.mass),
+        geometric=body.geometric,
+        places=places,
+        interfaces=interfaces,
+    )
+
+
+def _both(body: Products, beside: Products) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `Products.interfaces` does of both (collective)."""
+    assert body.interfaces is not None and beside.interfaces is not None
+    return tuple(a + b for a, b in zip(body.interfaces(), beside.interfaces(), strict=True))
 
 
 def _body_products(
@@ -147,11 +167,9 @@ def _at_interfaces(
     geometric: GeometricGradient | None,
     inertial: ElasticFieldGradient | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `Products.interfaces` does of a function of a body (collective).
-
-    Modes and all other fields are T times what they are solved for, and so are their adjoints; what
-    either are multiplied by in the Lagrangian, T aside, is zero within T's range alone.
-    """
+    """Return what `Products.interfaces` does of a function of a body (collective)."""
+    # Modes and all other fields are T times what they are solved for, and so are their adjoints;
+    # what either are multiplied by in the Lagrangian, T aside, is zero within T's range alone.
     elastic, basis = state.elastic, state.basis
     T, V = elastic.substructure.T, basis.V
     by_V = by_V - elastic.stiffness_times(fields.stiffness) + elastic.mass_times(fields.mass)
@@ -219,18 +237,27 @@ def static_gradient(
 
     Or the derivative by other variables of the design, see `Products`.
     """
-    return _static_gradient(state, response.loads, response.loads, by)
+    return tip_gradient(state, response.loads, response.loads, by)
 
 
 def deflection_gradient(
     state: DesignState, response: StaticResponse, exponent: float, by: By = by_densities
 ) -> np.ndarray:
     """Return d deflection / dx_phys (n_cells,), by one adjoint load a case; or by others."""
-    return _static_gradient(state, response.deflection_gradient(exponent), response.loads, by)
+    return tip_gradient(state, response.deflection_gradient(exponent), response.loads, by)
 
 
-def _static_gradient(state: DesignState, left: np.ndarray, right: np.ndarray, by: By) -> np.ndarray:
-    """Differentiate -sum_k u(left_k)' K u(right_k), fields held, of outboard loads (b, k)."""
+def tip_gradient(state: DesignState, left: np.ndarray, right: np.ndarray, by: By) -> np.ndarray:
+    """Differentiate a function of the displacements under outboard loads by the design of one arm.
+
+    dJ = sum_k left_k . dtip_k = -sum_k u(left_k)' dK u(right_k), by one adjoint load a case.
+
+    Args:
+        state: of the arm.
+        left: (b, k) derivatives by the displacements and rotations of its interfaces.
+        right: (b, k) the loads, N, N m.
+        by: what it is the derivative by.
+    """
     fields = state.elastic.static_fields(np.hstack([right, left]))
     with state.elastic.profile.phase("gradient"):
         of_left, of_right = (combine(fields.field, fields.amplitudes(f)) for f in (-left, right))

@@ -347,7 +347,14 @@ class Stress(Response):
                 return [
                     {k: _esl_gradient(one, found.cells[k], analysis.by) for k, one in parts.items()}
                 ]
-        by_body = _by_bodies(analysis, parts)
+        mine = {
+            k: [
+                (one.loads.motion, one.loads.place, one.instants, by)
+                for one, by in zip(part.chosen, part.by_loads, strict=True)
+            ]
+            for k, part in parts.items()
+        }
+        by_body = bodies_by_loads(analysis, mine)
         with together(analysis.partition.world):
             row = {}
             for k, one in parts.items():
@@ -534,16 +541,21 @@ def _gradient_of_arm(
     return _ArmGradient(by_loads, chosen, by_A, by_logs, by_weights)
 
 
-def _by_bodies(analysis: Analysis, parts: Mapping[int, _ArmGradient]) -> dict[int, ShapeIntegrals]:
-    """Return the derivatives by the bodies of all designs, on all ranks (collective)."""
+# Of one arm along one motion: number of the motion, place in the chain, instants (k,), and
+# derivatives (k, m) by `ArmLoads.coefficients` there.
+ByLoads = tuple[int, int, np.ndarray, np.ndarray]
+
+
+def bodies_by_loads(
+    analysis: Analysis, mine: Mapping[int, Sequence[ByLoads]]
+) -> dict[int, ShapeIntegrals]:
+    """Return the derivatives by the bodies of all designs, on all ranks (collective).
+
+    Args:
+        analysis: with the trajectory.
+        mine: of this rank's arms.
+    """
     partition, profile = analysis.partition, analysis.profile
-    mine = {
-        k: [
-            (one.loads.motion, one.loads.place, one.instants, by)
-            for one, by in zip(part.chosen, part.by_loads, strict=True)
-        ]
-        for k, part in parts.items()
-    }
     by_arm = gather_arms(partition, mine)
 
     def followed() -> dict[int, ShapeIntegrals]:

@@ -72,7 +72,7 @@ def blamed(source: str, changes: list[Override], locs: tuple[Loc, ...]) -> str:
     """Return the place to blame for the values at `locs`: the file, or the last --set of them."""
     where = source
     for change in changes:
-        if any(_starts(loc, changed) for loc in locs for changed in change.locs):
+        if any(loc[: len(changed)] == changed for loc in locs for changed in change.locs):
             where = f"{source} with --set {cut(change.text)}"
     return where
 
@@ -88,11 +88,6 @@ def _is_echo(
             return False
         before.append(("arms", loc[1] - 1, *loc[2:]))
     return (problem.kind, tuple(before)) in known
-
-
-def _starts(loc: Loc, above: Loc) -> bool:
-    """Tell whether `above` is `loc` or a table that holds it."""
-    return loc[: len(above)] == above
 
 
 def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:

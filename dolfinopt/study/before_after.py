@@ -21,8 +21,8 @@ from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, htm
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
+    from dolfinopt.multibody.mechanism import Mechanism
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-    from dolfinopt.multibody.spatial.mechanism import SpatialMechanism
     from dolfinopt.output.views import ArmView
 
 Summary = Mapping[str, Any]  # content of summary.json
@@ -104,7 +104,7 @@ class Side:
     scene: Scene
     summary: Summary
     views: list[ArmView]  # of all arms, in the scene's order
-    mechanism: SpatialMechanism
+    mechanism: Mechanism
     t: np.ndarray  # (n,) s
     q_r: np.ndarray  # (n, joints) rad or m
     deviation: np.ndarray  # (n,) of the tool from where rigid links carry it, m
@@ -119,10 +119,10 @@ def read_side(
     InputError where it has no summary.json or trajectory.npz, or another machine's.
     """
     from dolfinopt.arms.arm import chain_of
-    from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism
+    from dolfinopt.multibody.machine import family_of
 
     summary = _summary(folder)
-    mechanism = build_spatial_mechanism(scene, chain_of(scene, bodies))
+    mechanism = family_of(scene).build(scene, chain_of(scene, bodies))
     path = folder / "trajectory.npz"
     try:
         with np.load(path, allow_pickle=False) as data:

@@ -56,15 +56,23 @@ from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "sections"  # of the study's files, and of the folder of the members' meshes
 DESIGN, SAME = "design", "same mass"
-IN_PLANE = {"solid bar": FLAT_BAR}
-IN_SPACE = {
-    "solid bar": SOLID_BAR,
-    "rectangular tube": RECTANGULAR_TUBE,
-    "round tube": ROUND_TUBE,
-    "I section": I_SECTION,
+KINDS = {  # by the machine's dimension
+    2: {"solid bar": FLAT_BAR},
+    3: {
+        "solid bar": SOLID_BAR,
+        "rectangular tube": RECTANGULAR_TUBE,
+        "round tube": ROUND_TUBE,
+        "I section": I_SECTION,
+    },
 }
 BAR_CELLS = (4, 8)  # of a bar in place of an arm from a file: over its smaller side, at most
 LEAST, MOST = 0.01, 0.95  # shares: thinner walls are foil, thicker ones leave a slit
+VARIED = {
+    2: "In plane stress all parts are as thick as the arm, so that tubes and I sections are none; "
+    "the bar's height is what varies.",
+    3: "Tubes and the I have the outer sides of the arm's envelope, their walls are what varies (a "
+    f"share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is not judged.",
+}
 NEAREST, FARTHEST = 0.01, 0.5  # steps of the factor's logarithm to the other side of a limit
 CLOSE = 1e-6  # of the same: both sides are one
 STEPS = 20  # simulations at most on the way to a limit
@@ -210,11 +218,6 @@ def _excess(limit: Mapping[str, Any]) -> float:
     return float(-gap if limit["bound"] == "least" else gap)
 
 
-def _worst(outcome: Outcome) -> float:
-    """Return the largest of `limited`; inf of a case that failed."""
-    return max(limited(outcome).values(), default=math.inf)
-
-
 def lightest(members: Members) -> Search:
     """Search the lightest members that hold the limits; yield shares, take their outcomes.
 
@@ -241,19 +244,14 @@ def lightest(members: Members) -> Search:
 
 
 def _on_limit(members: Members, shares: Shares) -> Search:
-    """Search the least factor of all shares with which the members hold the limits.
-
-    Args:
-        members: whose.
-        shares: with a factor of 1; those that reach a bound stay there.
-    """
+    """Search the least factor of all shares with which the members hold the limits."""
     low, high = (math.log(bound / one) for bound, one in
                  ((LEAST, max(shares)), (members.most, min(shares))))  # fmt: skip
     excess: dict[float, float] = {}
     x: float | None = 0.0
     while x is not None and len(excess) < STEPS:
         [outcome] = yield [members.scaled(shares, x)]
-        excess[x] = _worst(outcome)
+        excess[x] = max(limited(outcome).values(), default=math.inf)  # of one that failed
         x = _next(excess, low, high)
     held = [at for at, value in excess.items() if value <= 0.0]
     if held:
@@ -263,12 +261,7 @@ def _on_limit(members: Members, shares: Shares) -> Search:
 
 
 def _next(excess: Mapping[float, float], low: float, high: float) -> float | None:
-    """Return where to look next for the least x that holds the limits; None: there is no more.
-
-    Args:
-        excess: ln(1 + excess) by x so far.
-        low, high: bounds of x.
-    """
+    """Return where to look next for the least x within the limits, by ln(1 + excess) so far."""
     first, most = min(excess), max(excess)
     up = min((at for at, value in excess.items() if value <= 0.0), default=None)
     if up is None:  # upwards, and from the most that there is down while that helps
@@ -314,14 +307,9 @@ def _balanced(
     outcomes: Sequence[Outcome],
     move: float,
 ) -> Shares:
-    """Return the shares of least mass by the power laws through the outcomes.
-
-    Args:
-        members: whose shares.
-        shares, stepped: of the outcomes: those to set out from, and with one arm's changed each.
-        outcomes: in this order.
-        move: largest change of a share's logarithm.
-    """
+    """Return the shares of least mass by the power laws through the outcomes."""
+    # The first is of the shares to set out from, the others of `stepped`, with one arm's changed;
+    # `move` is the largest change of a share's logarithm.
     base, *changed = map(limited, outcomes)
     names = [name for name in base if all(name in one for one in changed)]
     if not names:
@@ -413,8 +401,8 @@ def study_sections(
         InputError: the scene's arms cannot be replaced; nothing was computed.
     """
     label, design = on_root(world, _checked, scene, designs)
-    kinds = IN_SPACE if scene.is_spatial else IN_PLANE
-    every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds.items()]
+    kinds = KINDS[scene.dimension].items()
+    every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds]
     own = Case(scene, "simulate", design, DESIGN)
     done = run_cases([own], folder, world, shown=shown)
     computed = done.computed
@@ -558,22 +546,14 @@ def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
 
 def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
     """Return what one has to know to read the table."""
-    notes = ["Members are straight from joint to joint, uniform, without flanges or bosses."]
-    if scene.is_spatial:
-        notes.append(
-            "Tubes and the I have the outer sides of the arm's envelope, their walls are what "
-            f"varies (a share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is "
-            "not judged."
-        )
-    else:
-        notes.append(
-            "In plane stress all parts are as thick as the arm, so that tubes and I sections are "
-            "none; the bar's height is what varies."
-        )
+    notes = [
+        "Members are straight from joint to joint, uniform, without flanges or bosses.",
+        VARIED[scene.dimension],
+    ]
     if len({owner for owner in scene.owners if owner is not None}) > 1:
         notes.append("Every arm has its own size.")
-    kinds = IN_SPACE if scene.is_spatial else IN_PLANE
-    if missing := [kind for kind in kinds if kind not in {r.kind for r in rows if r.made == SAME}]:
+    found = {row.kind for row in rows if row.made == SAME}
+    if missing := [kind for kind in KINDS[scene.dimension] if kind not in found]:
         notes.append(f"No {' or '.join(missing)} in the envelope has the design's mass.")
     return notes
 

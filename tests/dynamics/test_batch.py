@@ -13,8 +13,9 @@ from dolfinopt.dynamics import batch, radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.body_motion import Constants, Scale
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism, Scale
+from dolfinopt.multibody.mechanism import plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.multibody.tangent import linearise
@@ -35,7 +36,7 @@ def two_arms(
     """Return two slender arms of 1 to 50 Hz; factors of mass, stiffness, and the damping, s."""
     body = beam(bending=bending, axial=300.0, damping=DAMPING).body()
     bodies = tuple(of_material(body, *factors) for _ in range(2))
-    mechanism = Mechanism(bodies, payload, inertia, gravity, 0.0)
+    mechanism = plane_chain(bodies, payload, inertia, gravity, 0.0)
 
     def motion(t: np.ndarray) -> RigidMotion:
         s, sd, sdd = (np.outer(x, size * np.array([0.2, 1.0, -0.8])) for x in quintic(t, duration))
@@ -86,14 +87,14 @@ def test_scales_are_those_of_scaled_bodies():
     payload = rng.uniform(0.5, 2.0, (4, 4))
     q, qd, qdd = rng.normal(size=(3, 4, 6))
     motion = RigidMotion(*rng.normal(size=(3, 4, 3)))
-    many = Mechanism(
+    many = plane_chain(
         tuple(bodies),
         payload[:, 0],
         payload[:, 1],
         (payload[:, 2], payload[:, 3]),
         0.0,
-        tuple(Scale(*factors[:, k].T.copy()) for k in range(2)),
     )
+    many = replace(many, scales=tuple(Scale(*factors[:, k].T.copy()) for k in range(2)))
     rows, drives = inverse_dynamics(many, motion, q, qd, qdd)
     slopes = linearise(many, motion, q, qd, qdd)
     change = rng.normal(size=(3, 4, 6))
@@ -101,7 +102,7 @@ def test_scales_are_those_of_scaled_bodies():
     for n in range(4):
         own = (of_material(b, f[0], f[1], f[2] / f[1]) for b, f in zip(bodies, factors[n]))
         gravity = (payload[n, 2], payload[n, 3])
-        one = Mechanism(tuple(own), payload[n, 0], payload[n, 1], gravity, 0.0)
+        one = plane_chain(tuple(own), payload[n, 0], payload[n, 1], gravity, 0.0)
         at, (q1, qd1, qdd1) = motion[n : n + 1], (x[n : n + 1] for x in (q, qd, qdd))
         # The same sums in another order: rounding.
         alone = inverse_dynamics(one, at, q1, qd1, qdd1)
@@ -158,8 +159,8 @@ def test_one_problem_is_solved_as_ever(alone):
 
 def with_elbow(system: ElasticSystem) -> ElasticSystem:
     """Return the system with a motor on its elbow, 2 kg."""
-    joints = (JointHardware(mass=2.0, inertia=0.01), JointHardware())
-    return replace(system, mechanism=replace(system.mechanism, joints=joints))
+    loads = {(0, 0): Constants.of_point(2.0, 0.01), **system.mechanism.loads}
+    return replace(system, mechanism=replace(system.mechanism, loads=loads))
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.mechanism import Closure, Drives, Mechanism
+from dolfinopt.multibody.mechanism import Closure, Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
 
@@ -113,7 +113,7 @@ def crank(body: ShapeIntegrals) -> Crank:
     none = np.zeros(1)
     drives = Drives(np.array([2]), none, none, np.full(1, np.inf), np.array([False]))
     return Crank(
-        Mechanism(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
+        plane_chain(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
         desired,
         (0.0, END),
         drives,

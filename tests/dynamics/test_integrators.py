@@ -29,7 +29,7 @@ from dolfinopt.dynamics.newton import NewtonMatrix, factorise, simplified_newton
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.paths.time_laws import Limits, law_for, quintic
@@ -88,7 +88,7 @@ def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> 
     C, D = tip[:, None], 2.0 * damping * frequency * one
     shape = (none, none, one, 0.0 * one, frequency**2 * one, D, np.zeros((3, 1)), tip)
     body = plane_body(1.0, np.zeros(2), 0.0, C, *shape)
-    return ElasticSystem(Mechanism((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
+    return ElasticSystem(plane_chain((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
 
 
 PUSH = 0.1  # s, when the cart begins to accelerate

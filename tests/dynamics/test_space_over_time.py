@@ -11,7 +11,7 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.multibody.end_effector import deviation, end_rotation
-from dolfinopt.multibody.mechanism import Drives, Mechanism
+from dolfinopt.multibody.mechanism import Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.paths.time_laws import quintic
 from dolfinopt.profiling import Profile
@@ -33,7 +33,7 @@ def test_plane_machine_in_space(controlled):
     There positions alone are compared to 1e-9 and the feed-forward is that of the rigid machine.
     """
     bodies = tuple(beam(damping=1e-3).body() for _ in range(2))
-    plane = Mechanism(bodies, 0.5, 0.01, (0.0, -9.81), -0.3)
+    plane = plane_chain(bodies, 0.5, 0.01, (0.0, -9.81), -0.3)
     ends = (0.0, 0.5)
     posed = posed_machine(plane), lambda t: posed_motion(plane_motion(t)), ends
     systems = [ElasticSystem(plane, plane_motion, ends), ElasticSystem(*posed)]

@@ -13,7 +13,7 @@ from dolfinopt.dynamics import generalized_alpha, radau
 from dolfinopt.dynamics.collocation import Solution, even_steps
 from dolfinopt.dynamics.machine_system import DenseLinearisation, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
-from dolfinopt.multibody.mechanism import Drives, Mechanism
+from dolfinopt.multibody.mechanism import Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.paths.time_laws import quintic
 from dolfinopt.profiling import Profile
@@ -115,7 +115,7 @@ def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
         np.arange(2), gains * np.array([4e3, 100.0]), gains * np.array([40.0, 0.5]),
         np.full(2, np.inf), np.ones(2, dtype=bool),
     )  # fmt: skip
-    mechanism = Mechanism((one_mode,), 0.5, 0.01, (0.0, gravity), 0.0)
+    mechanism = plane_chain((one_mode,), 0.5, 0.01, (0.0, gravity), 0.0)
     return MachineSystem(mechanism, desired, (0.0, 0.3, 0.5), drives)
 
 

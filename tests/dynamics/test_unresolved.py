@@ -13,7 +13,7 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import Unchanged
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.mechanism import plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -29,7 +29,7 @@ def still(t: np.ndarray) -> RigidMotion:
 def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
     """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
     method, h = radau_iia(3), np.full(10, 0.1)
-    nothing = ElasticSystem(Mechanism((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
+    nothing = ElasticSystem(plane_chain((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
     instants = nothing.at(np.zeros(30))
     stages = Stages(Unchanged(nothing), method, h, instants, instants[::3])
     t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]

@@ -10,8 +10,8 @@ from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_
 from runs import run
 
 from dolfinopt.arms.arm import build_arms, uniform_design
+from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
-from dolfinopt.exchange.urdf.read import read_robot
 from dolfinopt.exchange.urdf.robot import (
     MASSLESS,
     Robot,
@@ -25,8 +25,8 @@ from dolfinopt.mesh.checks import check_cells
 from dolfinopt.mesh.geometry import TENSOR
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.machine import exponential, roll_pitch_yaw
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -64,7 +64,7 @@ def random_joints(robot: Robot, rng):
 def in_scene(robot, mechanism, q):
     """Return those coordinates in the order of the scene's joints."""
     by_name = {scene_names([joint.name])[joint.name]: q[joint.name] for joint in robot.movable}
-    return np.column_stack([by_name[mechanism.joints[i].name] for i in mechanism.tree.movable])
+    return np.column_stack([by_name[mechanism.joints[i].name] for i in mechanism.movable])
 
 
 # -- kinematics and inertia ------------------------------------------------------------------
@@ -100,7 +100,7 @@ def test_mass_centre_and_inertia_in_the_world(imported):
     q = random_joints(robot, np.random.default_rng(2))
     frames = frames_of(mechanism, in_scene(robot, mechanism, q)[0])
     poses = robot.poses({name: values[0] for name, values in q.items()})
-    for body, frame, constants in zip(bodies, frames, mechanism.tree.constants, strict=True):
+    for body, frame, constants in zip(bodies, frames, mechanism.constants, strict=True):
         expected = MASSLESS
         for name in body.links:
             expected = expected + robot.links[name].own.posed(poses[name])
@@ -132,7 +132,7 @@ def test_drive_forces_against_pinocchio(imported):
     rows = [in_scene(robot, mechanism, one) for one in (q, qd, qdd)]
     none = np.zeros((MOVED, 0))
     found = inverse_dynamics(mechanism, RigidMotion(*rows), none, none, none)[1]
-    names = [mechanism.joints[i].name for i in mechanism.tree.movable]
+    names = [mechanism.joints[i].name for i in mechanism.movable]
     for k in range(MOVED):
         x, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
         for joint, index in zip(robot.movable, order, strict=True):

@@ -14,10 +14,9 @@ from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 from dolfinopt.arms.arm import Arm
 from dolfinopt.cli.robots import _check_robot, link_inertia
 from dolfinopt.cli.shared import _minimised
-from dolfinopt.exchange.urdf.read import implausible_inertias, read_robot
+from dolfinopt.exchange.urdf.file import NewLink, implausible_inertias, read_robot, robot_text
 from dolfinopt.exchange.urdf.robot import Inertia, Robot, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import read_origin
-from dolfinopt.exchange.urdf.write import NewLink, robot_text
 from dolfinopt.plots.style import new_figure
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.schema import file_digest

@@ -9,7 +9,7 @@ import pytest
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 from runs import ROOT, refusal, run
 
-from dolfinopt.exchange.urdf.read import implausible_inertias, read_robot
+from dolfinopt.exchange.urdf.file import implausible_inertias, read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.scene.load import load_scene
 
@@ -95,7 +95,7 @@ def test_ctrl_c_ends_the_import_before_it_writes(tmp_path, monkeypatch):
     """Libraries that swallow KeyboardInterrupt never see one; afterwards all is as before."""
     handlers = [signal.default_int_handler]
     monkeypatch.setattr(
-        "dolfinopt.exchange.urdf.read.read_robot",
+        "dolfinopt.exchange.urdf.file.read_robot",
         lambda *of: handlers.append(signal.getsignal(signal.SIGINT)) or read_robot(*of),
     )
     before = signal.signal(signal.SIGINT, handlers[0])

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism
+from dolfinopt.multibody.machine import (
+    GROUND,
+    Joint,
+    exponential,
+    rigid_spatial_body,
+    skew,
+    spatial_mechanism,
+)
+from dolfinopt.multibody.mechanism import JointHardware, Mechanism, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     STIFFENING,
@@ -17,14 +25,6 @@ from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     in_space,
     plane_body,
-)
-from dolfinopt.multibody.spatial.mechanism import (
-    GROUND,
-    Joint,
-    SpatialMechanism,
-    exponential,
-    rigid_spatial_body,
-    skew,
 )
 
 # By which integrals a function of a body is differentiated.
@@ -167,7 +167,7 @@ class Chain:
         """Return the same chain of shape integrals."""
         load = self.payload_mass, self.payload_inertia
         own = self.gravity, self.joint_height
-        return Mechanism(self.bodies, *load, *own, joints=self.joints, cart_mass=self.cart_mass)
+        return plane_chain(self.bodies, *load, *own, hardware=self.joints, cart_mass=self.cart_mass)
 
     def parts(self, y: np.ndarray) -> list[np.ndarray]:
         """Return each arm's elastic coordinates."""
@@ -287,13 +287,11 @@ class CloudTree:
     gravity: np.ndarray
     end: int
 
-    def mechanism(self) -> SpatialMechanism:
+    def mechanism(self) -> Mechanism:
         """Return the same tree of shape integrals."""
         carried = {site: one.body() for site, one in self.carried.items()}
-        first = tuple(carried.pop((i, 0), None) for i in range(len(self.clouds)))
-        bodies = tuple(cloud.body() for cloud in self.clouds)
-        tree = bodies, self.joints, first, self.gravity, self.end
-        return SpatialMechanism(*tree, carried_further=carried)
+        bodies = [cloud.body() for cloud in self.clouds]
+        return spatial_mechanism(bodies, self.joints, carried, self.gravity, (self.end, 0))
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
@@ -400,21 +398,22 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     return CloudTree(clouds, tuple(joints), loads, rng.normal(size=3), 4)
 
 
-def posed_machine(plane: Mechanism) -> SpatialMechanism:
+def posed_machine(plane: Mechanism) -> Mechanism:
     """Return a plane machine in space: a cart on the x axis, joints about z."""
     x, _, z = np.eye(3)
     none, still = np.zeros(3), np.eye(3)
     joints = [Joint("cart", "prismatic", GROUND, 0, x, rotor=float(plane.rotors[0]))]
-    carried: list[ShapeIntegrals | None] = [None]
     for k in range(len(plane.bodies)):
-        origin = np.array([0.0, plane.joint_height, 0.0]) if k == 0 else none
-        rotor, load = float(plane.rotors[1 + k]), plane.carried(k)
+        origin = np.array([*plane.origin, 0.0]) if k == 0 else none
+        rotor = float(plane.rotors[1 + k])
         joints.append(Joint(f"joint{k}", "revolute", k, 1 + k, z, origin, still, rotor))
-        inertia = None if load is None else (0.0, 0.0, load[1], 0.0, 0.0, 0.0)
-        carried.append(None if load is None else rigid_spatial_body(load[0], none, inertia))
+    carried = {
+        (1 + k, 0): rigid_spatial_body(load.mass, none, (0.0, 0.0, load.W_rest[0, 0], *none))
+        for (k, _), load in plane.loads.items()
+    }
     bodies = (rigid_spatial_body(0.0, none, np.zeros(6)), *map(in_space, plane.bodies))
-    gravity = np.array([*plane.gravity, 0.0])
-    return SpatialMechanism(bodies, tuple(joints), tuple(carried), gravity, len(plane.bodies))
+    gravity = np.array([*plane.gravity[:, 0], 0.0])
+    return spatial_mechanism(bodies, joints, carried, gravity, (len(plane.bodies), 0))
 
 
 def posed_motion(motion: RigidMotion) -> RigidMotion:

@@ -1,12 +1,13 @@
 """Machines: control, slider-crank, four-bar; what `tests/reference` says of them, and balances."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runs import TWO_ARM, scene
+from mpi4py import MPI
+from runs import ROOT, TWO_ARM, scene
 
 import dolfinopt as do
 from dolfinopt.dynamics.collocation import Solution
@@ -214,7 +215,7 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
     strain = np.zeros(len(t))
     origins, rotations, _ = _frames(mechanism, motion, q)
-    moment = mechanism.payload_mass * origins[-1]  # first moment of all masses, complex
+    moment = np.zeros(len(t), dtype=complex)  # first moment of all masses
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         e = q[:, part]
         strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
@@ -222,9 +223,9 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
         if body.is_stiffened:
             own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:2], e)
         moment = moment + body.mass * origins[k] + rotations[k] * (own[:, 0] + 1j * own[:, 1])
-    for k, joint in enumerate(mechanism.joints):
-        moment = moment + joint.mass * origins[1 + k]
-    potential = -(np.conj(complex(*mechanism.gravity)) * moment).real
+    for (k, _), load in mechanism.loads.items():
+        moment = moment + load.mass * origins[1 + k]
+    potential = -(np.conj(complex(*mechanism.gravity[:, 0])) * moment).real
     return kinetic, strain, potential
 
 
@@ -268,3 +269,21 @@ def fork() -> dict:
         "simulation": {"sample": 0.005, "tolerance": 1e-3, "stiffening": True},
         "objective": {"load_cases": 6},
     }  # fmt: skip
+
+
+def demo_machine(name: str, changes: Sequence[str], folder: Path, *, one_arm: bool) -> Scene:
+    """Return a demo with keys changed, FOLDER standing for the files' one, or with one arm alone.
+
+    Without a name the fork, whose table it writes (collective).
+    """
+    told = [change.replace("FOLDER", str(folder)) for change in changes]
+    if not name:
+        if MPI.COMM_WORLD.rank == 0:
+            (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
+        MPI.COMM_WORLD.barrier()
+        return scene_from_dict(fork(), str(folder / "fork.toml"), told)
+    path = ROOT / "demos" / f"{name}.toml"
+    if not one_arm:
+        return do.load_scene(path, told)
+    tree = do.load_scene(path).to_tree()
+    return scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)

@@ -1,6 +1,7 @@
 """Forces of one body by standard input data and by MBDyn's modal element, as programs read them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -178,3 +179,19 @@ def mbdyn_forces(groups: dict[int, Any], s: State) -> Forces:
         still = np.zeros(3)
         rows = rows + mbdyn_stiffening(groups, s.a, w, s.g, still, still) @ a
     return force, moment, rows
+
+
+def check_npz(path: Path, data: StandardInputData) -> None:
+    """Assert that an .npz file holds these data to the bit, array by array."""
+    with np.load(path, allow_pickle=False) as found:
+        nodes = [(node.name, node.rframe) for node in data.nodes]
+        assert float(found["mass"]) == data.mass and tuple(found["names"]) == data.names
+        assert str(found["comment"]) == data.comment
+        assert list(zip(found["node_names"], found["node_rframes"], strict=True)) == nodes
+        matrices = [name.split("/") for name in found.files if "/" in name]
+        for *node, matrix, field in matrices:
+            owner = data.nodes[int(node[0][4:]) - 1] if node else data
+            value = np.asarray(getattr(getattr(owner, matrix), field))
+            assert found["/".join([*node, matrix, field])].tobytes() == value.tobytes()
+        sigmas = sum(node.sigma is not None for node in data.nodes)
+        assert len(matrices) == 5 * (11 + 4 * len(data.nodes) + sigmas)

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from runs import ROOT, run, tomllib
 
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     GROUND,
-    SpatialMechanism,
     about,
     build_spatial_mechanism,
     rigid_link,
     rigid_spatial_body,
 )
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.scene.load import load_scene
 
 DEMO = ROOT / "demos" / "robot.urdf"
@@ -114,7 +114,7 @@ def tree_of(scene: Path) -> dict[str, Any]:
     return tomllib.loads(scene.read_text(encoding="utf-8"))
 
 
-def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> SpatialMechanism:
+def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> Mechanism:
     """Return the rigid mechanism of a scene.
 
     Args:
@@ -131,10 +131,10 @@ def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> SpatialMech
     return build_spatial_mechanism(scene, bodies)
 
 
-def frames_of(mechanism: SpatialMechanism, q: np.ndarray) -> list[np.ndarray]:
+def frames_of(mechanism: Mechanism, q: np.ndarray) -> list[np.ndarray]:
     """Return the pose (4, 4) of every body's frame in the world at joint coordinates (k,)."""
     found: dict[int, np.ndarray] = {}
-    for i in mechanism.tree.order:
+    for i in mechanism.order:
         joint = mechanism.joints[i]
         outer = np.eye(4)
         if joint.parent != GROUND:

@@ -7,16 +7,17 @@ of largest deviation as Saint-Venant beams, 18.62 mm with rigid end faces (issue
 import numpy as np
 from scipy.linalg import eigh
 
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
-    SpatialMechanism,
     rigid_spatial_body,
     roll_pitch_yaw,
     skew,
+    spatial_mechanism,
 )
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # Pa, -, kg/m3
 HEIGHT, THICKNESS = 0.04, 0.02  # m
@@ -89,7 +90,7 @@ def beam_link(
     )
 
 
-def reference_chain(normal_modes: int = 6, payload: float = 4.0) -> SpatialMechanism:
+def reference_chain(normal_modes: int = 6, payload: float = 4.0) -> Mechanism:
     """Return the chain of the module."""
     z = np.array([0.0, 0.0, 1.0])
     column = rigid_spatial_body(0.0, (0.0,) * 3, (0.0,) * 6)
@@ -101,7 +102,7 @@ def reference_chain(normal_modes: int = 6, payload: float = 4.0) -> SpatialMecha
     )
     load = rigid_spatial_body(payload, (0.0,) * 3, (0.0,) * 6)
     bodies = (column, beam_link(0.5, normal_modes), beam_link(0.45, normal_modes))
-    return SpatialMechanism(bodies, joints, (None, None, load), np.array([0.0, 0.0, -9.81]), 2)
+    return spatial_mechanism(bodies, joints, {(2, 0): load}, (0.0, 0.0, -9.81), (2, 0))
 
 
 def quintic_motion(t: np.ndarray) -> RigidMotion:

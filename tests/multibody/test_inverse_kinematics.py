@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tomllib
-from runs import refused
+from runs import refused, tomllib
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.dynamics.build import check_motion
+from dolfinopt.multibody.machine import end_chain, exponential, joint_motion
 from dolfinopt.multibody.motion import breakpoints
 from dolfinopt.multibody.spatial.end_effector import Follower, end_path, relative_vectors
-from dolfinopt.multibody.spatial.mechanism import end_chain, exponential, joint_motion
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

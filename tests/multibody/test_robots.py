@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
-    SpatialMechanism,
     inertia_tensor,
     rigid_spatial_body,
     roll_pitch_yaw,
+    spatial_mechanism,
 )
+from dolfinopt.multibody.motion import RigidMotion
 
 pin = pytest.importorskip("pinocchio")
 pytestmark = pytest.mark.serial
@@ -82,9 +82,7 @@ def test_rigid_robot(name):
         indices.append(model.addJoint(above, made(axis), place, str(i)))
         model.appendBodyToJoint(indices[-1], own, pin.SE3.Identity())
     model.gravity.linear = np.array([0.3, -0.2, -9.81])
-    machine = SpatialMechanism(
-        tuple(bodies), tuple(joints), (), np.array([0.3, -0.2, -9.81]), len(bodies) - 1
-    )
+    machine = spatial_mechanism(bodies, joints, {}, (0.3, -0.2, -9.81), (len(bodies) - 1, 0))
     q, qd, qdd = rng.normal(size=(3, 20, movable))
     none = np.zeros((20, 0))
     found = inverse_dynamics(machine, RigidMotion(q, qd, qdd), none, none, none)[1]

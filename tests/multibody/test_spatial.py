@@ -11,9 +11,9 @@ from bodies import changed, complex_derivative, random_tree
 from scipy.linalg import expm
 
 from dolfinopt.multibody.dimension import SpaceTurning
+from dolfinopt.multibody.machine import exponential, roll_pitch_yaw, skew
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.spatial.frozen import FrozenTree
-from dolfinopt.multibody.spatial.mechanism import exponential, roll_pitch_yaw, skew
 from dolfinopt.multibody.tangent import linearise
 
 pytestmark = pytest.mark.serial

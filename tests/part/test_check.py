@@ -14,9 +14,9 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.views import canonical_order
 from dolfinopt.part import check as checks
-from dolfinopt.part.buckling import Buckling
 from dolfinopt.part.check import check_parts, crisp
 from dolfinopt.part.part import make_parts, mesh_parts
+from dolfinopt.responses.buckling import LeastBuckling
 
 pytestmark = pytest.mark.serial
 
@@ -71,7 +71,7 @@ def test_buckling_of_the_part_stands_in_the_table(made):
 
 def test_part_that_buckles_is_told(made):
     check = made[2]
-    weak = replace(check.part, buckling=Buckling(1.2345, 0, 0.5))
+    weak = replace(check.part, buckling=LeastBuckling(1.2345, 0, 0.5))
     (warning,) = [text for text in replace(check, part=weak).warnings if "buckles" in text]
     assert warning.startswith("arm1 buckles at 1.23 times its loads at 0.500 s")
     assert len(warning.splitlines()) == 1

@@ -15,6 +15,7 @@ from dolfinopt.part.optimize import Problem, optimize_parts
 from dolfinopt.part.part import make_parts
 from dolfinopt.part.plane.curves import MIRROR, Spline, direction
 from dolfinopt.part.plane.free_outline import free_outline
+from dolfinopt.responses.constraints import EXCESS
 
 pytestmark = pytest.mark.serial
 
@@ -141,3 +142,21 @@ def test_command_writes_optimised_parts(made, tmp_path, capsys):
     row = figures["table"]["compliance"]
     assert row["optimised part"] < row["part"]
     assert row["optimised part"] == pytest.approx(found.after, rel=2e-2)  # mesh refined for stress
+
+
+@pytest.mark.slow
+def test_flanges_that_would_buckle_are_kept(tmp_path):
+    """The lightest frame of polymer within its deflection would buckle at 1.6 times its load."""
+    soft = ("material.young_modulus=2e9", "objective.kind=mass", "constraints.deviation=0.3")
+    found = {}
+    for least in (0.01, 1.7):
+        told = (*SMALL, *soft, f"constraints.buckling={least}")
+        folder = folder_with(tmp_path / f"run{least}", frame, *told)
+        scene = scene_of(folder)
+        one = optimize_parts(scene, make_parts(scene, folder), 6, lambda line: None)
+        found[least] = one.after, {limit.name: limit.value for limit in one.limits}
+    assert found[0.01][1]["buckling"] < 1.6
+    mass, limits = found[1.7]
+    assert 1.7 * (1.0 - EXCESS) <= limits["buckling"] < 1.75
+    assert limits["deviation"] < 0.3
+    assert found[0.01][0] < 0.99 * mass

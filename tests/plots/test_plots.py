@@ -14,7 +14,7 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.mechanism import Closure, Mechanism
+from dolfinopt.multibody.mechanism import Closure, Mechanism, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.state import HistoryRow
@@ -63,7 +63,7 @@ def manipulator(arms: int) -> tuple[list[ArmView], Mechanism]:
     lengths = LENGTHS[:arms]
     views = [beam(f"arm{k}", length, 0.06, 20, 4) for k, length in enumerate(lengths)]
     bodies = tuple(beam_body(length) for length in lengths)
-    return views, Mechanism(bodies, 6.0, 0.0, (0.0, 0.0), joint_height=-0.5)
+    return views, plane_chain(bodies, 6.0, 0.0, (0.0, 0.0), joint_height=-0.5)
 
 
 def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Closure | None = None) -> Any:
@@ -386,7 +386,7 @@ def slider_crank(count: int = 61) -> tuple[list[ArmView], Any]:
     crank = replace(beam("crank", 0.3, 0.2, 10, 2), modes=np.zeros((20, 4, 2, 0)), designed=False)
     views = [crank, beam("rod", 0.7, 0.06, 20, 4)]
     bodies = (body(np.zeros((3, 0)), 0.3), beam_body(0.7))
-    mechanism = Mechanism(bodies, 0.5, 0.0, (0.0, 0.0), joint_height=0.0)
+    mechanism = plane_chain(bodies, 0.5, 0.0, (0.0, 0.0), joint_height=0.0)
     t = np.linspace(0.0, 0.1, count)
     angle = 80.0 * t
     desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)

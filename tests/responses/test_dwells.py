@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 
 import numpy as np
 import pytest
-from runs import TWO_ARM, overrides, refused, run, scene
+from runs import TWO_ARM, overrides, refused, run, scene, tomllib
 
 import dolfinopt as do
 from dolfinopt.dynamics.build import rests_of
@@ -15,11 +14,6 @@ from dolfinopt.part.files.scene_file import toml_text
 from dolfinopt.responses.constraints import deviation_limits, limits_of
 from dolfinopt.responses.response import find
 from dolfinopt.scene.load import scene_from_dict
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 pytestmark = pytest.mark.serial
 # A fast stroke, a dwell, and a slow one: the first leaves the larger vibration.

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
-from machines import fork
+from machines import demo_machine
 from mpi4py import MPI
-from remainders import taylor, wave
-from runs import ROOT
+from remainders import hold_instants, taylor, wave
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.scene.tables.objective import EXACT_ONLY, NEEDS
+from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, ObjectiveKind
 
 WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
@@ -60,19 +60,11 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     if WORLD.rank == 0:
         for name, text in (("drives.csv", DRIVES), ("skew.geo", SKEW)):
             (folder / name).write_text(text)
-        (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
         (folder / "strokes.csv").write_text(STROKES)
         (folder / "spatial.csv").write_text(SPATIAL_STROKES)
     WORLD.barrier()
     name, quick = BASES[base]
-    told = [*quick, *(one.replace("FOLDER", str(folder)) for one in changes)]
-    if base == "fork":
-        return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
-    path = ROOT / "demos" / f"{name}.toml"
-    if base != "one_arm":
-        return do.load_scene(path, told)
-    tree = do.load_scene(path).to_tree()
-    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
+    return demo_machine(name, (*quick, *changes), folder, one_arm=base == "one_arm")
 
 
 def case(base: str, *changes: str, slow: bool = False, ranks: bool = False):
@@ -91,6 +83,7 @@ COMPLIANCE, DEVIATION, STRESS = (
 )
 EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
 SETTLING, ORIENTATION = "objective.kind=settling", "objective.kind=orientation"
+BUCKLING = "objective.kind=buckling"
 IN_STROKES = ("motion.path=joints", "motion.file='FOLDER/strokes.csv'")
 STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
@@ -227,9 +220,19 @@ CASES = [
     case("pin", ORIENTATION, slow=True),
     case("fork", ORIENTATION),
     case("space", ORIENTATION, TWO_IN_SPACE, HELD, slow=True),
+    # Buckling: of the chain of derivatives all parts.
+    case("two_arm", BUCKLING, BENT, *LOADED, ranks=True),
+    case("one_arm", BUCKLING, LINEAR, MODAL, ranks=True),
+    case("two_arm", BUCKLING, "interpolation.law=simp", "arms.arm2.design=arm1"),
+    case("two_arm", BUCKLING, TWO, slow=True),
+    case("controlled", BUCKLING),
+    case("slider", BUCKLING, GRAVITY, "motion.speed=30"),
+    case("fork", BUCKLING),
+    case("space", BUCKLING, slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
-      for kind in NEEDS for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
+      for kind in get_args(ObjectiveKind)
+      for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
 ]  # fmt: skip
 
 
@@ -238,9 +241,10 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
     """Along a random and a smooth direction; the gradient by ESL points the same way."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    hold_instants(monkeypatch)
     scene = scene_of(base, changes, shared_tmp_path)
     # Forces are made of accelerations, which leave more rounding.
-    steps = (1e-3, 2.5e-4) if scene.objective.kind in EXACT_ONLY else (4e-4, 1e-4)
+    steps = (1e-3, 2.5e-4) if scene.objective.kind in FORCES else (4e-4, 1e-4)
     test = taylor(scene, wave, steps, ("random", "smooth"))
     rates = [row.rate for row in test.rows]
     kind = scene.objective.kind

@@ -11,7 +11,6 @@ from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses import response as registry
 from dolfinopt.responses.motion import LoadCases, MotionResponse
@@ -142,16 +141,6 @@ def test_a_new_response_is_a_limit() -> None:
     assert kept.evaluation.values_of("roughness") == tuple(
         values[f"roughness_{arm.name}"].value for arm in scene.arms
     )
-
-
-@pytest.mark.usefixtures("three_steps")
-def test_a_new_response_of_the_motion_has_an_exact_gradient() -> None:
-    """From its derivatives by coordinates and bodies alone, to second order."""
-    built = build(*QUICK, "objective.gradient=exact")
-    built = rebuilt(built, minimised(built.scene, "mean_square"))
-    x = built.fields(wave)
-    test = taylor_test(built.scene, built.partition, built.arms, x, built.profile)
-    assert test.passed, test
 
 
 @pytest.mark.serial

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import fork
+from machines import demo_machine
 from moved_nodes import built_with, node_test, noise
 from mpi4py import MPI
-from remainders import rates, wave
-from runs import ROOT
+from remainders import hold_instants, rates, wave
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -33,6 +32,8 @@ QUADRILATERALS = ("arms.cells=[12,2]",)
 SHORT = ("arms.passive=0", "design.filter_radius=0", "motion.horizon=2.2", *ROUGHLY)
 LINK = ("arms.link1.cells=[5,1,1]", "arms.link2.cells=[5,1,1]", "arms.passive=0.06",
         "objective.load_cases=6", "design.filter_radius=0", *ROUGHLY)  # fmt: skip
+ROD = ("arms.rod.height=0.008", "arms.rod.passive=0", "motion.speed=60", "motion.duration=0.05",
+       "motion.horizon=0.1", *ROUGHLY)  # fmt: skip
 # Quadratic unless a case says otherwise; the outlines of tests/responses/test_gradients.py's bars.
 BAR = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
@@ -50,20 +51,7 @@ BASES = {  # scene, what makes it small, size of a move (m), whether boxes are c
     "tetrahedra": ("spatial_arm", LINK, 0.01, True),
     "hexahedra": ("spatial_arm", LINK, 0.01, False),
     "fork": ("", ("simulation.sample=0.01", *ROUGHLY[2:]), 0.005, False),
-    "slider": (
-        "slider_crank",
-        (
-            "arms.rod.cells=[12,2]",
-            "arms.rod.height=0.008",
-            "arms.rod.passive=0",
-            "motion.speed=60",
-            "motion.duration=0.05",
-            "motion.horizon=0.1",
-            *ROUGHLY,
-        ),
-        0.001,
-        False,
-    ),
+    "slider": ("slider_crank", ("arms.rod.cells=[12,2]", *ROD), 0.001, False),
 }
 BENT, LINEAR = "simulation.stiffening=true", "simulation.stiffening=false"
 GRAVITY = "motion.gravity=[0.5,-9.81]"
@@ -101,6 +89,9 @@ CASES = [
     case("one arm", "stress", BENT, GRAVITY, ranks=True),
     case("one arm", "deviation", LINEAR, MODAL, ranks=True),
     case("lone file", "stress", BENT, GRAVITY, ranks=True),
+    case("triangles", "buckling", BENT, GRAVITY, "payload.inertia=0.05", ranks=True),
+    case("triangles", "buckling", LINEAR, MODAL),
+    case("one arm", "buckling", BENT, GRAVITY, ranks=True),
     case("controlled", "esl", LINEAR),
     case("controlled", "deviation", BENT),
     case("controlled", "settling", BENT, slow=True),
@@ -110,6 +101,7 @@ CASES = [
       for name in ("incompatible", "linear", "quadratic")),
     case("quadrilaterals", "mass", KEPT, LINEAR),
     case("quadrilaterals", "stress", BENT),
+    case("quadrilaterals", "buckling", BENT),
     case("tetrahedra", "mass", KEPT),
     case("tetrahedra", "static"),
     case("tetrahedra", "eigenfrequency"),
@@ -118,15 +110,18 @@ CASES = [
     case("tetrahedra", "settling", LINEAR, "motion.dwells=[[0.1,0.2]]", slow=True),
     case("tetrahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
     case("tetrahedra", "stress", BENT, slow=True),
+    case("tetrahedra", "buckling", LINEAR, slow=True),
     case("hexahedra", "mass", KEPT),
     case("hexahedra", "static"),
     case("hexahedra", "compliance", LINEAR),
     case("hexahedra", "deviation", BENT, slow=True),
     case("hexahedra", "effort", "constraints.deviation=0.1", CONTROL, BENT, slow=True),
     case("hexahedra", "stress", BENT, slow=True),
+    case("hexahedra", "buckling", LINEAR, slow=True),
     # Two outboard interfaces; a closed loop.
     case("fork", "deviation", BENT),
     case("fork", "eigenfrequency"),
+    case("fork", "buckling", BENT),
     case("slider", "deviation", GRAVITY),
     case("slider", "stress", BENT, slow=True),
 ]  # fmt: skip
@@ -138,15 +133,8 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12)
         (folder / "bar.geo").write_text(BAR.replace("CELLS", str(cells + 1)))
     WORLD.barrier()
     name, quick, _, _ = BASES[base]
-    told = [one.replace("FOLDER", str(folder)) for one in (*quick, *changes)]
-    if base == "fork":
-        (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
-        return do.scene_from_dict(fork(), str(folder / "fork.toml"), told)
-    path = ROOT / "demos" / f"{name}.toml"
-    if base not in ("one arm", "lone file"):
-        return do.load_scene(path, told)
-    tree = do.load_scene(path).to_tree()
-    return do.scene_from_dict(tree | {"arms": tree["arms"][:1]}, str(path), told)
+    alone = base in ("one arm", "lone file")
+    return demo_machine(name, (*quick, *changes), folder, one_arm=alone)
 
 
 @pytest.mark.parametrize(("base", "changes"), CASES)
@@ -154,6 +142,7 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
     """Along random moves of all nodes of uneven meshes, those of interfaces included."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    hold_instants(monkeypatch)
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)  # one arm on two ranks is cut in two
     scene = scene_of(base, changes, shared_tmp_path)
     _, _, size, cut = BASES[base]
@@ -167,11 +156,12 @@ def test_remainders_are_of_second_order(base, changes, shared_tmp_path, monkeypa
 @pytest.mark.parametrize(
     ("kind", "part"),
     [("effort", "places"), ("compliance", "interfaces"), ("stress", "volumes"),
-     ("stress", "stress"), ("compliance", "geometric_stiffness")],
+     ("stress", "stress"), ("compliance", "geometric_stiffness"), ("buckling", "prestress")],
 )  # fmt: skip
 def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
     """Each part of the chain alone: remainders become of first order."""
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
+    hold_instants(monkeypatch)
     if part == "geometric_stiffness":
 
         def none(shape: ShapeDerivative, *_: object) -> np.ndarray:

@@ -110,7 +110,7 @@ def analysed_arms(built: Built):
     """Yield every arm, its cells, c, q; stress by mode acceleration and loads at an instant."""
     trajectory = Analysed(built, built.fields(wave)).trajectory
     y, yd, ydd = trajectory.unknowns
-    links = outward_pass(trajectory.mechanism.tree, trajectory.motion, (y, yd, ydd))
+    links = outward_pass(trajectory.mechanism, trajectory.motion, (y, yd, ydd))
     for k, arm in built.arms.items():
         part, c = trajectory.mechanism.slices[k], trajectory.load_coefficients[k]
         cells = cell_stress(arm.current)

@@ -8,7 +8,7 @@ from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.spatial.mechanism import build_spatial_mechanism, rigid_link
+from dolfinopt.multibody.machine import build_spatial_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -99,15 +99,15 @@ def test_machine_of_a_scene(source):
     assert np.array_equal(machine.joints[0].axis, [0, 0, 1])
     assert (machine.joints[1].parent, machine.joints[1].coordinate) == (0, 1)
     assert (machine.joints[2].parent, machine.joints[2].coordinate) == (1, None)
-    assert machine.carried[:2] == (None, None)
-    assert machine.carried[2].w[0, 0] == pytest.approx(0.1)
-    assert machine.end == 2
+    assert set(machine.loads) == {(2, 0)}
+    assert machine.loads[2, 0].body.w[0, 0] == pytest.approx(0.1)
+    assert machine.end == (2, 0)
     data = with_tool()  # the tree is that of the joints, whatever the order of the tables
     data["joints"].reverse()
     scene = scene_from_dict(data, source)
     machine = machine_of(scene)
     assert scene.driven == ("lift", "yaw")
-    assert machine.tree.order == (0, 1, 2) and machine.tree.movable == (1, 0)
+    assert machine.order == (0, 1, 2) and machine.movable == (1, 0)
 
 
 FIXED = {"name": "yaw", "type": "fixed", "parent": "ground", "child": "column"}
@@ -184,12 +184,12 @@ def test_interfaces_of_a_scene(source):
     machine = machine_of(scene)
     assert (machine.joints[2].parent, machine.joints[2].interface) == (1, 1)
     assert np.array_equal(machine.bodies[1].points, [[0.4, 0, 0], [0.2, 0.01, 0]])
-    assert machine.tree.sites == ((0,), (0, 1), ()) and set(machine.tree.loads) == {(1, 0)}
+    assert machine.sites == ((0,), (0, 1), ()) and set(machine.loads) == {(1, 0)}
     assert machine.way == ((0, 0), (1, 0))
     data = with_fork()  # the payload at the side, beside the tool
     data["payload"]["interface"] = "Side"
     machine = machine_of(scene_from_dict(data, source))
-    assert (machine.end, machine.end_interface) == (1, 1) and set(machine.tree.loads) == {(1, 1)}
+    assert machine.end == (1, 1) and set(machine.loads) == {(1, 1)}
 
 
 def test_coordinates_of_several_interfaces(source):

@@ -390,7 +390,10 @@ BAD_VALUES = [
      "3 numbers, for cart, arm1, arm2"),
     ("constraints.first_frequency", [0.0], "a number >= 1e-06 and <= 1000000000"),
     ("constraints.tip_deflection", [-1e-3], "a number >= 1e-15 and <= 10000"),
-    (" ".join(f"constraints.{key}" for key in Constraints.model_fields), [-1.0], " >= "),
+    (" ".join(f"constraints.{key}" for key in Constraints.model_fields if key != "stiffness"),
+     [-1.0], " >= "),
+    ("constraints.buckling", [0.0, 1001], "a number >= 0.001 and <= 1000"),
+    ("constraints.stiffness", [1.0], "an array of tables"),
     ("design.volume_fraction design.initial optimizer.move", [0.0, 1.01],
      "a number >= 1e-06 and <= 1"),
     ("design.minimum", [0.0], "a number >= 1e-09 and < 1"),
@@ -462,8 +465,9 @@ def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
     tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    # In files of their own: test_regions, test_joints, test_machine_scenes.
-    elsewhere = ("arms.regions", "control", "closure", "joints", "arms.interfaces")
+    # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness.
+    elsewhere = ("arms.regions", "control", "closure", "joints", "arms.interfaces",
+                 "constraints.stiffness.")  # fmt: skip
     assert {info.key for info in describe_keys() if not info.key.startswith(elsewhere)} <= tried
 
 
@@ -649,7 +653,7 @@ def test_described_defaults():
         *(f"arms.{key}" for key in ARM),
         *("motion.path", "payload.mass"),
         *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
-        *("arms.interfaces.name", "arms.interfaces.point"),
+        *("arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm"),
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
     }

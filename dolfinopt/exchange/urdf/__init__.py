@@ -1,6 +1,5 @@
-"""Robots as URDF files: read and checked, as bodies and joints of a scene, written back.
+"""Robots as URDF files: bodies and joints of a scene, and back.
 
-`robot` (links, joints, frames), `read`, `checks` (inertias that cannot be), `bodies` (which links
-are bodies of a scene), `solids` (their frames), `geometry` (their shapes), `trajectory`, `scene`
-(the text of a scene file), `write`.
+`robot` (links, joints, frames; which links are bodies of a scene), `file` (read, checked, written
+back), `geometry` (shapes of links as cells), `scene` (the text of a scene file, its trajectory).
 """

@@ -20,14 +20,12 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from dolfinopt.exchange.urdf.robot import SceneBody, inverse
+from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-CELLS = 6000  # of a solid, about
 MOST = 20000  # of one with thin walls
-FEWEST = 4  # cells over the smaller of height and thickness
 FINE = 3  # voxels along the side of a cell
 VOXELS = 1e7  # of a link, at most
 COARSE = 64  # voxels along a link where its volume is estimated
@@ -102,12 +100,10 @@ class LinkCells:
 
     def offset(self, length: float) -> float:
         """Largest distance of an interface's middle from its joint, m."""
-        away = []
-        for facets, x in ((self.inboard, 0.0), (self.outboard, length)):
-            at = self.points[facets].reshape(-1, 3)
-            middle = 0.5 * (at.min(axis=0) + at.max(axis=0))
-            away.append(float(np.linalg.norm(middle - [x, 0.0, 0.0])))
-        return max(away)
+        places = (self.points[one].reshape(-1, 3) for one in (self.inboard, self.outboard))
+        middles = np.stack([0.5 * (at.min(axis=0) + at.max(axis=0)) for at in places])
+        middles[1, 0] -= length
+        return float(np.linalg.norm(middles, axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,15 +116,12 @@ class _Grid:
 
     def taken_from(self, other: _Grid, found: np.ndarray) -> np.ndarray:
         """Return what is True at the middles of these voxels on another grid, False beyond it."""
-        at, inside = [], []
+        around, at = np.pad(found, 1), []
         for k, count in enumerate(self.shape):
             middle = self.low[k] + (np.arange(count) + 0.5) * self.step
             index = np.floor((middle - other.low[k]) / other.step).astype(int)
-            inside.append((index >= 0) & (index < other.shape[k]))
-            at.append(np.clip(index, 0, other.shape[k] - 1))
-        return np.asarray(
-            found[np.ix_(*at)] & inside[0][:, None, None] & inside[1][:, None] & inside[2]
-        )
+            at.append(1 + np.clip(index, -1, other.shape[k]))
+        return np.asarray(around[np.ix_(*at)])
 
     def filled_by(self, closed: Trimesh) -> np.ndarray:
         """Return True for the voxels whose middle lies within a closed surface."""
@@ -386,13 +379,18 @@ def _region(
     if ends is not None:
         x = grid.low[0] + (np.arange(grid.shape[0]) + 0.5) * grid.step
         found[(x < ends[0]) | (x > ends[1])] = False
-    labels, count = ndimage.label(found)
-    if not count:
+    if not found.any():
         if ends is None:
             raise NoSolid("its geometry encloses nothing")
         return found, 0.0
-    sizes = np.bincount(labels.ravel())[1:]
-    return labels == 1 + int(sizes.argmax()), float(sizes.max() / sizes.sum())
+    largest = _connected(found)
+    return largest, float(largest.sum() / found.sum())
+
+
+def _connected(found: np.ndarray) -> np.ndarray:
+    """Return the largest connected part of what is True."""
+    labels, _ = ndimage.label(found)
+    return np.asarray(labels == 1 + int(np.bincount(labels.ravel())[1:].argmax()))
 
 
 def _ends(box: np.ndarray, length: float) -> tuple[float, float] | None:
@@ -430,13 +428,12 @@ class _Piece:
 def _piece(region: np.ndarray, share: float, grid: _Grid, box: np.ndarray) -> _Piece:
     """Return a piece with its box, within that of what was looked at."""
     where = np.argwhere(region)
-    low = grid.low + where.min(axis=0) * grid.step
-    high = grid.low + (where.max(axis=0) + 1) * grid.step
     # Half a voxel is lost where a surface passes beyond the middles of voxels.
-    low[1:], high[1:] = low[1:] - grid.step, high[1:] + grid.step
-    return _Piece(
-        region, share, grid, np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
-    )
+    lost = grid.step * np.array([0.0, 1.0, 1.0])
+    low = grid.low + where.min(axis=0) * grid.step - lost
+    high = grid.low + (where.max(axis=0) + 1) * grid.step + lost
+    within = np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
+    return _Piece(region, share, grid, within)
 
 
 def _largest(pieces: _Pieces) -> _Piece:
@@ -496,12 +493,10 @@ def _cells(
     fine = _Grid(start, side / FINE, (along, over, through))
     region, _ = _region(pieces, fine, ends)
     pooled = region.reshape(blocks[0], FINE, blocks[1], FINE, blocks[2], FINE).mean(axis=(1, 3, 5))
-    labels, count = ndimage.label(pooled >= FULL)
-    if not count:
+    if not (pooled >= FULL).any():
         return None
-    sizes = np.bincount(labels.ravel())[1:]
-    solid = labels == 1 + int(sizes.argmax())
-    if sizes.max() < KEPT * pooled.sum() or sizes.max() > 2 * MOST:
+    solid = _connected(pooled >= FULL)
+    if not KEPT * pooled.sum() <= solid.sum() <= 2 * MOST:
         return None
     if ends is not None and not (solid[0].any() and solid[-1].any()):
         return None
@@ -540,12 +535,10 @@ def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.n
     """Return the outer facets nearest to each joint, without common points."""
     middles = points[facets].mean(axis=1)
     away = np.stack([np.linalg.norm(middles - [x, 0.0, 0.0], axis=1) for x in (0.0, length)])
-    count = max(4, math.ceil(PATCH * len(facets)))
-    own = [np.flatnonzero(away[k] <= away[1 - k]) for k in (0, 1)]
-    found = []
-    for k, mine in enumerate(own):
-        chosen = mine[np.argsort(away[k, mine], kind="stable")[:count]]
-        found.append(facets[chosen])
+    count, found = max(4, math.ceil(PATCH * len(facets))), []
+    for own, other in (away, away[::-1]):
+        mine = np.flatnonzero(own <= other)
+        found.append(facets[mine[np.argsort(own[mine], kind="stable")[:count]]])
     shared = np.intersect1d(found[0], found[1])
     found[1] = found[1][~np.isin(found[1], shared).any(axis=1)]
     if not all(map(len, found)):
@@ -594,21 +587,14 @@ def _on_surface(
     longest = np.linalg.norm(shift, axis=1, keepdims=True)
     cell = FINE * grid.step
     shift *= np.minimum(1.0, LONGEST * cell / np.maximum(longest, 1e-30))
-    for _ in range(20):
-        bad = _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3
-        if not bad.any():
-            return np.asarray(points + shift)
-        shift[np.unique(cells[bad])] *= EASED
-    shift[np.unique(cells[bad])] = 0.0
+    tries = 0
     while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3).any():
-        shift[np.unique(cells[bad])] = 0.0
+        shift[np.unique(cells[bad])] *= EASED if tries < 20 else 0.0
+        tries += 1
     return np.asarray(points + shift)
 
 
 def _jacobians(corners: np.ndarray) -> np.ndarray:
     """Return the Jacobian (n, 8) at the corners of hexahedra (n, 8, 3), m3."""
-    found = []
-    for k, around in enumerate(AROUND):
-        a, b, c = (corners[:, j] - corners[:, k] for j in around)
-        found.append(np.einsum("na,na->n", a, np.cross(b, c)))
-    return np.stack(found, axis=1)
+    a, b, c = (corners[:, list(one)] - corners for one in zip(*AROUND, strict=True))
+    return np.asarray(np.einsum("nka,nka->nk", a, np.cross(b, c)))

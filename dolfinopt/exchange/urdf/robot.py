@@ -88,11 +88,9 @@ class Inertia:
 
     def __add__(self, other: Inertia) -> Inertia:
         """Return that of both bodies held together, in the same components."""
-        mass = self.mass + other.mass
-        if mass == 0.0:
-            return Inertia(0.0, self.centre, self.tensor + other.tensor)
-        centre = (self.mass * self.centre + other.mass * other.centre) / mass
-        tensor = np.zeros((3, 3))
+        mass, centre, tensor = self.mass + other.mass, self.centre, np.zeros((3, 3))
+        if mass != 0.0:
+            centre = (self.mass * self.centre + other.mass * other.centre) / mass
         for one in (self, other):
             r = one.centre - centre
             tensor += one.tensor + one.mass * (r @ r * np.eye(3) - np.outer(r, r))
@@ -129,10 +127,16 @@ class RobotLink:
     @cached_property
     def volume(self) -> float:
         """Volume in m3 within its surfaces; within their convex hulls if they are open."""
-        return sum(
-            abs(float(one.volume)) if one.is_watertight else _hull_volume(one)
-            for one in self.shapes
-        )
+        from scipy.spatial import QhullError
+
+        found = 0.0
+        for one in self.shapes:
+            try:
+                whole = one if one.is_watertight else one.convex_hull
+                found += abs(float(whole.volume))
+            except QhullError:  # a flat one
+                continue
+        return found
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -168,9 +172,9 @@ class Robot:
         """The joints with a coordinate."""
         return tuple(joint for joint in self.joints if joint.moves)
 
-    def children(self, link: str) -> tuple[RobotJoint, ...]:
+    def children(self, link: str) -> list[RobotJoint]:
         """Return the joints on a link."""
-        return tuple(joint for joint in self.joints if joint.parent == link)
+        return [joint for joint in self.joints if joint.parent == link]
 
     def path(self, link: str) -> tuple[RobotJoint, ...]:
         """Return the joints from the ground to a link."""
@@ -187,16 +191,6 @@ class Robot:
             own = motion_of(joint.kind, joint.axis, q[joint.name]) if joint.moves else np.eye(4)
             found[joint.child] = found[joint.parent] @ joint.pose @ own
         return found
-
-
-def _hull_volume(surface: Trimesh) -> float:
-    """Return the volume of a surface's convex hull, m3; 0 of a flat one."""
-    from scipy.spatial import QhullError
-
-    try:
-        return float(surface.convex_hull.volume)
-    except QhullError:
-        return 0.0
 
 
 # -- frames ----------------------------------------------------------------------------------
@@ -239,8 +233,15 @@ def roll_pitch_yaw_of(R: np.ndarray) -> tuple[float, float, float]:
     return roll, math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0]), yaw
 
 
+def number(value: float) -> str:
+    """Return a number as files have it, zero without a sign."""
+    return repr(float(value) + 0.0)
+
+
 # -- chosen links as solids: their frames from joint to joint, and their sizes -------------------
 
+CELLS = 6000  # of a solid, about
+FEWEST = 4  # over the smaller of height and thickness
 SLENDERNESS = 10.0  # length over height of a link whose geometry is not known
 SHORTEST = 1e-3  # m of a solid
 PARALLEL = 1e-6  # sine of the angle between axes
@@ -274,7 +275,7 @@ def solid_of(robot: Robot, name: str, tool: str) -> Solid:
             "point; choose a link with a length"
         )
     x = along / length
-    z = _across(x, inner.axis if inner.moves else None, pose[:3, :3] @ outer.axis)
+    z = _across(x, *([inner.axis] if inner.moves else []), pose[:3, :3] @ outer.axis)
     frame = pose_of(np.column_stack([x, np.cross(z, x), z]), first)
     points = robot.links[name].points @ frame[:3, :3]
     height, thickness = np.ptp(points[:, 1:], axis=0) if len(points) else (0.0, 0.0)
@@ -294,17 +295,15 @@ def _next_joint(robot: Robot, name: str, tool: str) -> tuple[RobotJoint, np.ndar
         joint, pose = waiting.pop(0)
         found.append((2 * (joint in onward) + joint.moves, joint, pose))
         if not joint.moves:
-            more = robot.children(joint.child)
-            waiting += [(other, pose @ other.pose) for other in more]
+            waiting += [(other, pose @ other.pose) for other in robot.children(joint.child)]
     if not found:
         raise InputError(
             f"{robot.file}: link {name!r}: nothing hangs on it, so that its outboard end is not "
             "known; add a fixed joint there with a link for the tool"
         )
     best = max(rank for rank, _, _ in found)
-    # Of fixed joints the last one: the tool's frame behind a flange.
     equal = [(joint, pose) for rank, joint, pose in found if rank == best]
-    return equal[0] if equal[0][0].moves else equal[-1]
+    return equal[0] if equal[0][0].moves else equal[-1]  # of fixed ones the tool's frame
 
 
 def _interfaces(
@@ -322,15 +321,11 @@ def _interfaces(
     return middle * inner.axis, last + (middle - last @ inner.axis) * inner.axis
 
 
-def _across(x: np.ndarray, *axes: np.ndarray | None) -> np.ndarray:
-    """Return the direction across x that is nearest to the first axis with one."""
-    for axis in (*axes, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])):
-        if axis is None:
-            continue
-        across = axis - (axis @ x) * x
-        if (size := float(np.linalg.norm(across))) > 0.1:
-            return np.asarray(across / size)
-    raise AssertionError("two of three axes lie across any direction")
+def _across(x: np.ndarray, *axes: np.ndarray) -> np.ndarray:
+    """Return the direction across x that is nearest to the first axis with one, z or y."""
+    found = (axis - (axis @ x) * x for axis in (*axes, *np.eye(3)[:0:-1]))
+    across = next(one for one in found if np.linalg.norm(one) > 0.1)
+    return np.asarray(across / float(np.linalg.norm(across)))
 
 
 # -- bodies and joints of a scene from a robot: chosen links become solids, the others are rigid
@@ -338,8 +333,7 @@ def _across(x: np.ndarray, *axes: np.ndarray | None) -> np.ndarray:
 # What fixed joints hold together is one body, except where a solid or the tool begins. A rigid body
 # has the frame of its link. A solid's x axis points from its inboard joint to its outboard one, its
 # z axis lies along the inboard joint's as far as it can, and its origin, like that of every frame
-# on
-# a joint that turns, may slide along the joint's axis. With G = F T the body's frame in that of
+# on a joint that turns, may slide along the joint's axis. With G = F T the body's frame in that of
 # the link F, and O the outboard interface in G, a joint of pose H has in the scene the pose
 #     O_parent^-1 T_parent^-1 H T_child,
 # and its axis a the components R_child' a: the same motion, for T_child moves the origin along a.
@@ -349,25 +343,15 @@ GROUND = "ground"
 
 @dataclass(frozen=True, eq=False)
 class SolidMesh:
-    """A solid in the shape of its link.
+    """A solid in the shape of its link."""
 
-    Attributes:
-        data: .msh file of its hexahedra.
-        cells: their number.
-        size: of a cell, m.
-        volume: m3.
-        ends: volume of the cells within `size` of the interfaces, m3.
-        offset: largest distance of an interface's middle from its joint, m.
-        done: what was done with the link's geometry, in a few words each.
-    """
-
-    data: bytes
-    cells: int
-    size: float
-    volume: float
-    ends: float
-    offset: float
-    done: tuple[str, ...]
+    data: bytes  # .msh file of its hexahedra
+    cells: int  # their number
+    size: float  # of a cell, m
+    volume: float  # m3
+    ends: float  # volume of the cells within `size` of the interfaces, m3
+    offset: float  # largest distance of an interface's middle from its joint, m
+    done: tuple[str, ...]  # with the link's geometry, in a few words each
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,45 +413,29 @@ def scene_bodies(
     for link, (body, _) in places.items():
         if link != body:
             continue
-        joint = robot.holder[link]
+        joint, solid = robot.holder[link], solids.get(link)
         parent, at = places[joint.parent]
-        solid = solids.get(link)
         frame = np.eye(4) if solid is None else solid.frame
         outboard = solids[parent].outboard if parent in solids else np.eye(4)
         links = tuple(name for name, (other, _) in places.items() if other == link)
         total = robot.links[link].own if solid else MASSLESS
         for name in () if solid else links:
             total = total + robot.links[name].own.posed(places[name][1])
-        found.append(
-            SceneBody(
-                link,
-                links,
-                joint,
-                parent,
-                frame,
-                inverse(outboard) @ at @ joint.pose @ frame,
-                frame[:3, :3].T @ joint.axis,
-                total.posed(inverse(frame)),
-                0.0 if solid is None else solid.length,
-                None if solid is None else solid.size,
-                solid is not None and solid.measured,
-            )
-        )
+        pose, axis = inverse(outboard) @ at @ joint.pose @ frame, frame[:3, :3].T @ joint.axis
+        own = (solid.length, solid.size, solid.measured) if solid else ()
+        inertia = total.posed(inverse(frame))
+        found.append(SceneBody(link, links, joint, parent, frame, pose, axis, inertia, *own))
     if any(one.parent == tool for one in found):
-        return (*found, _end(tool))
+        # A body without mass at the outboard interface of a tool on which others hang.
+        name, still = f"{tool}_end", np.eye(4)
+        joint = RobotJoint(name, "fixed", tool, name, still, still[0, :3])
+        return (*found, SceneBody(name, (), joint, tool, still, still, joint.axis, MASSLESS))
     return tuple(sorted(found, key=lambda one: one.link == tool))
-
-
-def _end(tool: str) -> SceneBody:
-    """Return a body without mass at the outboard interface of a tool on which others hang."""
-    name, one = f"{tool}_end", np.eye(4)
-    joint = RobotJoint(name, "fixed", tool, name, one, np.array([1.0, 0.0, 0.0]))
-    return SceneBody(name, (), joint, tool, one, one, joint.axis, MASSLESS)
 
 
 def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
     """Raise InputError unless the links that become solids, and the tool's, are there."""
-    for name in (*chosen, *([] if tool is None else [tool])):
+    for name in (*chosen, tool) if tool is not None else chosen:
         if name not in robot.links:
             near = difflib.get_close_matches(name, robot.links, 1)
             hint = f"did you mean {near[0]}?" if near else f"it has {', '.join(robot.links)}"

@@ -10,18 +10,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.robot import GROUND, Robot, RobotJoint, SceneBody, roll_pitch_yaw_of
+from dolfinopt.exchange.urdf.robot import (
+    CELLS,
+    FEWEST,
+    GROUND,
+    Robot,
+    RobotJoint,
+    SceneBody,
+    number,
+    roll_pitch_yaw_of,
+)
 from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_table
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
-CELLS = 6000  # of a solid, about
-FEWEST = 4  # over its height and over its thickness
 RADIUS = 2.0  # of the filter, in cells
 MATERIAL, DENSITY = "aluminium 6082-T6", 2700.0  # kg/m3
 FRACTION = 0.4  # of the volume of solids whose mass the file does not tell
@@ -106,11 +112,8 @@ class RobotScene:
         own, file = body.inertia, _one_line(self.robot.file.name)
         one = _extent(body)
         if body.mesh is None:
-            by = (
-                "the extents of its geometry"
-                if body.measured
-                else "a guess: its geometry does not tell"
-            )
+            guess = "a guess: its geometry does not tell"
+            by = f"{'the extents of its geometry' if body.measured else guess}: edit them"
             keys = [f"cells = {list(cells_of(body.length, *one.sides))}"]
         else:
             by = "those of its geometry"
@@ -122,17 +125,17 @@ class RobotScene:
                 keys.insert(0, f"# {'; '.join(body.mesh.done)}")
             if body.mesh.offset > CENTRED * max(one.sides):
                 keys.append(
-                    f"interface_offset = {_number(_up(1.001 * body.mesh.offset))}  # m, of their "
+                    f"interface_offset = {number(_up(1.001 * body.mesh.offset))}  # m, of their "
                     "middles from the joints"
                 )
         return [
             "[[arms]]",
             f"name = {_string(self.arms[body.link])}",
-            f"length = {_number(body.length)}  # m, from joint to joint",
-            f"height = {_number(one.sides[0])}  # m, {by}{'' if body.mesh else ': edit them'}",
-            f"thickness = {_number(one.sides[1])}",
+            f"length = {number(body.length)}  # m, from joint to joint",
+            f"height = {number(one.sides[0])}  # m, {by}",
+            f"thickness = {number(one.sides[1])}",
             *keys,
-            f"passive = {_number(one.passive)}  # m, kept solid at the joints: one layer of cells, "
+            f"passive = {number(one.passive)}  # m, kept solid at the joints: one layer of cells, "
             f"{DENSITY * one.ends:.3g} kg",
             f"# all solid it weighs {DENSITY * one.volume:.4g} kg; {file}: "
             f"{own.mass:.4g} kg, centre {_rounded(own.centre)}",
@@ -161,11 +164,6 @@ class RobotScene:
         said = f"starts at {start:.3g} kg of {DENSITY * one.volume:.3g} kg all solid"
         return f"{said}, the file says {body.inertia.mass:.3g} kg"
 
-    @property
-    def _weighed(self) -> bool:
-        """Whether the file tells the mass of every solid."""
-        return all(body.inertia.mass > 0.0 for body in self.bodies if body.is_solid)
-
     def mesh_name(self, body: SceneBody) -> str:
         """Return the name of a solid's mesh file."""
         return f"{self.arms[body.link]}.msh"
@@ -179,7 +177,7 @@ class RobotScene:
             *([f"# with {', '.join(map(_one_line, also))}, fixed to it"] if also else []),
             "rigid = true",
             "length = 0.0",
-            f"mass = {_number(own.mass)}",
+            f"mass = {number(own.mass)}",
             f"centre = {_list(own.centre)}",
             f"inertia = {_list(own.tensor[i] for i in INERTIA)}",
         ]
@@ -188,7 +186,7 @@ class RobotScene:
         joint = body.joint
         kind = "revolute" if joint.kind == "continuous" else joint.kind
         parent = GROUND if body.parent == GROUND else self.arms[body.parent]
-        R = body.pose[:3, :3]
+        rpy = np.array(roll_pitch_yaw_of(body.pose[:3, :3]))
         lines = [
             "[[joints]]",
             f"name = {_string(self.joints[joint.name])}",
@@ -196,7 +194,7 @@ class RobotScene:
             f"parent = {_string(parent)}",
             f"child = {_string(self.arms[body.link])}",
             f"origin = {_list(_tidy(body.pose[:3, 3]))}",
-            f"rpy = {_list(_tidy(np.array(roll_pitch_yaw_of(R))))}",
+            f"rpy = {_list(_tidy(rpy))}",
         ]
         if not joint.moves:
             return lines
@@ -204,23 +202,22 @@ class RobotScene:
         length, force = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
         if math.isfinite(joint.lower) and math.isfinite(joint.upper):
             lines.append(f"position_limits = {_list((joint.lower, joint.upper))}  # {length}")
-        for key, value, unit in (
-            ("velocity_limit", joint.velocity, f"{length}/s"),
-            ("effort_limit", joint.effort, force),
-        ):
-            if math.isfinite(value):
-                lines.append(f"{key} = {_number(value)}  # {unit}")
+        if math.isfinite(joint.velocity):
+            lines.append(f"velocity_limit = {number(joint.velocity)}  # {length}/s")
+        if math.isfinite(joint.effort):
+            lines.append(f"effort_limit = {number(joint.effort)}  # {force}")
         return lines
 
     def _rest(self) -> list[str]:
         """Return motion, payload and what of the defaults is not for a solid of this size."""
         side = max(_extent(body).cell for body in self.bodies if body.is_solid)
         fraction, initial = self.start
+        weighed = all(body.inertia.mass > 0.0 for body in self.bodies if body.is_solid)
         return [
             "[motion]",
             'path = "joints"',
             f"file = {_string(TRAJECTORY)}  # t in s, the joints in rad or m",
-            f"horizon = {_number(_up(self.duration * (1.0 + SETTLING)))}  # s simulated",
+            f"horizon = {number(_up(self.duration * (1.0 + SETTLING)))}  # s simulated",
             "gravity = [0.0, 0.0, -9.81]  # m/s2, in the robot's root frame",
             "",
             "[payload]",
@@ -233,10 +230,10 @@ class RobotScene:
             "coordinates = 6  # of a solid link: those of its outboard interface alone",
             "",
             "[design]",
-            f"volume_fraction = {_number(fraction)}  # of each solid link may stay: together as "
-            "heavy as in the URDF file" + ("" if self._weighed else ", as far as it tells"),
-            f"initial = {_number(initial)}  # density with which they begin so",
-            f"filter_radius = {_number(_up(RADIUS * side))}  # m",
+            f"volume_fraction = {number(fraction)}  # of each solid link may stay: together as "
+            "heavy as in the URDF file" + ("" if weighed else ", as far as it tells"),
+            f"initial = {number(initial)}  # density with which they begin so",
+            f"filter_radius = {number(_up(RADIUS * side))}  # m",
         ]
 
     def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
@@ -249,21 +246,18 @@ class RobotScene:
         new: dict[Path, str | bytes] = {
             folder / self.mesh_name(one): one.mesh.data for one in self.bodies if one.mesh
         }
-        joints = [self.joints[joint.name] for joint in self.robot.movable]
-        new[folder / TRAJECTORY] = _trajectory_text(joints, t, rows)
-        new[folder / RECORD] = json.dumps(self._record(folder), indent=2) + "\n"
-        return new | {folder / f"{self.robot.file.stem}.toml": self.text()}
-
-    def _record(self, folder: Path) -> dict[str, Any]:
-        """Return what `export --urdf` needs: the file, and every solid's link and frame."""
-        return {
-            "urdf": _path_from(self.robot.file, folder),
-            "solids": {
-                self.arms[body.link]: {"link": body.link, "frame": body.frame.tolist()}
-                for body in self.bodies
-                if body.is_solid
-            },
+        lines = [",".join(["t", *(self.joints[joint.name] for joint in self.robot.movable)])]
+        lines += [",".join(map(repr, map(float, row))) for row in np.column_stack([t, rows])]
+        new[folder / TRAJECTORY] = "\n".join(lines) + "\n"
+        # What `export --urdf` needs: the file, and every solid's link and frame.
+        urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
+        solids = {
+            self.arms[body.link]: {"link": body.link, "frame": body.frame.tolist()}
+            for body in self.bodies
+            if body.is_solid
         }
+        new[folder / RECORD] = json.dumps({"urdf": urdf, "solids": solids}, indent=2) + "\n"
+        return new | {folder / f"{self.robot.file.stem}.toml": self.text()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,20 +306,13 @@ def cells_of(length: float, height: float, thickness: float) -> tuple[int, int, 
 
 @dataclass(frozen=True)
 class _Extent:
-    """A solid as it stands in the scene.
+    """A solid as it stands in the scene."""
 
-    Attributes:
-        sides: height and thickness, m.
-        cell: longest side of a cell, m.
-        passive: length kept solid at the joints, m.
-        volume, ends: of all cells, and of those kept solid, m3.
-    """
-
-    sides: tuple[float, float]
-    cell: float
-    passive: float
-    volume: float
-    ends: float
+    sides: tuple[float, float]  # height and thickness, m
+    cell: float  # longest side of a cell, m
+    passive: float  # length kept solid at the joints, m
+    volume: float  # of all cells, m3
+    ends: float  # of those kept solid, m3
 
     @property
     def blurred(self) -> float:
@@ -347,10 +334,6 @@ def _extent(body: SceneBody) -> _Extent:
     return _Extent((height, thickness), max(along, *across), float(f"{passive:.6g}"), volume, ends)
 
 
-def _path_from(file: Path, folder: Path) -> str:
-    return Path(os.path.relpath(file.absolute(), folder.absolute())).as_posix()
-
-
 def _up(value: float) -> float:
     """Return a number rounded up to three digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)
@@ -366,12 +349,8 @@ def _rounded(values: Sequence[float] | np.ndarray) -> str:
     return "[" + ", ".join(f"{float(one):.4g}" for one in _tidy(np.asarray(values))) + "]"
 
 
-def _number(value: float) -> str:
-    return repr(float(value) + 0.0)
-
-
 def _list(values: Iterable[float]) -> str:
-    return "[" + ", ".join(map(_number, values)) + "]"
+    return "[" + ", ".join(map(number, values)) + "]"
 
 
 def _string(text: str) -> str:
@@ -405,11 +384,7 @@ def read_trajectory(robot: Robot, file: str) -> tuple[np.ndarray, np.ndarray, li
 
 
 def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a table's columns that are joints with a coordinate of their own.
-
-    Raises:
-        InputError: there is no column t; a column is no joint, a fixed one or one that follows.
-    """
+    """Return the names of a table's columns but t, all joints with a coordinate of their own."""
     joints = {joint.name: joint for joint in robot.joints}
     own = [joint.name for joint in robot.movable if joint.mimic is None]
     allowed = f"expected t and any of {', '.join(own)}"
@@ -419,20 +394,18 @@ def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...
     for name in found:
         if name in own:
             continue
-        joint = joints.get(name)
-        if joint is None:
-            raise InputError(f"{file}: column {name!r}: the robot has no such joint; {allowed}")
-        what = "is fixed" if not joint.moves else f"follows {joint.mimic.joint!r}"  # type: ignore
-        raise InputError(f"{file}: column {name!r}: this joint {what}; {allowed}")
+        what = "this joint is fixed"
+        if (joint := joints.get(name)) is None:
+            what = "the robot has no such joint"
+        elif joint.mimic is not None:
+            what = f"this joint follows {joint.mimic.joint!r}"
+        raise InputError(f"{file}: column {name!r}: {what}; {allowed}")
     return found
 
 
 def _complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Return values (n, joints) of all joints that move, and a sentence on those not in the table.
-
-    A joint that is not in the table stands at zero, or at the limit nearest to it; one that
-    follows another does so.
-    """
+    """Return values (n, joints) of all joints that move, and a sentence on those not given."""
+    # Such a joint stands at zero, or at the limit nearest to it; one that follows another does so.
     given = dict(zip(names, np.asarray(rows, dtype=float).T, strict=True))
     held = []
     for joint in robot.movable:
@@ -449,21 +422,15 @@ def _complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.
 
 
 def _check_positions(robot: Robot, file: str, lines: Sequence[int], rows: np.ndarray) -> None:
-    """Raise InputError for the first value beyond a joint's limits.
-
-    Args:
-        robot: the robot.
-        file: of the table, for the message.
-        lines: of the rows in the file.
-        rows: (n, joints) of all joints that move, rad or m.
-    """
+    """Raise InputError for the first of the rows (n, joints) beyond a joint's limits."""
     for joint, values in zip(robot.movable, np.asarray(rows).T, strict=True):
         width = joint.upper - joint.lower
         slack = LIMIT_ROUNDING * width if np.isfinite(width) else 0.0
         beyond = np.flatnonzero((values < joint.lower - slack) | (values > joint.upper + slack))
         if beyond.size:
             k = beyond[0]
-            degrees = " (are these degrees?)" if _looks_like_degrees(joint, values) else ""
+            turned = joint.kind != "prismatic" and np.abs(values).max() > 4.0 * np.pi
+            degrees = " (are these degrees?)" if turned else ""
             raise InputError(
                 f"{file}: line {lines[k]}, joint {joint.name} = {values[k]:g}: expected "
                 f"{joint.lower:g} to {joint.upper:g} [{_unit(joint)}], its limits{degrees}"
@@ -483,16 +450,5 @@ def _too_fast(robot: Robot, file: str, rates: np.ndarray) -> list[str]:
     return found
 
 
-def _trajectory_text(names: Sequence[str], t: np.ndarray, rows: np.ndarray) -> str:
-    """Return a table, t in s and a column for each joint, as CSV."""
-    lines = [",".join(["t", *names])]
-    lines += [",".join(repr(float(x)) for x in (at, *row)) for at, row in zip(t, rows)]
-    return "\n".join(lines) + "\n"
-
-
 def _unit(joint: RobotJoint) -> str:
     return "m" if joint.kind == "prismatic" else "rad"
-
-
-def _looks_like_degrees(joint: RobotJoint, values: np.ndarray) -> bool:
-    return joint.kind != "prismatic" and float(np.abs(values).max()) > 4.0 * np.pi

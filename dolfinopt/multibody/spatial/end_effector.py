@@ -13,6 +13,13 @@ from scipy.spatial.transform import Rotation
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.machine import (
+    Mechanism,
+    Pose,
+    RigidChain,
+    end_chain,
+    roll_pitch_yaw,
+)
 from dolfinopt.multibody.measured import (
     DAMPED_ITERATIONS,
     FOLLOWED_RESIDUAL_SHARE,
@@ -28,13 +35,6 @@ from dolfinopt.multibody.measured import (
     START_GUESSES,
 )
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
-from dolfinopt.multibody.spatial.mechanism import (
-    Pose,
-    RigidChain,
-    SpatialMechanism,
-    end_chain,
-    roll_pitch_yaw,
-)
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
 from dolfinopt.scene.load import Scene
@@ -76,7 +76,7 @@ class Frames:
         )
 
 
-def body_frames(mechanism: SpatialMechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
+def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
     """Return the frames of all bodies.
 
     Args:
@@ -498,13 +498,8 @@ class Follower:
             raise self._singular(t)
 
     def _lost(self, t: float, q: np.ndarray, first: float | None = None) -> InputError:
-        """Return why the path cannot be followed to t: out of reach, or through a singularity.
-
-        Args:
-            t: an instant that is not reached, s.
-            q: (1, joints) shortly before.
-            first: the first instant that is not; default: t.
-        """
+        """Return why the path cannot be followed to t: out of reach, or at a singularity."""
+        # The joints q (1, .) are those shortly before; `first` is the first instant not reached.
         for instant in (t, t if first is None else first):
             path = end_path(np.array([instant]), self.scene)
             guess = self.spread(q[:, self.unknown], path.joints[0])

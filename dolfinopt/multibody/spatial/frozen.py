@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.multibody.inverse_dynamics import outward_pass
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.spatial.mechanism import (
+from dolfinopt.multibody.machine import (
     ONE,
-    SpatialMechanism,
     rigid_spatial_body,
     skew,
 )
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
@@ -75,7 +75,7 @@ class FrozenTree:
         kind: "rigid-body" everything outboard, "point-mass" its mass alone, "none" nothing.
     """
 
-    mechanism: SpatialMechanism
+    mechanism: Mechanism
     motion: RigidMotion
     kind: str
 
@@ -84,7 +84,7 @@ class FrozenTree:
         """Motion of every body's frame by that of the interface that it hangs on (6, 6)."""
         none, units = np.zeros((1, 0)), np.eye(6)[:, :, None]
         found = []
-        for link in outward_pass(self.mechanism.tree, self.motion, (none, none, none)):
+        for link in outward_pass(self.mechanism, self.motion, (none, none, none)):
             loads = link.joint.at_interface((units[:3], units[3:]))
             found.append(np.concatenate(loads)[:, :, 0].T)
         return found
@@ -98,10 +98,10 @@ class FrozenTree:
     def _beyond(self, body: int, interface: int) -> list[tuple[int, np.ndarray]]:
         """Return the bodies outboard of an interface, and their motion by that of it."""
         found: list[tuple[int, np.ndarray]] = []
-        for i in self.mechanism.tree.hanging.get((body, interface), ()):
+        for i in self.mechanism.hanging.get((body, interface), ()):
             own = self._steps[i]
             found.append((i, own))
-            for s in self.mechanism.tree.sites[i]:
+            for s in self.mechanism.sites[i]:
                 shift = self._shift(i, s) @ own
                 found += [(j, T @ shift) for j, T in self._beyond(i, s)]
         return found
@@ -110,13 +110,13 @@ class FrozenTree:
         self, body: int, interface: int
     ) -> Iterator[tuple[ShapeIntegrals, np.ndarray]]:
         """Yield what is carried at an interface and outboard of it, and its motion likewise."""
-        loads = self.mechanism.every_load
+        loads = self.mechanism.loads
         if (body, interface) in loads:
-            yield loads[body, interface], np.eye(6)
+            yield loads[body, interface].body, np.eye(6)
         for i, T in self._beyond(body, interface):
-            for s in self.mechanism.tree.sites[i]:
+            for s in self.mechanism.sites[i]:
                 if (i, s) in loads:
-                    yield loads[i, s], self._shift(i, s) @ T
+                    yield loads[i, s].body, self._shift(i, s) @ T
 
     def carried(self) -> list[CarriedInertia]:
         """Return what every body carries, about its interfaces' points, in its own frame."""
@@ -124,7 +124,7 @@ class FrozenTree:
         for k, body in enumerate(self.mechanism.bodies):
             size = 6 * len(body.points)
             whole = np.zeros((size, size))
-            for s in self.mechanism.tree.sites[k]:
+            for s in self.mechanism.sites[k]:
                 M = np.zeros((6, 6))
                 for i, T in self._beyond(k, s):
                     M += T.T @ mass_matrix(self.mechanism.bodies[i]) @ T
@@ -155,7 +155,7 @@ class FrozenTree:
         """Return the derivatives by every body's integrals from those by `carried` (b, b)."""
         by_matrix: dict[int, np.ndarray] = {}
         for k, by in enumerate(by_carried):
-            for s in self.mechanism.tree.sites[k] if by.any() else ():
+            for s in self.mechanism.sites[k] if by.any() else ():
                 place = slice(6 * s, 6 * s + 6)
                 inner = self._kept_transposed(by[place, place])
                 for i, T in self._beyond(k, s):

@@ -21,6 +21,7 @@ ObjectiveKind = Literal[
     "settling",
     "orientation",
     "stress",
+    "buckling",
     "mass",
     "effort",
     "peak_force",
@@ -303,7 +304,59 @@ Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
-Limit = float | tuple[float | None, ...]
+Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
+Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
+
+
+class StiffnessCase(Table):
+    """A static load on one arm, and how far it may move the arm's outboard interface."""
+
+    arm: str = Field(description="name of the arm, which is clamped at its inboard interface [-]")
+    force: tuple[Component, Component] | tuple[Component, Component, Component] | None = Field(
+        default=None,
+        description="force at the outboard interface in the arm's frame: two components, three of "
+        "a solid [N]",
+    )
+    moment: Component | tuple[Component, Component, Component] | None = Field(
+        default=None,
+        description="moment there: one number, of a solid three components [N m]",
+    )
+    displacement: Distance | None = Field(
+        default=None, description="upper limit of the length of the interface's displacement [m]"
+    )
+    rotation: Angle | None = Field(
+        default=None,
+        description="upper limit of its rotation, of a solid its vector's length [rad]",
+    )
+
+    @property
+    def load(self) -> tuple[float, ...]:
+        """Force and moment, three components in the plane and six in space."""
+        force, moment = self.force, self.moment
+        spatial = isinstance(moment, tuple) or (force is not None and len(force) == 3)
+        none = 3 * (0.0,) if spatial else (0.0, 0.0)
+        turning = moment if isinstance(moment, tuple) else (moment or 0.0,)
+        if spatial and moment is None:
+            turning = none
+        return (*(force or none), *turning)
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse what is no arm with a design, no load on it, or without limit."""
+        names = [arm.name for arm in scene.arms if arm.flexible]
+        if self.arm not in names:
+            raise Refusal(
+                f"expected the name of an arm with a design: {', '.join(names)}", (*at, "arm")
+            )
+        if self.displacement is None and self.rotation is None:
+            raise Refusal("expected displacement or rotation, or both", at)
+        if not any(self.load):
+            raise Refusal("expected force or moment, not all of them zero", at)
+        if len(self.load) != (6 if scene.is_spatial else 3):
+            kind = "three components each" if scene.is_spatial else "two components and one number"
+            raise Refusal(f"expected force and moment of {kind} in this scene", at)
+
+
+Limit = float | tuple[float | None, ...] | tuple[StiffnessCase, ...]
 
 
 class Constraints(Table):
@@ -343,6 +396,11 @@ class Constraints(Table):
         description="upper limit of the largest von Mises stress of all arms along the motion, "
         "relaxed for intermediate density [Pa]",
     )
+    buckling: Factor | None = Field(
+        default=None,
+        description="lower limit of the buckling factor, by which all loads of an instant may grow "
+        "until an arm buckles, in the plane of a plane arm; above 1000 nothing buckles [-]",
+    )
     effort: Effort | None = Field(
         default=None,
         description="upper limit of the weighted root mean square of the drives' forces, see "
@@ -363,6 +421,9 @@ class Constraints(Table):
         description="upper limit of the static deflection of the outboard interface of every "
         "designed arm under objective.loads, one for all or one for each [m]",
     )
+    stiffness: tuple[StiffnessCase, ...] | None = Field(
+        default=None, description="static load cases, each with the largest displacement [-]"
+    )
 
     @field_validator("peak_force", mode="before")
     @classmethod
@@ -374,6 +435,13 @@ class Constraints(Table):
         if free and all(one is None for one in free):
             raise Refusal("expected a limit for one drive at least")
         return free
+
+    @field_validator("stiffness")
+    @classmethod
+    def _check_cases(cls, cases: tuple[StiffnessCase, ...] | None) -> Any:
+        if cases == ():
+            raise Refusal("expected at least one table [[constraints.stiffness]]")
+        return cases
 
     @property
     def limits(self) -> dict[str, Limit]:
@@ -390,9 +458,11 @@ class Constraints(Table):
         }
         for key, limit in self.limits.items():
             names = owners.get(key, [])
-            if isinstance(limit, tuple) and len(limit) != len(names):
+            if key in owners and isinstance(limit, tuple) and len(limit) != len(names):
                 number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
                 raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
+        for index, one in enumerate(self.stiffness or ()):
+            one.check_in_scene(scene, (*at, "stiffness", index))
         self._check_delay(scene.motion, (*at, "settling_after"))
 
     def _check_delay(self, motion: Motion, own: Loc) -> None:
@@ -431,15 +501,19 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "settling": MOTION,
     "orientation": MOTION,
     "stress": MOTION,
+    "buckling": MOTION,
     "static": STATICS,
     "eigenfrequency": VIBRATION,
     "first_frequency": VIBRATION,
     "tip_deflection": STATICS,
+    "stiffness": STATICS,
     "effort": MOTION,
     "peak_force": MOTION,
 }
-# Those that no equivalent static load tells anything of: their gradient is always the exact one.
-EXACT_ONLY = frozenset({"effort", "peak_force"})
+# Forces of drives, of which no equivalent static load tells anything: their gradient is always the
+# exact one, and so is that of buckling.
+FORCES = frozenset({"effort", "peak_force"})
+EXACT_ONLY = FORCES | {"buckling"}
 # What uses an option of [objective]: as objective, and under [constraints].
 OPTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "worst": (("esl",), ("esl",)),

@@ -1,4 +1,4 @@
-"""A URDF file as a `Robot`: parsed by yourdfpy, checked for what a scene can hold."""
+"""A URDF file as a `Robot`: parsed by yourdfpy, checked for what a scene can hold; written back."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.robot import MOVABLE, Inertia, Mimic, Robot, RobotJoint, RobotLink
+from dolfinopt.exchange.urdf.robot import (
+    MOVABLE,
+    Inertia,
+    Mimic,
+    Robot,
+    RobotJoint,
+    RobotLink,
+    number,
+)
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -36,13 +45,16 @@ def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
         InputError: yourdfpy is not installed; no such file; not URDF; joints that a scene does not
             have (floating, planar); links that are no tree.
     """
-    yourdfpy = _library()
-    tree = _parse(file)
+    try:
+        from yourdfpy import URDF
+    except ImportError:
+        raise InputError(
+            f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
+        ) from None
+    tree = BytesIO(_parse(file))
     with _quiet():
         try:
-            model = yourdfpy.URDF.load(
-                BytesIO(tree), build_scene_graph=False, load_meshes=False
-            ).robot
+            model = URDF.load(tree, build_scene_graph=False, load_meshes=False).robot
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(
                 f"{file}: not a robot that yourdfpy can read ({type(error).__name__}: {error}); "
@@ -57,27 +69,17 @@ def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
     return Robot(model.name, file, links, ordered, root)
 
 
-def _library() -> Any:
-    try:
-        import yourdfpy
-    except ImportError:
-        raise InputError(
-            f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
-        ) from None
-    return yourdfpy
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep what yourdfpy and trimesh log to themselves: errors are told in one line."""
     loggers = [logging.getLogger(name) for name in ("yourdfpy", "yourdfpy.urdf", "trimesh")]
-    levels = [one.level for one in loggers]
+    levels = [(one, one.level) for one in loggers]
     for one in loggers:
         one.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        for one, level in zip(loggers, levels, strict=True):
+        for one, level in levels:
             one.setLevel(level)
 
 
@@ -153,36 +155,23 @@ def _joint(file: Path, one: Any) -> RobotJoint:
     if one.type != "fixed" and not (math.isfinite(length) and length > 0.0):
         raise InputError(f"{where}: axis {axis.tolist()}; expected three numbers, not all zero")
     limit = one.limit
-    lower, upper = (-math.inf, math.inf)
-    if limit is not None and one.type in ("revolute", "prismatic"):
-        lower = 0.0 if limit.lower is None else limit.lower
-        upper = 0.0 if limit.upper is None else limit.upper
-        if limit.lower is None and limit.upper is None:
-            lower, upper = -math.inf, math.inf
-        _check_finite(f"{where}: limit", [x for x in (limit.lower, limit.upper) if x is not None])
+    lower, upper = -math.inf, math.inf
+    stated = [] if limit is None else [x for x in (limit.lower, limit.upper) if x is not None]
+    if stated and one.type in ("revolute", "prismatic"):
+        lower, upper = limit.lower or 0.0, limit.upper or 0.0
+        _check_finite(f"{where}: limit", stated)
         if lower > upper:
             raise InputError(f"{where}: limit lower = {lower:g} above upper = {upper:g}")
-    rate, effort = (
-        math.inf if limit is None else _limit(where, word, getattr(limit, word))
-        for word in ("velocity", "effort")
-    )
-    return RobotJoint(
-        one.name,
-        one.type,
-        one.parent,
-        one.child,
-        _pose(one.origin),
-        axis / length if length else np.array([1.0, 0.0, 0.0]),
-        lower,
-        upper,
-        rate,
-        effort,
-        _mimic(one.mimic) if one.type != "fixed" else None,
-    )
+    rate, effort = (_limit(where, word, limit) for word in ("velocity", "effort"))
+    unit = axis / length if length else np.array([1.0, 0.0, 0.0])
+    mimic = None if one.type == "fixed" or one.mimic is None else _mimic(one.mimic)
+    own = one.name, one.type, one.parent, one.child, _pose(one.origin), unit
+    return RobotJoint(*own, lower, upper, rate, effort, mimic)
 
 
-def _limit(where: str, word: str, value: float | None) -> float:
+def _limit(where: str, word: str, limit: Any) -> float:
     """Return a limit of rate or effort; files that know none say 0, or nothing."""
+    value = None if limit is None else getattr(limit, word)
     if not value:
         return math.inf
     if math.isnan(value) or value < 0.0:
@@ -190,20 +179,15 @@ def _limit(where: str, word: str, value: float | None) -> float:
     return float(value)
 
 
-def _mimic(one: Any) -> Mimic | None:
-    if one is None:
-        return None
+def _mimic(one: Any) -> Mimic:
     multiplier = 1.0 if one.multiplier is None else float(one.multiplier)
     return Mimic(one.joint, multiplier, 0.0 if one.offset is None else float(one.offset))
 
 
 def _check_mimics(file: Path, joints: list[RobotJoint]) -> None:
-    by_name = {joint.name: joint for joint in joints}
+    leading = {one.name for one in joints if one.moves and one.mimic is None}
     for joint in joints:
-        if joint.mimic is None:
-            continue
-        other = by_name.get(joint.mimic.joint)
-        if other is None or not other.moves or other.mimic is not None:
+        if joint.mimic is not None and joint.mimic.joint not in leading:
             raise InputError(
                 f"{file}: joint {joint.name!r}: follows {joint.mimic.joint!r}; expected a joint "
                 "that moves and follows no other"
@@ -228,13 +212,11 @@ def _ordered(
             f"{file}: {len(roots)} links that no joint holds ({', '.join(roots) or 'none'}); "
             "expected one, which stands on the ground"
         )
-    placed, found = {roots[0]}, []
-    waiting = list(joints)
+    placed, found, waiting = {roots[0]}, [], list(joints)
     while waiting:
-        more = [joint for joint in waiting if joint.parent in placed]
-        if not more:
+        first = next((joint for joint in waiting if joint.parent in placed), None)
+        if first is None:
             raise InputError(f"{file}: joint {waiting[0].name!r} is part of a loop")
-        first = more[0]
         found.append(first)
         placed.add(first.child)
         waiting.remove(first)
@@ -293,9 +275,8 @@ def _inertia(file: Path, link: Any) -> Inertia | None:
 def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
     values = np.atleast_1d(np.asarray(numbers, dtype=float))
     if not np.isfinite(values).all() or (positive and (values <= 0.0).any()):
-        found = ", ".join(f"{value:g}" for value in values.ravel())
-        raise InputError(f"{where}: expected {'positive' if positive else 'finite'} numbers, "
-                         f"found {found}")  # fmt: skip
+        kind, found = "positive" if positive else "finite", ", ".join(f"{x:g}" for x in values.flat)
+        raise InputError(f"{where}: expected {kind} numbers, found {found}")
 
 
 def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -> Trimesh:
@@ -306,12 +287,11 @@ def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -
         if (one := getattr(geometry, kind)) is not None:
             size = np.hstack([getattr(one, name) for name in names])
             _check_finite(f"{file}: link {link!r}: size of a {kind}", size, positive=True)
-    if geometry.box is not None:
-        return creation.box(extents=geometry.box.size)
-    if geometry.sphere is not None:
-        return creation.icosphere(subdivisions=4, radius=geometry.sphere.radius)
-    if geometry.cylinder is not None:
-        one = geometry.cylinder
+    if (one := geometry.box) is not None:
+        return creation.box(extents=one.size)
+    if (one := geometry.sphere) is not None:
+        return creation.icosphere(subdivisions=4, radius=one.radius)
+    if (one := geometry.cylinder) is not None:
         return creation.cylinder(radius=one.radius, height=one.length, sections=SECTIONS)
     return _mesh(file, geometry.mesh, package_path)
 
@@ -322,9 +302,8 @@ def _mesh(file: Path, mesh: Any, package_path: Sequence[Path]) -> Trimesh:
     path = mesh_path(file, mesh.filename, package_path) if mesh.filename else None
     if path is None:
         raise FileNotFoundError(mesh.filename)
-    load: Callable[..., Any] = trimesh.load_mesh
     try:
-        found = load(os.fspath(path))
+        found: Any = trimesh.load_mesh(os.fspath(path))
     except Exception as error:  # every format has its own
         raise FileNotFoundError(mesh.filename) from error
     if not isinstance(found, trimesh.Trimesh) or not len(found.faces):
@@ -401,10 +380,11 @@ ROUNDING = 1e-6
 
 def implausible_inertias(robot: Robot) -> list[str]:
     """Return a sentence for every inertia of a robot that cannot be, or hardly."""
-    found = []
-    for link in robot.links.values():
-        found += [f"{robot.file}: link {link.name!r}: {what}" for what in _of_link(robot, link)]
-    return found
+    return [
+        f"{robot.file}: link {link.name!r}: {what}"
+        for link in robot.links.values()
+        for what in _of_link(robot, link)
+    ]
 
 
 def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
@@ -421,15 +401,11 @@ def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
             yield "an inertia without mass"
         return
     principal = np.linalg.eigvalsh(tensor)
+    told = f"principal moments {', '.join(f'{value:.4g}' for value in principal)} kg m2"
     if principal[0] <= 0.0:
-        yield (
-            f"its inertia is not positive definite: principal moments {_listed(principal)} kg m2"
-        )
+        yield f"its inertia is not positive definite: {told}"
     elif principal[2] > (1.0 + ROUNDING) * (principal[0] + principal[1]):
-        yield (
-            f"its inertia cannot be: of the principal moments {_listed(principal)} kg m2 the "
-            "largest exceeds the sum of the others"
-        )
+        yield f"its inertia cannot be: of the {told} the largest exceeds the sum of the others"
     if len(link.points):
         yield from _of_size(link, principal)
 
@@ -437,30 +413,99 @@ def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
 def _of_size(link: RobotLink, principal: np.ndarray) -> Iterator[str]:
     """Compare mass, centre and inertia with the link's geometry."""
     mass, centre = link.own.mass, link.own.centre
-    low, high = link.points.min(axis=0), link.points.max(axis=0)
-    diagonal = float(np.linalg.norm(high - low))
-    away = float(np.linalg.norm(np.maximum(0.0, np.maximum(low - centre, centre - high))))
+    first, last = link.points.min(axis=0), link.points.max(axis=0)
+    diagonal = float(np.linalg.norm(last - first))
+    away = float(np.linalg.norm(np.maximum(0.0, np.maximum(first - centre, centre - last))))
     if away > OUTSIDE * diagonal:
         yield f"its centre of mass is {away:.3g} m outside its geometry, {diagonal:.3g} m across"
     gyration = float(np.sqrt(max(0.0, principal.sum() / 2.0 / mass)))
-    if gyration > diagonal:
+    if not SLENDER * diagonal <= gyration <= diagonal:
         yield (
-            f"its inertia is too large: a radius of gyration of {gyration:.3g} m in a geometry "
-            f"{diagonal:.3g} m across"
-        )
-    elif gyration < SLENDER * diagonal:
-        yield (
-            f"its inertia is too small: a radius of gyration of {gyration:.3g} m in a geometry "
-            f"{diagonal:.3g} m across"
+            f"its inertia is too {'large' if gyration > diagonal else 'small'}: a radius of "
+            f"gyration of {gyration:.3g} m in a geometry {diagonal:.3g} m across"
         )
     density = mass / link.volume if link.volume > 0.0 else np.inf
     if not DENSITIES[0] <= density <= DENSITIES[1]:
-        low_density, high_density = DENSITIES
         yield (
             f"{mass:.4g} kg in {link.volume:.3g} m3 are {density:.3g} kg/m3; expected "
-            f"{low_density:g} to {high_density:g}: mass or unit of the geometry (mm?) is wrong"
+            f"{DENSITIES[0]:g} to {DENSITIES[1]:g}: mass or unit (mm?) of the geometry is wrong"
         )
 
 
-def _listed(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.4g}" for value in values)
+# -- the file as it was, with new inertia and meshes of some links -------------------------------
+
+INDENT = "  "
+
+
+@dataclass(frozen=True, eq=False)
+class NewLink:
+    """What a link is from now on, in its frame."""
+
+    name: str
+    inertia: Inertia
+    mesh: str | None = None  # file of its surface, as the URDF file names it; None: shapes stay
+
+
+def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
+    """Return the text of a URDF file in `folder` in which some links are new.
+
+    All else stays, comments and elements of other programs included; names of meshes relative to
+    the file become relative to `folder`.
+
+    Raises:
+        InputError: the file cannot be read, or has no such link.
+    """
+    from lxml import etree
+
+    try:
+        tree = safe_xml(file)
+    except (OSError, etree.XMLSyntaxError) as error:
+        raise InputError(f"{file}: cannot be read ({error}); --urdf needs the robot") from None
+    by_name = {one.get("name"): one for one in tree.getroot().iterfind("link")}
+    for mesh in tree.getroot().iter("mesh"):
+        name = mesh.get("filename", "")
+        if "://" not in name and not os.path.isabs(name):
+            path = os.path.relpath(os.path.abspath(file.parent / name), os.path.abspath(folder))
+            mesh.set("filename", Path(path).as_posix())
+    for link in links:
+        if link.name not in by_name:
+            raise InputError(f"{file}: no link {link.name!r}; is it the robot of the scene?")
+        one = by_name[link.name]
+        material = one.find("visual/material")
+        _replace(one, _inertial(link.inertia))
+        for kind in () if link.mesh is None else ("visual", "collision"):
+            new = etree.Element(kind)
+            etree.SubElement(etree.SubElement(new, "geometry"), "mesh", filename=link.mesh)
+            if kind == "visual" and material is not None:
+                new.append(material)
+            _replace(one, new)
+    text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
+    return text + b"\n"
+
+
+def _replace(parent: Any, new: Any) -> None:
+    """Put an element in the place of the first of its kind, and remove the others."""
+    from lxml import etree
+
+    old = parent.findall(new.tag)
+    at = parent.index(old[0]) if old else len(parent)
+    for one in old:
+        parent.remove(one)
+    etree.indent(new, INDENT, level=2)
+    new.tail = "\n" + 2 * INDENT
+    if not (parent.text or "").strip():
+        parent.text = parent.text or "\n" + 2 * INDENT
+    parent.insert(at, new)
+    parent[-1].tail = "\n" + INDENT  # the end of a link on a line of its own
+
+
+def _inertial(inertia: Inertia) -> Any:
+    from lxml import etree
+
+    element = etree.Element("inertial")
+    etree.SubElement(element, "origin", xyz=" ".join(map(number, inertia.centre)), rpy="0 0 0")
+    etree.SubElement(element, "mass", value=number(inertia.mass))
+    pairs = ("xx", "xy", "xz", "yy", "yz", "zz")
+    moments = inertia.tensor[np.triu_indices(3)]
+    etree.SubElement(element, "inertia", **{f"i{k}": number(x) for k, x in zip(pairs, moments)})
+    return element

@@ -1,105 +1,28 @@
-"""A tree of rigid and flexible bodies in space: what inverse dynamics works on.
-
-Every body hangs on its parent's outboard interface, or on the ground, by one joint, whose frame is
-placed as in URDF; the body's own frame is the joint's. What a body carries at its outboard
-interface without a joint (payload, motor) is a rigid body in the interface's frame. Source:
-Featherstone, Rigid Body Dynamics Algorithms (2008); Schwertassek & Wallrapp (1999).
-"""
+"""A scene as a machine: rigid bodies and rotations in space, joints, mechanism, motion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.dimension import series
-from dolfinopt.multibody.mechanism import GROUND, ElasticBodies, Joint, Site, Tree
-from dolfinopt.multibody.motion import RigidMotion, along_table, columns_of
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.mechanism import GROUND, Joint, JointHardware, Mechanism, Site, plane_chain
+from dolfinopt.multibody.motion import (
+    RigidMotion,
+    along_table,
+    check_plane_motion,
+    columns_of,
+    curve_of_table,
+    rigid_motion,
+)
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
+from dolfinopt.paths.tables import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.arms import interface_number
-
-
-@dataclass(frozen=True, eq=False)
-class SpatialMechanism(ElasticBodies):
-    """Bodies, the joints that hold them, what they carry, and gravity.
-
-    Attributes:
-        bodies: in the order of the elastic coordinates.
-        joints: that hold them, in the same order.
-        carried: what every body carries at its first outboard interface, a rigid body in the frame
-            of the interface, or None; an empty tuple for nothing at all.
-        gravity: (3,) m/s2.
-        end: index of the body that has the end-effector.
-        end_interface: which of its interfaces that is, 0 the first.
-        carried_further: what bodies carry at other interfaces, likewise, by (body, interface).
-    """
-
-    joints: tuple[Joint, ...]
-    carried: tuple[ShapeIntegrals | None, ...]
-    gravity: np.ndarray
-    end: int
-    end_interface: int = 0
-    carried_further: Mapping[Site, ShapeIntegrals] = field(default_factory=dict)
-
-    @cached_property
-    def tree(self) -> Tree:  # type: ignore[override]
-        """Itself as inverse dynamics goes along it."""
-        loads = {site: Constants(one) for site, one in self.every_load.items()}
-        constants = tuple(map(Constants, self.bodies))
-        return Tree(constants, self.slices, self.joints, loads, self.gravity[:, None])
-
-    @cached_property
-    def every_load(self) -> dict[Site, ShapeIntegrals]:
-        """All that bodies carry, by (body, interface)."""
-        first = {(i, 0): one for i, one in enumerate(self.carried) if one is not None}
-        return first | dict(self.carried_further)
-
-    @cached_property
-    def way(self) -> tuple[Site, ...]:  # type: ignore[override]
-        """From the ground to the end-effector: every body and the interface that leads on."""
-        found = [(self.end, self.end_interface)]
-        while (joint := self.joints[found[0][0]]).parent != GROUND:
-            found.insert(0, (joint.parent, joint.interface))
-        return tuple(found)
-
-    @property
-    def softness(self) -> float:
-        """Largest static deflection of an interface by a unit force, m/N."""
-        found = [0.0]
-        for body in self.bodies:
-            if body.num_modes:
-                for B in body.outboard.reshape(-1, 6, body.num_modes)[:, :3]:
-                    soft = B @ np.linalg.solve(body.K, B.T)
-                    found.append(float(np.linalg.eigvalsh(0.5 * (soft + soft.T))[-1]))
-        return max(found)
-
-    @property
-    def levers(self) -> np.ndarray:
-        """Deflection of the end by unit rigid coordinates (joints,), m; at most."""
-        reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in self.bodies)
-        reach += sum(float(np.linalg.norm(one.origin)) for one in self.joints)
-        slides = [self.joints[i].kind == "prismatic" for i in self.tree.movable]
-        return np.where(slides, 1.0, reach)
-
-    @property
-    def num_rigid(self) -> int:
-        """Number of rigid coordinates."""
-        return len(self.tree.movable)
-
-    def __getitem__(self, part: slice | np.ndarray) -> SpatialMechanism:
-        """Return itself: it is the same at all instants."""
-        return self
-
-    @property
-    def rotors(self) -> np.ndarray:
-        """Reflected inertia of every rigid coordinate's drive."""
-        return self.tree.rotors
-
 
 # -- rigid bodies ----------------------------------------------------------------------------
 
@@ -303,28 +226,51 @@ def rigid_link(arm: Arm, density: float) -> ShapeIntegrals:
     return rigid_spatial_body(mass, centre, _tensor(inertia), (x, 0.0, 0.0), further)
 
 
+def flat_bar(arm: Arm, density: float) -> ShapeIntegrals:
+    """Return a rigid arm's body in the plane likewise."""
+    mass = density * arm.length * arm.height * arm.thickness if arm.mass is None else arm.mass
+    assert not isinstance(arm.inertia, tuple)  # the scene would have refused it
+    return rigid_bar(arm.length, arm.height, mass, arm.inertia)
+
+
+RIGID_ARMS = {2: flat_bar, 3: rigid_link}  # by the machine's dimension
+
+
 def _tensor(inertia: float | Inertia) -> Inertia:
     """Return xx, yy, zz, xy, xz, yz; a number is the moment about every axis."""
     return inertia if isinstance(inertia, tuple) else (*[inertia] * 3, 0.0, 0.0, 0.0)
 
 
-def build_spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> SpatialMechanism:
+def spatial_mechanism(
+    bodies: Sequence[ShapeIntegrals],
+    joints: Sequence[Joint],
+    carried: Mapping[Site, ShapeIntegrals],
+    gravity: Sequence[float] | np.ndarray,
+    end: Site,
+) -> Mechanism:
+    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
+    loads = {site: Constants(one) for site, one in carried.items()}
+    down = np.array(gravity, dtype=float)[:, None]
+    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
+
+
+def build_spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     """Put the bodies on the scene's joints, with what they carry.
 
     Args:
         scene: with [[joints]].
         bodies: of the arms, in the scene's order.
     """
-    gravity = scene.motion.gravity
-    end, interface = scene.end_effector
-    return SpatialMechanism(
-        bodies=tuple(bodies),
-        joints=joints_of(scene),
-        carried=tuple(_carried(scene, k) for k in range(len(bodies))),
-        gravity=np.array(gravity if len(gravity) == 3 else (0.0, 0.0, 0.0)),
-        end=end,
-        end_interface=interface,
-        carried_further={(end, interface): _payload(scene)} if interface else {},
+    gravity, end = scene.motion.gravity, scene.end_effector
+    carried = {(k, 0): _carried(scene, k) for k in range(len(bodies))}
+    if end[1]:
+        carried[end] = _payload(scene)
+    return spatial_mechanism(
+        bodies,
+        joints_of(scene),
+        {site: one for site, one in carried.items() if one is not None},
+        gravity if len(gravity) == 3 else (0.0, 0.0, 0.0),
+        end,
     )
 
 
@@ -350,7 +296,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
                 axis=axis / np.linalg.norm(axis),
                 origin=np.array(one.origin, dtype=float),
                 rotation=roll_pitch_yaw(one.rpy),
-                rotor=arm.rotor_inertia * arm.gear_ratio**2,
+                rotor=rotor_inertia(arm),
                 interface=interface,
             )
         )
@@ -407,3 +353,61 @@ def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 def check_joint_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's table or path cannot be followed."""
     joint_motion(np.zeros(1), scene)
+
+
+# -- how scenes become machines, by their dimension ------------------------------------------------
+
+
+def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
+    """Put the bodies on the scene's base, with what sits at their joints and its payload."""
+    return plane_chain(
+        bodies,
+        scene.payload.mass,
+        scene.payload.moment,
+        (scene.motion.gravity[0], scene.motion.gravity[1]),
+        scene.motion.joint_height,
+        hardware=[
+            JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
+            for arm in scene.arms
+        ],
+        cart_mass=scene.motion.cart_mass,
+    )
+
+
+def reflected_inertia(arm: Arm) -> float:
+    """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
+    return 0.0 if arm.joint_stiffness > 0.0 else rotor_inertia(arm)
+
+
+def rotor_inertia(arm: Arm) -> float:
+    """Return the inertia of the rotor that drives an arm's inboard joint, geared, kg m2."""
+    return arm.rotor_inertia * arm.gear_ratio**2
+
+
+@dataclass(frozen=True)
+class Family:
+    """How scenes in the plane, or in space, become machines.
+
+    Attributes:
+        build: (scene, bodies): the mechanism.
+        motion: (t, scene): the desired rigid motion at instants t (n,), s.
+        check: (scene): raises `InputError` where that motion is impossible.
+        curve: (scene): the curve through its table, and whether its parameter is time.
+    """
+
+    build: Callable[[Scene, list[ShapeIntegrals]], Mechanism]
+    motion: Callable[..., RigidMotion]
+    check: Callable[[Scene], None]
+    curve: Callable[[Scene], tuple[Curve, bool]]
+
+
+IN_PLANE = Family(build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
+
+
+def family_of(scene: Scene) -> Family:
+    """Return how the scene becomes a machine."""
+    if scene.dimension == 2:
+        return IN_PLANE
+    from dolfinopt.multibody.spatial.end_effector import curve_in_space
+
+    return Family(build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)

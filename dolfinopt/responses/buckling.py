@@ -1,0 +1,371 @@
+"""Buckling of the arms along the motion: the factor by which the loads of an instant may grow.
+
+mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.buckling`), with K0 by the
+static stress of an instant, u = U a: the fields U of all loads (`fem.stress`) times coefficients a.
+phi'K phi being 1, mu changes by
+
+    dmu = -phi'(dK0 + mu dK) phi,
+
+K0 by the cells and by u, which goes through the fields' adjoints and the motion as stress does.
+Source: Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from dolfinopt.arms.arm import Arm
+from dolfinopt.arms.buckling import BucklingModes, buckling_modes
+from dolfinopt.arms.design_state import DesignState
+from dolfinopt.density.interpolation import interpolate
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.fem.prestress import Prestress, PrestressGradient, StressedModulus
+from dolfinopt.parallel import on_all_ranks, on_root, together
+from dolfinopt.responses.measured import (
+    BUCKLING_MODES,
+    BUCKLING_PEAK_SHARE,
+    BUCKLING_PEAKS,
+    BUCKLING_PLATEAU,
+    BUCKLING_PROMINENCE,
+    BUCKLING_RANK_SHARE,
+    BUCKLING_ROUNDS,
+    BUCKLING_WEIGHT_SHARE,
+    LARGEST_FACTOR,
+    VOID_STRESS_SHARE,
+)
+from dolfinopt.responses.products import Pair, Products
+from dolfinopt.responses.response import (
+    Analysis,
+    CellGradient,
+    Measured,
+    Response,
+    p_norm,
+    register,
+)
+from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
+from dolfinopt.responses.stress import ArmLoads, ByLoads, arm_loads, bodies_by_loads, motions_of
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.objective import NEEDS
+
+# -- the instants of one arm along one motion at which it comes closest to buckling ---------------
+
+
+@dataclass(frozen=True, eq=False)
+class Pressed:
+    """One arm of the chain at one instant.
+
+    Attributes:
+        loads: along the motion.
+        instant: of it.
+        stiffer: Young's modulus of the motion's scene over the nominal one.
+        modes: of the nominal stiffness under the stress over `stiffer`.
+    """
+
+    loads: ArmLoads
+    instant: int
+    stiffer: float
+    modes: BucklingModes
+
+    @property
+    def a(self) -> np.ndarray:
+        """Coefficients (m,) of that stress."""
+        return np.asarray(self.loads.coefficients[self.instant] / self.stiffer)
+
+
+def pressed(state: DesignState, loads: ArmLoads, stiffer: float) -> list[Pressed]:
+    """Return the instants that count (collective on the arm's ranks).
+
+    The first are those of the largest strain energy. The modes found there tell at any other
+    instant that mu is at least their Ritz value: where that has its peaks modes are computed next,
+    until the peaks are known.
+    """
+    a, fields, modulus = loads.coefficients / stiffer, state.load_fields, stressed_modulus(state)
+    energies = state.elastic.energy_matrix(fields.columns)
+    peaks = worst_instants(np.einsum("nk,kl,nl->n", a, energies, a))
+    known: dict[int, BucklingModes] = {}
+    for left in reversed(range(BUCKLING_ROUNDS)):
+        new = [n for n in peaks if n not in known]
+        for n in new:
+            stress = Prestress(fields, modulus, a[n : n + 1])
+            known[n] = buckling_modes(stress, BUCKLING_MODES, 1.0 / LARGEST_FACTOR)
+        if not (new and left):
+            break
+        values = _ritz(state, a, known)
+        highest = worst_instants(values, BUCKLING_PEAK_SHARE)
+        peaks = list(dict.fromkeys(_nearby(values, n, known) for n in highest))
+    return [Pressed(loads, n, stiffer, known[n]) for n in peaks]
+
+
+def _nearby(values: np.ndarray, peak: int, known: Iterable[int]) -> int:
+    """Return a known instant of the same peak of values (n,), where it is as high as that."""
+    for n in known:
+        first, last = sorted((n, peak))
+        if values[first : last + 1].min() >= (1.0 - BUCKLING_PLATEAU) * values[peak]:
+            return n
+    return peak
+
+
+def worst_instants(values: np.ndarray, share: float = 0.0) -> list[int]:
+    """Return the highest peaks of values (n,), at least a share of the largest, largest first."""
+    around = np.concatenate([[0.0], np.maximum(values, 0.0), [0.0]])  # the ends may be peaks
+    peaks = find_peaks(around, prominence=BUCKLING_PROMINENCE * around.max())[0] - 1
+    if not around.any():
+        return []
+    first = peaks[np.argsort(-values[peaks], kind="stable")][:BUCKLING_PEAKS]
+    return [int(n) for n in first if values[n] >= share * values[first[0]]]
+
+
+def stressed_modulus(state: DesignState) -> StressedModulus:
+    """Return the modulus of the cells whose stress stiffens.
+
+    With r = E / E_0 less that of void, and e = `VOID_STRESS_SHARE`, s = E_0 r^2 (1 + e) / (r + e):
+    Young's where there is material, and less than any share of it towards void.
+    """
+    law, solid, e = state.scene.interpolation, state.solid.young_modulus, VOID_STRESS_SHARE
+    void = interpolate(np.zeros(1), law.law, law.penalty, law.floor).stiffness
+    r = state.elastic.young / solid - void
+    share = (1.0 + e) * r / (r + e)
+    return StressedModulus(solid * r * share, share * (r + 2.0 * e) / (r + e))
+
+
+def _ritz(state: DesignState, a: np.ndarray, known: Mapping[int, BucklingModes]) -> np.ndarray:
+    """Return the largest mu (n,) that the known modes show of all instants."""
+    arm, fields = state.elastic, state.load_fields
+    V = np.concatenate([one.field[:, :, :2] for one in known.values()], axis=2)
+    every = Prestress(fields, stressed_modulus(state), np.eye(a.shape[1]))
+    K, K0 = arm.energy_matrix(V), every.stiffness(V)
+
+    def largest() -> np.ndarray:
+        values, vectors = np.linalg.eigh(K)
+        kept = values > BUCKLING_RANK_SHARE * values[-1]
+        W = vectors[:, kept] / np.sqrt(values[kept])
+        of_instants = np.tensordot(a, W.T @ K0 @ W, 1)
+        return np.asarray(np.linalg.eigvalsh(-of_instants)[:, -1])
+
+    found: np.ndarray = on_root(arm.comm, largest)
+    return found
+
+
+# -- the least factor of a machine ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LeastBuckling:
+    """What buckles first.
+
+    Attributes:
+        factor: of the loads; infinite where nothing buckles below `LARGEST_FACTOR`.
+        place: of the arm in the chain.
+        instant: s.
+    """
+
+    factor: float
+    place: int
+    instant: float
+
+
+def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuckling | None:
+    """Return the lowest factor of all arms at their worst instants, on this rank alone.
+
+    None where nothing loads them.
+
+    Args:
+        arms: of solid material, reduced.
+        trajectory: of these arms; of scenarios the worst counts.
+    """
+    scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
+    loads, found = _loads(scene, trajectory), list[LeastBuckling]()
+    for k, arm in arms.items():
+        for one in _of_design(arm.current, loads[k], trajectory):
+            mu, motion = float(one.modes.inverse[0]), motions[one.loads.motion]
+            factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
+            found.append(LeastBuckling(factor, one.loads.place, float(motion.t[one.instant])))
+    return min(found, key=lambda one: one.factor, default=None)
+
+
+Loads = list[tuple[ArmLoads, float]]  # of one design, each with `Pressed.stiffer`
+
+
+def _loads(scene: Scene, trajectory: Trajectory) -> dict[int, Loads]:
+    """Return the loads of every design."""
+    motions = motions_of(trajectory)
+
+    def stiffer(one: ArmLoads) -> float:
+        other = motions[one.motion].scene.material_of(one.place).young_modulus
+        return other / scene.material_of(one.place).young_modulus
+
+    every = arm_loads(scene, motions)
+    return {k: [(one, stiffer(one)) for one in each] for k, each in every.items()}
+
+
+def _known(state: DesignState | None, trajectory: Trajectory | None) -> list[Pressed] | None:
+    """Return what is known of a design in this motion."""
+    kept = None if state is None else state.kept.get(Buckling.name)
+    return kept[1] if kept is not None and kept[0] is trajectory else None
+
+
+def _of_design(state: DesignState, loads: Loads, trajectory: Trajectory | None) -> list[Pressed]:
+    """Return the instants of all arms with a design (collective on its ranks)."""
+    known = _known(state, trajectory) if trajectory is not None else None
+    if known is None:
+        with state.elastic.profile.phase("buckling"):
+            known = [each for one in loads for each in pressed(state, *one)]
+        state.kept[Buckling.name] = trajectory, known
+    return known
+
+
+# -- as objective and as limit -------------------------------------------------------------------
+
+
+@register
+class Buckling(Response):
+    """p-norm of 1 / factor over arms, scenarios, their worst instants and modes; true: the factor.
+
+    Instants are peaks over time, up to three of every arm, of each the four lowest modes. That
+    nothing buckles is a factor of 1000, and of no influence.
+    """
+
+    name, label, unit = "buckling", "reciprocal of the buckling factor", "-"
+    lower = True
+    natural = "maximize"
+    needs = NEEDS[name]
+    stands_for = "buckling factor"
+
+    def measure(self, analysis: Analysis) -> Measured:
+        """Return the least factor and the p-norm (collective)."""
+        inverse, smooth, _ = self._values(analysis, self._found(analysis))
+        return Measured(self.name, ("",), (1.0 / inverse,), (smooth,))
+
+    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+        """Return the gradient of the p-norm, which is always the exact one (collective)."""
+        found = self._found(analysis)
+        weights = self._values(analysis, found)[2]
+        parts = {}
+        with together(analysis.partition.world):
+            for k, state in analysis.designs.items():
+                parts[k] = _gradient_of_arm(state, found[k], weights.get(k, []))
+        by_body = bodies_by_loads(analysis, {k: one.by_loads for k, one in parts.items()})
+        with together(analysis.partition.world):
+            return [
+                {
+                    k: exact_gradient(
+                        analysis.designs[k], by_body[k], one.by_columns, analysis.by, one.beside
+                    )
+                    if k in by_body
+                    else analysis.by(analysis.designs[k], Products())  # nothing buckles
+                    for k, one in parts.items()
+                }
+            ]
+
+    def smooth_limits(
+        self, analysis: Analysis, measured: Measured, limits: np.ndarray
+    ) -> np.ndarray:
+        """Return the reciprocals of the least factors, scaled like the smooth one."""
+        return np.array(measured.smooth) * np.array(measured.values) / limits
+
+    def _found(self, analysis: Analysis) -> dict[int, list[Pressed]]:
+        """Return the instants of this rank's designs, once for value and gradient (collective)."""
+        designs, world = analysis.designs, analysis.partition.world
+        first = next(iter(designs.values()), None)
+        # The root, which has an arm and the trajectory, speaks for all: they work in step.
+        if world.bcast(_known(first, analysis.trajectory) is not None, root=0):
+            return {k: state.kept[self.name][1] for k, state in designs.items()}
+
+        def loads() -> dict[int, Loads]:
+            assert analysis.trajectory is not None
+            return _loads(analysis.scene, analysis.trajectory)
+
+        every: dict[int, Loads] = on_root(world, loads)
+        with together(world):
+            return {
+                k: _of_design(state, every[k], analysis.trajectory) for k, state in designs.items()
+            }
+
+    def _values(
+        self, analysis: Analysis, found: Mapping[int, list[Pressed]]
+    ) -> tuple[float, float, dict[int, list[np.ndarray]]]:
+        """Return the largest 1 / factor, the p-norm, and by design its derivatives (collective)."""
+        mine = {k: [one.modes.inverse for one in each] for k, each in found.items()}
+        every = on_all_ranks(analysis.partition, mine)
+        flat = [each for arm in every.values() for each in arm]
+        values = np.maximum(np.concatenate([*flat, [1.0 / LARGEST_FACTOR]]), 0.0)
+        smooth, by = p_norm(values, self.options.exponent)
+        parts = iter(np.split(by, np.cumsum([len(one) for one in flat])))
+        weights = {k: [next(parts) for _ in arm] for k, arm in every.items()}
+        return float(values.max()), smooth, weights
+
+
+@dataclass(frozen=True, eq=False)
+class _ArmGradient:
+    """Derivatives of the p-norm by one design.
+
+    Attributes:
+        by_loads: see `bodies_by_loads`.
+        by_columns: (n_nodes, d, m) by `LoadFields.columns`; None where nothing counts.
+        beside: by the design itself.
+    """
+
+    by_loads: Sequence[ByLoads] = ()
+    by_columns: np.ndarray | None = None
+    beside: Products | None = None
+
+
+def _gradient_of_arm(
+    state: DesignState, found: Sequence[Pressed], weights: Sequence[np.ndarray]
+) -> _ArmGradient:
+    """Differentiate by what one design's K0 is made of (collective on the arm's ranks)."""
+    least = BUCKLING_WEIGHT_SHARE
+    every = zip(found, weights, strict=True)
+    counted = [(one, by * (by > least)) for one, by in every if by.max(initial=0.0) > least]
+    if not counted:
+        return _ArmGradient()
+    kept = [by > 0.0 for _, by in counted]
+    modes = np.concatenate(
+        [one.modes.field[:, :, own] for (one, _), own in zip(counted, kept, strict=True)], axis=2
+    )
+    mu = np.concatenate(
+        [one.modes.inverse[own] for (one, _), own in zip(counted, kept, strict=True)]
+    )
+    by_mu = np.concatenate([by[own] for (_, by), own in zip(counted, kept, strict=True)])
+    instant = np.repeat(np.arange(len(counted)), [own.sum() for own in kept])
+    by_K0 = np.zeros((len(counted), len(mu), len(mu)))
+    by_K0[instant, range(len(mu)), range(len(mu))] = -by_mu
+    a, fields = np.array([one.a for one, _ in counted]), state.load_fields
+    one = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
+    pair = (modes * (-by_mu * mu), modes)
+    by_loads = [
+        (each.loads.motion, each.loads.place, np.array([each.instant]), by[None] / each.stiffer)
+        for (each, _), by in zip(counted, one.by_a, strict=True)
+    ]
+    beside = Products(
+        stiffness=(pair, (one.y, one.stress.u)),
+        mass=((-one.y, one.stress.inertia),),
+        places=one.places,
+        interfaces=partial(_at_interfaces, one, pair),
+        prestress=one,
+    )
+    return _ArmGradient(_joined(by_loads), one.by_columns, beside)
+
+
+def _joined(every: Sequence[ByLoads]) -> list[ByLoads]:
+    """Return one entry for every arm along every motion, instants ascending."""
+    found = []
+    for motion, place in sorted({one[:2] for one in every}):
+        own = sorted(
+            (one for one in every if one[:2] == (motion, place)), key=lambda one: one[2][0]
+        )
+        instants, by = (np.concatenate([one[k] for one in own]) for k in (2, 3))
+        found.append((motion, place, instants, by))
+    return found
+
+
+def _at_interfaces(gradient: PrestressGradient, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `Products.interfaces` does of modes and K0, the fields of loads aside."""
+    direct = ((gradient.by_modes, gradient.modes),)
+    rigid, _ = pairs_at_interfaces(gradient.stress.arm, (pair,), direct=direct)
+    return rigid, gradient.levers

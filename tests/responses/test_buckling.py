@@ -1,0 +1,259 @@
+"""Buckling: Euler's and Greenhill's columns, void that does not buckle, worst instants, limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from remainders import arm_of, build, built_of, wave
+from runs import scene
+
+import dolfinopt as do
+from dolfinopt.arms.arm import build_arms
+from dolfinopt.arms.buckling import buckling_modes
+from dolfinopt.errors import InputError
+from dolfinopt.fem.prestress import Prestress, StressedModulus
+from dolfinopt.parallel import partition_arms
+from dolfinopt.profiling import Profile
+from dolfinopt.responses.buckling import pressed, stressed_modulus, worst_instants
+from dolfinopt.responses.constraints import EXCESS, limits_of
+from dolfinopt.responses.stress import ArmLoads
+
+LENGTH, HEIGHT, THICKNESS = 1.0, 0.03, 0.01
+ALONG_X, FORCE, ACROSS = 0, 4, 5  # unit loads: acceleration, and forces at the outboard interface
+BAR = f"""Point(1) = {{0, {-HEIGHT / 2}, 0}}; Point(2) = {{{LENGTH}, {-HEIGHT / 2}, 0}};
+Point(3) = {{{LENGTH}, {HEIGHT / 2}, 0}}; Point(4) = {{0, {HEIGHT / 2}, 0}};
+Line(1) = {{1, 2}}; Line(2) = {{2, 3}}; Line(3) = {{3, 4}}; Line(4) = {{4, 1}};
+Curve Loop(1) = {{1, 2, 3, 4}}; Plane Surface(1) = {{1}};
+Transfinite Curve {{1, 3}} = 41; Transfinite Curve {{2, 4}} = 3; Transfinite Surface {{1}};
+Physical Curve("inboard") = {{4}}; Physical Curve("outboard") = {{2}};
+"""
+
+
+@pytest.fixture(scope="module")
+def bar(tmp_path_factory):
+    """A straight slender bar of quadratic triangles, and EI."""
+    path = tmp_path_factory.mktemp("bar") / "bar.geo"
+    path.write_text(BAR)
+    one = scene(
+        f"arms.0.mesh='{path}'", "arms.0.element=quadratic", f"arms.0.thickness={THICKNESS}",
+        f"arms.0.height={HEIGHT}", "arms.1.rigid=true", "design.filter_radius=0",
+    )  # fmt: skip
+    arm = build_arms(one, partition_arms(MPI.COMM_SELF, one.cell_counts), Profile())[0]
+    arm.set_design(np.ones(arm.mesh.num_cells))
+    young = one.material_of(0).young_modulus
+    return arm.current, young * THICKNESS * HEIGHT**3 / 12.0
+
+
+def under(state, load: int, size: float, modulus: StressedModulus | None = None) -> Prestress:
+    """Return the stress of a unit load times a size."""
+    a = np.zeros((1, state.load_fields.columns.shape[2]))
+    a[0, state.basis.V.shape[2] + load] = size
+    return Prestress(state.load_fields, modulus or stressed_modulus(state), a)
+
+
+def factor_of(state, load: int, size: float) -> float:
+    return 1.0 / buckling_modes(under(state, load, size), 1).inverse[0]
+
+
+@pytest.mark.serial
+def test_bar_buckles_at_eulers_force(bar):
+    """Clamped and free; shear lowers it by F / (k G A), 0.06 %. The next one is far behind."""
+    state, bending = bar
+    euler = np.pi**2 * bending / (4.0 * LENGTH**2)
+    found = buckling_modes(under(state, FORCE, -euler / 10.0), 3)
+    assert 1.0 / found.inverse == pytest.approx([10.0], rel=0.01)
+    assert state.elastic.energy_matrix(found.field) == pytest.approx(np.eye(1), abs=1e-8)
+    assert factor_of(state, FORCE, -euler / 20.0) == pytest.approx(1.0 / (0.5 * found.inverse[0]))
+
+
+@pytest.mark.serial
+def test_bar_under_its_inertia_buckles_at_the_known_acceleration(bar):
+    """q L = 7.837 EI / L^2 of a column under its own weight (Greenhill 1881)."""
+    state, bending = bar
+    mass = state.elastic.density[0] * LENGTH * HEIGHT * THICKNESS
+    a = 7.8373 * bending / LENGTH**2 / mass / 10.0
+    # Static fields are those of inertia forces -M a: the unit load is M a itself.
+    assert factor_of(state, ALONG_X, -a) == pytest.approx(10.0, rel=0.01)
+
+
+@pytest.mark.serial
+def test_tension_alone_does_not_buckle(bar):
+    state, bending = bar
+    modes = buckling_modes(under(state, FORCE, np.pi**2 * bending / 40.0), 2)
+    assert modes.inverse.max() < 1e-3
+
+
+@pytest.mark.serial
+def test_geometric_stiffness_is_that_of_the_reduction(bar):
+    """Of any motions, rotations of the outboard interface included, and of every unit load."""
+    state = bar[0]
+    elastic, loads = state.elastic, state.unit_loads
+    rng = np.random.default_rng(1)
+    V = elastic.expand(rng.standard_normal((elastic.num_interior, 2)), rng.normal(size=(3, 2)))
+    solid = StressedModulus(elastic.young, np.ones_like(elastic.young))
+    for load, expected in enumerate(loads.geometric_stiffness(V)):
+        stress = under(state, load, 1.0, solid)
+        assert stress.stiffness(V)[0] == pytest.approx(expected, rel=1e-9)
+        flat = np.einsum("nak,nm,mal->kl", V, stress.matrix().toarray(), V)
+        theta = elastic.substructure.T.coordinates(V)[2:]
+        assert flat + theta.T @ stress.rotation[0, 0] @ theta == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.serial
+def test_void_in_a_closing_gap_does_not_buckle():
+    """A tongue that nothing loads beside a beam that bends towards it, void between them."""
+    arm = arm_of((60, 12), "arms.passive=0.0")
+    x, y = arm.mesh.centroid.T
+    row = np.round((y - y.min()) / (y.max() - y.min()) * 11).astype(int)
+    solid = (row >= 8) | ((row >= 2) & (row <= 6) & (x < 0.9)) | (x < 0.02)
+
+    def first(light: float, modulus: StressedModulus | None = None) -> tuple[float, float]:
+        """Return the factor, and the share of the mode's energy in solid."""
+        arm.set_design(np.where(solid, 1.0, light))
+        one = arm.current
+        phi = buckling_modes(under(one, ACROSS, -100.0, modulus), 1)
+        energy = one.elastic.cell_stiffness_products(phi.field, phi.field) * one.elastic.young
+        return 1.0 / phi.inverse[0], energy[solid].sum() / energy.sum()
+
+    empty, share = first(0.0)
+    assert share > 0.5
+    assert first(0.01)[0] == pytest.approx(empty, rel=0.3)  # what is there is stiff, too
+    young = arm.current.elastic.young
+    spurious, share = first(0.01, StressedModulus(young, np.ones_like(young)))
+    assert share < 0.2 and spurious < 0.02 * empty
+
+
+# -- worst instants --------------------------------------------------------------------------
+
+
+def test_worst_instants_are_peaks():
+    t = np.linspace(0.0, 5.0, 501)
+    values = np.sin(np.pi * t) ** 2 * (1.0 + t)
+    assert t[worst_instants(values)] == pytest.approx([4.5, 3.5, 2.5], abs=0.03)
+    assert t[worst_instants(values, 0.8)] == pytest.approx([4.5, 3.5], abs=0.03)
+    assert worst_instants(np.array([3.0, 1.0, 2.0])) == [0, 2]  # ends count
+    assert worst_instants(np.zeros(3)) == worst_instants(-np.ones(3)) == []
+
+
+@pytest.mark.serial
+def test_pressure_is_found_between_stronger_tension(bar):
+    """Its peak has a tenth of the energy of four others, of which three are looked at first."""
+    state = bar[0]
+    t = np.linspace(0.0, 1.0, 101)
+    size = 3e3 * np.sin(4.0 * np.pi * t) ** 2 * np.where((t > 0.5) & (t < 0.75), -0.3, 1.0)
+    a = size[:, None] * under(state, FORCE, 1.0).a
+    found = pressed(state, ArmLoads(0, 0, a), 1.0)
+    assert [t[one.instant] for one in found] == pytest.approx([0.63], abs=0.011)
+    assert found[0].modes.inverse[0] == pytest.approx(1.0 / factor_of(state, FORCE, size.min()))
+    # Twice as stiff under the same stress: half as near to buckling.
+    (stiffer,) = pressed(state, ArmLoads(0, 0, a), 2.0)
+    assert stiffer.modes.inverse[0] == pytest.approx(0.5 * found[0].modes.inverse[0])
+
+
+# -- the limit -------------------------------------------------------------------------------
+
+YOUNG, MASS, GRAVITY = 70e9, 3.7, 981.0  # SI; the arm has no weight
+SECTION = {"height": 0.04, "thickness": 0.02}
+COLUMNS = {
+    "plane": {
+        "arms": [SECTION | {"name": "link", "length": LENGTH, "cells": [30, 6]}],
+        "motion": {"base": "fixed", "gravity": [-GRAVITY, 0.0]},
+    },
+    "space": {
+        "arms": [SECTION | {"name": "link", "length": LENGTH, "cells": [20, 2, 2]}],
+        "joints": [{"name": "link", "type": "revolute", "parent": "ground", "child": "link",
+                    "axis": [0, 0, 1]}],
+        "motion": {"gravity": [-GRAVITY, 0.0, 0.0]},
+    },
+}  # fmt: skip
+STILL = {"path": "joints", "file": "table.csv", "horizon": 1.0}
+
+
+def column(kind: str, folder, *changes: str) -> do.Scene:
+    """Return a cantilever under a mass that presses it along its axis, held still."""
+    (folder / "table.csv").write_text("t,link\n0,0\n1,0.001\n")
+    tree = COLUMNS[kind] | {
+        "motion": COLUMNS[kind]["motion"] | STILL,
+        "name": kind,
+        "material": {"young_modulus": YOUNG, "poisson_ratio": 0.3, "density": 1e-3},
+        "payload": {"mass": MASS},
+        "simulation": {"sample": 0.01, "stiffening": False},
+        "constraints": {"buckling": 2.0},
+    }
+    return do.scene_from_dict(tree, str(folder / "scene.toml"), changes)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", COLUMNS)
+def test_column_under_a_payload(kind, tmp_path):
+    """pi^2 EI / (4 L^2) over m g; a plane arm in its plane, a solid across its thickness."""
+    told = "design.initial=1.0", "design.volume_fraction=1.0", "design.filter_radius=0"
+    one = column(kind, tmp_path, *told)
+    a, b = sorted(SECTION.values(), reverse=kind == "plane")
+    euler = np.pi**2 * YOUNG * b * a**3 / 12.0 / (4.0 * LENGTH**2) / (MASS * GRAVITY)
+    limit = limits_of(one, do.Model(one).simulate().evaluation)[-1]
+    assert (limit.name, limit.unit, limit.met) == ("buckling", "-", bool(euler > 2.0))
+    # The clamped edge hinders lateral contraction: 0.1 % and 0.8 %, with two cells across it.
+    assert limit.value == pytest.approx(euler, rel=0.01)
+    up = [GRAVITY, *one.motion.gravity[1:]]
+    pulled = column(kind, tmp_path, *told, f"motion.gravity={up}")
+    assert limits_of(pulled, do.Model(pulled).simulate().evaluation)[-1].value == 1000.0
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+def test_lightest_column_keeps_its_factor(tmp_path):
+    """What is light enough for a given deflection would buckle at 1.1 times its load."""
+    light = ("objective.kind=mass", "constraints.tip_deflection=2.2e-4", "arms.passive=0.04",
+             "design.filter_radius=0", "design.initial=0.8",
+             "optimizer.max_iterations=80")  # fmt: skip
+    free, kept = (
+        do.optimize(column("plane", tmp_path, *light, f"constraints.buckling={least}"))
+        for least in (0.01, 2.0)
+    )
+    assert free.limits[0].value < 1.5
+    assert not kept.violated
+    assert kept.limits[0].value == pytest.approx(2.0, rel=EXCESS)  # active
+    assert kept.evaluation.objective > 1.05 * free.evaluation.objective
+
+
+def test_an_arm_cut_in_two(monkeypatch):
+    """The same on the ranks that share an arm, or have an arm each."""
+    told = ("objective.kind=buckling", "motion.horizon=2.2", "simulation.sample=0.01",
+            "arms.passive=0", "design.filter_radius=0")  # fmt: skip
+    one = do.load_scene(build().scene.source, ("arms.cells=[20,3]", *told))
+
+    def factor(world: MPI.Comm) -> float:
+        built = built_of(one, world)
+        return built.evaluate(built.fields(wave))[0].responses[0].values[0]
+
+    alone = factor(MPI.COMM_SELF)
+    assert factor(MPI.COMM_WORLD) == pytest.approx(alone, rel=1e-7)
+    monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)
+    assert factor(MPI.COMM_WORLD) == pytest.approx(alone, rel=1e-7)
+
+
+@pytest.mark.serial
+def test_what_it_costs_and_that_others_pay_nothing():
+    """Constraint modes alone ask for no eigenproblem, buckling for one an instant."""
+    counts = []
+    for kind in ("stress", "buckling"):
+        built = build(f"objective.kind={kind}", "reduction.coordinates=3")
+        trajectory = built.evaluate(built.uniform(0.5))[1]
+        assert ("buckling" in built.profile.seconds) == (kind == "buckling")
+        before = replace(built.profile.counts)
+        built.gradient(trajectory)
+        # Nothing is searched for again; the gradient's solves are those of stress, less
+        # its columns without load.
+        assert built.profile.counts.eigenproblems == before.eigenproblems
+        counts.append((before.eigenproblems, built.profile.counts.solves - before.solves))
+    assert counts[0][0] == 0 < counts[1][0] <= 48
+    assert counts[1][1] <= counts[0][1] + 2
+
+
+def test_reductions_without_adjoint_are_refused():
+    with pytest.raises(InputError, match=r"reduction\.method.*constraints\.buckling"):
+        build("constraints.buckling=1.5", "reduction.method=balanced", "objective.gradient=esl")
