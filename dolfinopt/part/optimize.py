@@ -211,8 +211,8 @@ class FreeForm(Protocol):
     def meshed(self, coarser: float) -> tuple[FreeForm, PartMesh]:
         """Return a new mesh of it, and it: variables may be others then."""
 
-    def followed(self, mesh: Any) -> PartMesh:
-        """Return the mesh of a form nearby, moved to this one."""
+    def followed(self, mesh: Any) -> PartMesh | None:
+        """Return the mesh of a form nearby, moved to this one; None where it folds."""
 
     def by_s(self, mesh: Any, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s from those by the places of the nodes of its mesh."""
@@ -509,10 +509,10 @@ class Search:
             if not outlines[k].is_valid:
                 return None
         try:
-            bodies = {k: one.followed(self.state.bodies[k]) for k, one in outlines.items()}
-            if any(one.is_worn(bodies[k]) for k, one in outlines.items()):
-                bodies = {}
-            return self.problem.evaluated(outlines, bodies, self.solutions)
+            after = {k: one.followed(self.state.bodies[k]) for k, one in outlines.items()}
+            bodies = {k: body for k, body in after.items() if body is not None}
+            anew = len(bodies) < len(after)
+            return self.problem.evaluated(outlines, {} if anew else bodies, self.solutions)
         except (ConvergenceError, InputError):
             return None
 

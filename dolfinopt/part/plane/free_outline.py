@@ -187,8 +187,8 @@ class FreeOutline:
         return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
 
     def is_worn(self, mesh: BodyMesh) -> bool:
-        """Whether a mesh is to be made anew: a triangle is folded or nearly flat."""
-        return mesh.is_folded or bool(mesh.quality.min() < WORN)
+        """Whether a mesh is to be made anew: a triangle is nearly flat."""
+        return bool(mesh.quality.min() < WORN)
 
     @property
     def size(self) -> float:
@@ -199,9 +199,10 @@ class FreeOutline:
         """Return the outline with a new mesh; variables stay."""
         return self, self.current.mesh(coarser)
 
-    def followed(self, mesh: BodyMesh) -> BodyMesh:
-        """Return a mesh of an outline nearby, moved to this one."""
-        return mesh.morphed(self.shape)
+    def followed(self, mesh: BodyMesh) -> BodyMesh | None:
+        """Return a mesh of an outline nearby, moved to this one; None where it folds."""
+        found = mesh.morphed(self.shape)
+        return None if found.is_folded else found
 
     @property
     def blocks(self) -> list[slice]:

@@ -26,7 +26,7 @@ from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.mesh import facing
 from dolfinopt.part.solid.domain import SolidDomain
-from dolfinopt.part.solid.mesh import NEAR, PlateMesh
+from dolfinopt.part.solid.mesh import NEAR, PlateMesh, extruded
 from dolfinopt.part.solid.part import SolidPart, plate_part
 from dolfinopt.part.solid.surface import (
     Surface,
@@ -43,7 +43,8 @@ NEAREST, WALLS = 400, 60  # places around each that may be the other side; the a
 WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
 ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
-WORN = 0.3  # worst shape of a cell, over that when the mesh was made, that makes a new one due
+# Worst shape of a cell over that when the mesh was made: a new one is due, or a step goes too far.
+WORN, SPOILT = 0.6, 0.2
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 
 
@@ -130,14 +131,17 @@ class FreeSurface:
     @property
     def is_valid(self) -> bool:
         """Whether its cells are sound and its surface does not cross itself."""
-        if self.is_worn(self.mesh):
+        if self._worst(self.mesh) < SPOILT:
             return False
         return not len(crossings(Surface(self.mesh.points, self.mesh.boundary)))
 
     def is_worn(self, mesh: Tetrahedra) -> bool:
         """Whether the worst cell of a mesh is much worse than when it was made."""
+        return self._worst(mesh) < WORN
+
+    def _worst(self, mesh: Tetrahedra) -> float:
         made = replace(self.mesh, points=self.frame.places)
-        return bool(mesh.quality.min() < WORN * made.quality.min())
+        return float(mesh.quality.min() / made.quality.min())
 
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Return how far (count,) nodes may move inwards and outwards in a step, m.
@@ -293,9 +297,10 @@ class FreePlate:
         """Return it with a new mesh; variables stay."""
         return self, self.current.mesh(coarser)
 
-    def followed(self, mesh: PlateMesh) -> PlateMesh:
-        """Return a mesh of a plate nearby, moved to this one."""
-        return mesh.followed(self.outline.shape)
+    def followed(self, mesh: PlateMesh) -> PlateMesh | None:
+        """Return a mesh of a plate nearby, moved to this one; None where it folds."""
+        face = self.outline.followed(mesh.face)
+        return None if face is None else extruded(face, mesh.thickness, mesh.layers)
 
     def by_s(self, mesh: PlateMesh, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s from those by the places (n, 3) of all nodes."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra, tetrahedra_of
-from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.mesh import BodyMesh
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
@@ -99,10 +98,6 @@ class PlateMesh(Tetrahedra):
     face: BodyMesh
     thickness: float
     layers: int
-
-    def followed(self, shape: Shape) -> PlateMesh:
-        """Return the mesh moved to a shape nearby."""
-        return extruded(self.face.morphed(shape), self.thickness, self.layers)
 
     def at_face(self, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (n, 2) by the face's points from those by the places of all nodes."""
