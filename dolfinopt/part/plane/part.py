@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 
 TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
-TRIES, ENOUGH = 3, 0.98  # of the radius of concave corners; share of the tool's that will do
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,16 +173,8 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
             f"{domain.cell:.3g} m"
         )
     tool = default_tool(domain) if tool_radius is None else tool_radius
-    # Where nobody has asked for a tool, curves within the tolerance of its path will do.
-    least = max(tool - tolerance, 0.0) if tool_radius is None else ENOUGH * tool
-    rounding = None
-    for _ in range(TRIES):
-        outline = draw_outline(domain, tool, tolerance, rounding)
-        shape = make_shape(outline, tolerance, curves.arcs)
-        radius = shape.concave_radius
-        if radius >= least:
-            break
-        rounding = outline.rounding * min(1.1 * tool / radius, 2.0)
+    outline = draw_outline(domain, tool, tolerance)
+    shape = make_shape(outline, tolerance, curves.arcs)
     return PlanePart(domain, outline, shape, tolerance, thinnest_member(outline))
 
 
