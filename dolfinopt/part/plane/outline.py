@@ -436,7 +436,13 @@ def _material(
     above = shapely.simplify(raster.above(level), straight)
     if offset:
         above = above.buffer(offset, quad_segs=QUADRANT)
-    return shapely.union_all([above.intersection(given.arm), given.stays, given.links])
+    whole = shapely.union_all([above.intersection(given.arm), given.stays])
+    missing = shapely.get_parts(given.links.difference(whole))
+    near = 1e-3 * straight
+    joints = shapely.buffer(shapely.intersection(shapely.buffer(missing, near), whole), near)
+    # What touches the material in one place alone joins nothing.
+    joins = [len(polygons_of(one)) > 1 for one in joints]
+    return shapely.union_all([whole, *shapely.buffer(missing[joins], near)])
 
 
 def _at(
