@@ -33,11 +33,13 @@ class Curves:
         tool_radius: of concave corners, m; None: a fifth of a cell.
         tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
         arcs: lines and arcs in place of splines.
+        simplify: straight lines and fillets within the tolerance.
     """
 
     tool_radius: float | None = None
     tolerance: float | None = None
     arcs: bool = False
+    simplify: bool = False
 
     @property
     def is_default(self) -> bool:

@@ -392,6 +392,7 @@ class Domain:
         x_phys: (n_cells,) physical densities.
         field: (n_cells,) what is smooth from cell to cell and falls where x_phys does: the
             filtered densities before they are projected, or x_phys itself.
+        beside: (n_cells,) `field`, in cells that stay solid or void that of the nearest other one.
         crisp: whether `field` is a projected design, which leaps from cell to cell.
         links: (n, 2, 2) m, lines between the centroids of solid cells of a projected design that
             share a corner at least, where one of them is in a member no wider than a cell.
@@ -412,6 +413,7 @@ class Domain:
     area: np.ndarray
     x_phys: np.ndarray
     field: np.ndarray
+    beside: np.ndarray
     crisp: bool
     links: np.ndarray
     contacts: int
@@ -486,7 +488,8 @@ def domain_of(
         centroid=mesh.centroid,
         area=mesh.area,
         x_phys=x_phys,
-        field=_without_kept(mesh, mesh.fixed, x_phys if field is None else field),
+        field=x_phys if field is None else field,
+        beside=_without_kept(mesh, mesh.fixed, x_phys if field is None else field),
         crisp=field is None and bool(scene.design.projection),
         links=_links(cells.nodes, mesh.centroid, x_phys, bool(scene.design.projection)),
         contacts=_contacts(cells.nodes, x_phys > 0.5),

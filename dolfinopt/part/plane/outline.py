@@ -15,7 +15,7 @@ How wide the thinnest member of an outline is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -307,6 +307,11 @@ class Outline:
     centres: np.ndarray
 
     @property
+    def tolerance(self) -> float:
+        """Of the part, m."""
+        return self.chord / CHORD
+
+    @property
     def rounding(self) -> float:
         """Radius of its concave corners, m: curves within the tolerance may turn sharper."""
         return _rounding(self.tool_radius, self.chord)
@@ -369,7 +374,6 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
             "checkerboard has no outline; give design.filter_radius the length of two cells or more"
         )
     given = _given(domain, CHORD * tolerance)
-    raster = rasterise(domain)
     target = domain.volume
     if given.stays.area > target * (1.0 + AREA):
         raise InputError(
@@ -387,18 +391,27 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
             "optimise it first"
         )
 
+    for field in (domain.beside, domain.field):
+        found = _found(replace(domain, field=field), given, tool_radius, tolerance)
+        if _off(found) <= LEAP:
+            return replace(found, domain=domain)
+    raise InputError(
+        f"{where}: the material of the design does not hang together: at no level has the "
+        "piece that joins both interfaces the design's volume; let the optimisation go on "
+        "until the design is crisp (design.projection)"
+    )
+
+
+def _found(domain: Domain, given: _Given, tool_radius: float, tolerance: float) -> Outline:
+    """Return the outline whose area is nearest to the design's volume."""
+    raster = rasterise(domain)
+
     def at(level: float, offset: float = 0.0) -> Outline:
         return _at(domain, given, raster, level, offset, tool_radius, CHORD * tolerance)
 
     found = _at_level(at, lambda level: _rough(given, raster, domain, level), domain, raster)
     if _off(found) > LEAP:  # a large piece joins or leaves: move the outline itself
         found = _at_offset(at, found)
-    if _off(found) > LEAP:
-        raise InputError(
-            f"{where}: the material of the design does not hang together: at no level has the "
-            "piece that joins both interfaces the design's volume; let the optimisation go on "
-            "until the design is crisp (design.projection)"
-        )
     return found
 
 

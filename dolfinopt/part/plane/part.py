@@ -18,6 +18,7 @@ from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.domain import Domain
 from dolfinopt.part.plane.mesh import BodyMesh, body_mesh
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline, thinnest_member
+from dolfinopt.part.plane.simplify import simple_shape
 from dolfinopt.part.plane.stress import corner_stress, is_regular
 from dolfinopt.part.plane.trace import make_shape
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.stress import CornerStress
 
 
+SIMPLE = 0.25  # distance of simplified outlines by default, cells
 TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
 
 
@@ -173,8 +175,13 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
             f"{domain.cell:.3g} m"
         )
     tool = default_tool(domain) if tool_radius is None else tool_radius
+    distance = SIMPLE * domain.cell if curves.tolerance is None else tolerance
+    if curves.simplify:
+        tolerance = min(tolerance, TOLERANCE, CELLS * domain.cell)
     outline = draw_outline(domain, tool, tolerance)
-    shape = make_shape(outline, tolerance, curves.arcs)
+    shape = simple_shape(outline, distance, domain.volume) if curves.simplify else None
+    if shape is None:
+        shape = make_shape(outline, tolerance, curves.arcs)
     return PlanePart(domain, outline, shape, tolerance, thinnest_member(outline))
 
 

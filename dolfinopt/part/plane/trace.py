@@ -302,7 +302,7 @@ def pieces_along(
         first, last = joints[k], joints[(k + 1) % len(runs)]
         if run.edge is not None:
             fillet = run.edge.label == FILLET
-            curve = _along(run, first.point, last.point)
+            curve = piece_along(run, first.point, last.point)
             found.append(Piece(curve, "" if fillet else run.edge.label, free=fillet))
         else:
             found.append(_fitted(run.points, first, last, spacing, tolerance))
@@ -353,7 +353,7 @@ def _joint(before: Run, after: Run, reach: float) -> _Joint:
                 place = projected(other.curve, one.curve.centre)[0]
                 if abs(np.linalg.norm(place - one.curve.centre) - one.curve.radius) < 1e-12:
                     return _Joint(place, None)
-        return _Joint(_common(before.edge, after.edge, point), None)
+        return _Joint(common(before.edge, after.edge, point), None)
     if before.edge is None and after.edge is None:  # a corner of the free outline
         return _Joint(point, None, free=True)
     edge = before.edge if before.edge is not None else after.edge
@@ -370,7 +370,7 @@ def _joint(before: Run, after: Run, reach: float) -> _Joint:
     return _Joint(place, along if angle_between(ahead, along) < SMOOTH else None)
 
 
-def _common(first: Edge, second: Edge, point: np.ndarray) -> np.ndarray:
+def common(first: Edge, second: Edge, point: np.ndarray) -> np.ndarray:
     """Return where two curves meet, near a point."""
     for _ in range(20):
         rows, gaps = [], []
@@ -387,7 +387,7 @@ def _common(first: Edge, second: Edge, point: np.ndarray) -> np.ndarray:
     return point
 
 
-def _along(run: Run, start: np.ndarray, end: np.ndarray) -> Curve:
+def piece_along(run: Run, start: np.ndarray, end: np.ndarray) -> Curve:
     """Return the piece of a run's curve between two points of it."""
     assert run.edge is not None
     curve = run.edge.curve
