@@ -55,6 +55,12 @@ Say = Callable[[str], None]
     help="splines, or lines and arcs alone for machines that know no splines",
 )
 @click.option(
+    "--simplify",
+    is_flag=True,
+    help="straight lines and fillets in place of splines, both sides of struts parallel; within "
+    "--tolerance of the outline, by default a quarter of a cell",
+)
+@click.option(
     "--check/--no-check",
     default=True,
     help="simulate the machine with the parts, beside the densities they are made of",
@@ -81,6 +87,7 @@ def part(
     tool_radius: float | None,
     tolerance: float | None,
     curves: str,
+    simplify: bool,
     check: bool,
     optimize: bool,
     iterations: int,
@@ -112,7 +119,8 @@ def part(
     claim(world, target, overwrite, file_names(scene), scene=scene)
     with _stages(world) as say:
         say("outlines and surfaces")
-        asked = Curves(tool_radius, tolerance, curves == "arcs")
+        # Splines are optimised, then simplified.
+        asked = Curves(tool_radius, tolerance, curves == "arcs", simplify and not optimize)
         parts = make_parts(scene, folder, asked, world)
         with together(world):
             if world.rank == 0:
@@ -121,6 +129,8 @@ def part(
                 made = made.checked(folder, say) if check else made
                 if optimize and made.meshes is not None:
                     made = made.optimized(folder, iterations, check, say)
+                    if simplify:
+                        made = made.simplified(folder, tolerance, check, say)
                 say("files")
                 made.write(folder, target, plots)
     if world.rank == 0:
@@ -195,11 +205,27 @@ class Made:
             self.scene, plates, iterations, lambda line: click.echo(line, err=True)
         )
         click.echo(found.sentence)
-        after = replace(self, parts=found.parts, meshes=found.meshes, shape=found, check=None)
+        after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
+        return self._followed_by(after, run, check, say)
+
+    def simplified(self, run: Path, tolerance: float | None, check: bool, say: Say) -> Made:
+        """Return it with optimised shapes in straight lines and fillets."""
+        from dolfinopt.part.plane.part import PlanePart, simplified
+
+        parts = {
+            k: simplified(one, tolerance) for k, one in self.parts.items() if isinstance(one, PlanePart)
+        }
+        after = replace(self, parts=parts, meshes=_meshes(parts, check, say))
+        return self._followed_by(after, run, check, say)
+
+    def _followed_by(self, after: Made, run: Path, check: bool, say: Say) -> Made:
+        """Return other parts with what they do, and that of the first ones beside it."""
+        after = replace(after, check=None)
         after = after.checked(run, say) if check else after
         if self.check is None or after.check is None:
             return after
-        return replace(after, check=replace(after.check, before=self.check.part))
+        before = self.check.before or self.check.part
+        return replace(after, check=replace(after.check, before=before))
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""

@@ -28,7 +28,6 @@ from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simula
 from dolfinopt.part.part import Meshes, mesh_parts
 from dolfinopt.part.plane.free_outline import CHORD, FreeOutline, free_outline
 from dolfinopt.part.plane.mesh import BodyMesh
-from dolfinopt.part.plane.outline import thinnest_member
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
@@ -168,7 +167,7 @@ def _part(outline: FreeOutline) -> PlanePart:
     old, *gaps = part.shape.polygons(chord)
     apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
     shape = replace(outline.shape, apart=float(apart))
-    return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
+    return replace(part, shape=shape, outline=drawn)
 
 
 # -- the problem at one outline ----------------------------------------------------------------
