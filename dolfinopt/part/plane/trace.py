@@ -542,14 +542,17 @@ def with_area(
     )
     if length == 0.0:
         return change(shape)
-    offset = 0.0
+    offset, slope = 0.0, length  # curves with ends that stay gain less than that
     moved = change(shape)
     for _ in range(STEPS):
         missing = area - moved.area
         if abs(missing) < 1e-9 * area:
             break
-        offset += missing / length
+        step = missing / slope
+        offset += step
         moved = change(_offset(shape, offset))
+        gained = (missing - (area - moved.area)) / step
+        slope = gained if gained > 0.1 * slope else slope
     return replace(moved, offset=offset)
 
 
