@@ -213,7 +213,9 @@ class Made:
         from dolfinopt.part.plane.part import PlanePart, simplified
 
         parts = {
-            k: simplified(one, tolerance) for k, one in self.parts.items() if isinstance(one, PlanePart)
+            k: simplified(one, tolerance)
+            for k, one in self.parts.items()
+            if isinstance(one, PlanePart)
         }
         after = replace(self, parts=parts, meshes=_meshes(parts, check, say))
         return self._followed_by(after, run, check, say)

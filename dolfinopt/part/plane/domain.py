@@ -476,12 +476,10 @@ def domain_of(
     cells = cells_of(mesh)
     rim, rim_cells = cells.rim()
     outline = region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool))
-    solid, void = (
-        _kept(mesh, cells, chosen, entry, kind, outline)
-        if index not in scene.patterns  # else regions are scaled, and those of another arm
-        else region_of(mesh, cells, chosen)
-        for kind, chosen in (("solid", mesh.passive), ("void", mesh.void))
-    )
+    solid, void = region_of(mesh, cells, mesh.passive), region_of(mesh, cells, mesh.void)
+    if index not in scene.patterns:  # there regions are scaled, and those of another arm
+        solid = _kept(mesh, cells, mesh.passive, entry, "solid", outline)
+        void = _kept(mesh, cells, mesh.void, entry, "void", outline)
     return Domain(
         name=entry.name,
         corners=cells.corners,

@@ -23,7 +23,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.plane.curves import DEGREE, MIRROR, Line, Piece, Shape, Spline
+from dolfinopt.part.plane.curves import DEGREE, KINK, MIRROR, Line, Piece, Shape, Spline, direction
 from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
 from dolfinopt.part.plane.part import PlanePart
 
@@ -354,7 +354,8 @@ def free_outline(part: PlanePart) -> FreeOutline:
     """
     import shapely
 
-    if any(piece.free and not isinstance(piece.curve, Spline) for piece in part.shape.pieces):
+    free = [piece.curve for piece in part.shape.pieces if piece.free]
+    if free and not any(isinstance(curve, Spline) for curve in free):  # those of fillets are arcs
         raise InputError("--optimize: expected splines, not --curves arcs")
 
     domain, shape = part.domain, part.shape
@@ -366,13 +367,18 @@ def free_outline(part: PlanePart) -> FreeOutline:
     fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]
     for loop in fixed:
         found: list[Piece | int] = []
-        for piece in loop:
-            if piece.free:
-                found.append(len(runs))
-                line = piece.curve.at(piece.curve.parameters(chord))
-                runs.append(Run(_fitted_open(line, SPACING * cell), False))
-            else:
+        line = np.empty((0, 2))
+        for piece, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+            if not piece.free:
                 found.append(piece)
+                continue
+            own = piece.curve.at(piece.curve.parameters(chord))
+            line = np.vstack([line, own[1:]]) if len(line) else own
+            smooth = direction(piece.curve, 1.0) @ direction(after.curve, 0.0) > np.cos(KINK)
+            if not (after.free and smooth) or piece is loop[-1]:
+                found.append(len(runs))
+                runs.append(Run(_fitted_open(line, SPACING * cell), False))
+                line = np.empty((0, 2))
         loops.append(tuple(found))
     tool = part.outline.tool_radius
     for ring in _free_rings(shape, tool, chord, len(fixed)):

@@ -9,6 +9,7 @@ import numpy as np
 
 from dolfinopt.density.members import narrowest
 from dolfinopt.part.plane.curves import Shape
+from dolfinopt.part.plane.outline import polygons_of
 
 if TYPE_CHECKING:
     from shapely import Polygon
@@ -54,7 +55,6 @@ def tight_places(shape: Shape, tool_radius: float, tolerance: float) -> list[Tig
         shape: the part.
         tool_radius, tolerance: m.
     """
-    import shapely
 
     if tool_radius == 0.0:
         return []
@@ -76,12 +76,12 @@ def tight_places(shape: Shape, tool_radius: float, tolerance: float) -> list[Tig
 
 
 def _left(polygon: Any, radius: float, deep: float) -> list[Any]:
-    """Return what a disc does not reach from without, as polygons deeper than a length, m."""
+    """Return what a disc does not reach from without, less half of a depth, m, all around it."""
     import shapely
 
     closed = polygon.buffer(radius, quad_segs=QUADRANT).buffer(-radius, quad_segs=QUADRANT)
-    pieces = shapely.get_parts(closed.difference(polygon))
-    return list(pieces[shapely.area(shapely.buffer(pieces, -0.5 * deep, quad_segs=2)) > 0.0])
+    # Pieces hang together by slivers along the outline, which are the rounding of numbers.
+    return polygons_of(closed.difference(polygon).buffer(-0.5 * deep, quad_segs=2))
 
 
 def thinnest_member(shape: Shape, cell: float) -> float | None:
@@ -107,5 +107,5 @@ def thinnest_member(shape: Shape, cell: float) -> float | None:
         return None
     place = np.array([x[found[1][0]], y[found[1][1]]])
     # The raster knows the place; around it the distance from the outline tells the width.
-    around = place + h * np.stack(np.mgrid[-1:1:9j, -1:1:9j], axis=-1).reshape(-1, 2)
+    around = place + h * np.mgrid[-1:1:9j, -1:1:9j].reshape(2, -1).T
     return float(2.0 * shapely.distance(shapely.points(around), polygon.boundary).max())

@@ -448,6 +448,7 @@ def _material(
     if offset:
         above = above.buffer(offset, quad_segs=QUADRANT)
     whole = shapely.union_all([above.intersection(given.arm), given.stays])
+    whole = shapely.union_all(polygons_of(whole))  # without points and lines
     missing = shapely.get_parts(given.links.difference(whole))
     near = 1e-3 * straight
     joints = shapely.buffer(shapely.intersection(shapely.buffer(missing, near), whole), near)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,11 @@ from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.trace import (
     AXIS,
     Run,
-    piece_along,
     common,
     crosses,
     half_chains,
     mirrored,
+    piece_along,
     resampled,
     trace,
     whole,
@@ -118,7 +119,7 @@ def simple_shape(outline: Outline, distance: float, area: float) -> Shape | None
         chains = _parallel(chains, share * distance, FACING * outline.domain.cell)
         chains = [_crossed(chain, outline.rounding) for chain in chains]
 
-        def at(offset: float, chains: Any = chains, share: float = share) -> Shape:
+        def at(offset: float, chains: Any = chains, share: float = share) -> Shape | None:
             return _built(chains, offset, share * distance, outline)
 
         shape = _with_area(at, area)
@@ -136,25 +137,23 @@ def simple_shape(outline: Outline, distance: float, area: float) -> Shape | None
 
 def _with_area(at: Any, area: float) -> Shape | None:
     """Return the shape whose offset encloses an area, by secants."""
-    offsets, excess = [0.0], []
-    length = None
-    for _ in range(STEPS):
-        shape: Shape | None = at(offsets[-1])
+    offset, excess, slope = 0.0, 0.0, 0.0
+    shape: Shape | None = None
+    for step in range(STEPS):
+        shape = at(offset)
         if shape is None:
             return None
-        excess.append(shape.area - area)
-        if abs(excess[-1]) < 1e-9 * area:
-            return shape
-        if len(excess) == 1:
-            length = sum(
-                float(np.linalg.norm(p.curve.end - p.curve.start)) for p in shape.pieces if p.free
-            )
-            if length == 0.0:
-                return shape
-            slope = length
+        before, excess = excess, shape.area - area
+        if abs(excess) < 1e-9 * area:
+            break
+        if step == 0:
+            free = [p.curve for p in shape.pieces if p.free]
+            slope = sum(float(np.linalg.norm(curve.end - curve.start)) for curve in free)
         else:
-            slope = (excess[-1] - excess[-2]) / (offsets[-1] - offsets[-2])
-        offsets.append(offsets[-1] - excess[-1] / slope)
+            slope *= 1.0 - excess / before  # the last step was that of before over the slope
+        if slope <= 0.0:
+            break
+        offset -= excess / slope
     return shape
 
 
@@ -164,7 +163,9 @@ def _sides(ring: Sequence[Run], distance: float, outline: Outline) -> list[_Side
     for k, run in enumerate(ring):
         ends = run.points[[0, -1]]
         beside = ring[k - 1].edge, ring[(k + 1) % len(ring)].edge
-        speck = len(ring) > 3 and None in beside and np.linalg.norm(ends[1] - ends[0]) < 2 * distance
+        speck = (
+            len(ring) > 3 and None in beside and np.linalg.norm(ends[1] - ends[0]) < 2 * distance
+        )
         if run.edge is not None and run.edge.label == "" and speck:
             continue
         if run.edge is not None:
@@ -185,7 +186,7 @@ def _sides(ring: Sequence[Run], distance: float, outline: Outline) -> list[_Side
             long = int(np.argmax(np.diff(breaks)))
             points = np.vstack([points[breaks[long] : -1], points[: breaks[long] + 1]])
         breaks = _straight(points, distance)
-        lines = [_line(points[a : b + 1]) for a, b in zip(breaks[:-1], breaks[1:], strict=True)]
+        lines = [_line(points[a : b + 1]) for a, b in pairwise(breaks)]
         for end, other in zip((0, -1), beside, strict=True):
             if other is not None and other.label == AXIS:  # at a right angle
                 up = np.array([0.0, 1.0 if end == 0 else -1.0])
@@ -465,7 +466,7 @@ def _corner(
         least: radius of concave fillets, m.
     """
     turn = _turn(before, after, point)
-    if before.run is not None and after.run is not None or abs(turn) < NO_TURN:
+    if (before.run is not None and after.run is not None) or abs(turn) < NO_TURN:
         return _Corner(point, point, None)
     own = before.run is not None or after.run is not None
     if own and turn > 0.0:  # the arm's own edge ends there
