@@ -106,7 +106,7 @@ def part(
     world = start()
     from dolfinopt.parallel import on_root, together
     from dolfinopt.part.files.folder import file_names
-    from dolfinopt.part.part import Curves, make_parts
+    from dolfinopt.part.part import Curves, PartsError, make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
     target = out or folder / "part"
@@ -121,7 +121,15 @@ def part(
         say("outlines and surfaces")
         # Splines are optimised, then simplified.
         asked = Curves(tool_radius, tolerance, curves == "arcs", simplify and not optimize)
-        parts = make_parts(scene, folder, asked, world)
+        try:
+            parts = make_parts(scene, folder, asked, world)
+        except PartsError as error:  # what there is of the others is of use
+            if error.parts:
+                say("files")
+                Made(scene, error.parts, None).write(folder, target, plots)
+                names = ", ".join(one.name for one in error.parts.values())
+                warn([f"only files of {names} in {target}"])
+            raise
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))

@@ -1,4 +1,4 @@
-"""Outlines as a shop cuts them: the tool's radius, rings and regions, straight lines and fillets."""
+"""Outlines as a shop cuts them: the tool's radius, rings, straight lines and fillets."""
 
 import numpy as np
 import pytest
@@ -60,10 +60,12 @@ def test_a_cutter_of_3_mm_leaves_nothing_in_a_scara(scara, simplify):
     shape = part.shape
     assert shape.area == pytest.approx(scara.volume, rel=1e-5)
     deep, _ = deepest_left(shape, 0.003, SIZE)
-    told = part.tight
-    assert deep <= part.tolerance + 1.5 * SIZE or told
+    assert deep <= part.tolerance + 1.5 * SIZE
+    # Told are the arm's own corners, where the bar meets the boss; elsewhere a trifle may be.
+    own = [one for one in part.tight if np.hypot(*(np.abs(one.place) - [0.305, 0.037])) < 2e-3]
+    assert all(one.radius > 0.8 * 0.003 for one in part.tight if one not in own)
     if simplify:
-        assert not told and {type(curve) for curve in shape.curves} == {Line, Arc}
+        assert {type(curve) for curve in shape.curves} == {Line, Arc}
     circles = {
         round(p.curve.radius, 9) for p in shape.pieces if not p.free and isinstance(p.curve, Arc)
     }

@@ -77,7 +77,6 @@ def tight_places(shape: Shape, tool_radius: float, tolerance: float) -> list[Tig
 
 def _left(polygon: Any, radius: float, deep: float) -> list[Any]:
     """Return what a disc does not reach from without, less half of a depth, m, all around it."""
-    import shapely
 
     closed = polygon.buffer(radius, quad_segs=QUADRANT).buffer(-radius, quad_segs=QUADRANT)
     # Pieces hang together by slivers along the outline, which are the rounding of numbers.

@@ -172,7 +172,10 @@ class PlanePart:
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> BodyMesh:
         """Return triangles along its curves, see `part.Part`."""
-        return body_mesh(self.shape, self.domain.cell, coarser, finer)
+        try:
+            return body_mesh(self.shape, self.domain.cell, coarser, finer)
+        except InputError as error:
+            raise InputError(f"arm {self.name!r}: {error}") from None
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 2) are away from where stress has no limit (n,)."""
