@@ -38,7 +38,8 @@ MeshSize {:} = size;
 def webbed(x, y):
     """Two flanges and slanted webs of about 10 mm between rings; the ends are void."""
     flange = 0.05 - 0.045 * x
-    webs = np.abs(np.abs((x - 0.07) % 0.12 - 0.06) - 0.06 * (y + 0.04) / 0.08) < 0.006
+    between = (x > 0.04) & (x < 0.29)
+    webs = between & (np.abs(np.abs((x - 0.07) % 0.12 - 0.06) - 0.06 * (y + 0.04) / 0.08) < 0.006)
     return (((np.abs(y) > flange - 0.012) & (np.abs(y) < flange) & (x > 0.0)) | webs) * 1.0
 
 

@@ -43,12 +43,14 @@ class PlanePart:
         outline: its polygon.
         shape: its curves.
         tolerance: of the curves, m.
+        kept_splines: whether no straight lines and fillets were found that were asked for.
     """
 
     domain: Domain
     outline: Outline
     shape: Shape
     tolerance: float
+    kept_splines: bool = False
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
@@ -111,6 +113,11 @@ class PlanePart:
             found.append(
                 f"arm {one.name!r}: {number} without a joint to both interfaces "
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
+            )
+        if self.kept_splines:
+            found.append(
+                f"arm {one.name!r}: --simplify: no straight lines and fillets without crossings; "
+                "splines instead; choose a smaller --tolerance"
             )
         if self.tight:
             listed = "; ".join(map(str, self.tight[:TOLD]))
@@ -204,14 +211,15 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
         shape = simple_shape(outline, distance, domain.volume)
         if shape is not None:
             return PlanePart(domain, outline, shape, fine)
-    return PlanePart(domain, outline, make_shape(outline, fine, curves.arcs), fine)
+    shape = make_shape(outline, fine, curves.arcs)
+    return PlanePart(domain, outline, shape, fine, curves.simplify)
 
 
 def simplified(part: PlanePart, tolerance: float | None = None) -> PlanePart:
     """Return a part in straight lines and fillets, within a tolerance of it, m, if there are."""
     distance = SIMPLE * part.domain.cell if tolerance is None else tolerance
     shape = simple_shape(part.outline, distance, part.shape.area)
-    return part if shape is None else replace(part, shape=shape)
+    return replace(part, kept_splines=True) if shape is None else replace(part, shape=shape)
 
 
 def _count(number: int, name: str) -> str:
