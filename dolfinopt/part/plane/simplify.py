@@ -29,8 +29,8 @@ from dolfinopt.part.plane.trace import (
 )
 
 SPACING = 0.2  # of points along the outline, cells
-ATTEMPTS = (1.0, 0.6, 0.35)  # shares of the distance, one attempt after the other
-STEPS = 8  # of the area's correction
+ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 0.1)  # shares of the distance, one attempt after the other
+STEPS, SAME_AREA = 8, 1e-7  # of the area's correction; relative
 FACING = 6.0  # width of struts and flanges whose sides become parallel, cells
 OVERLAP = 0.5  # of two sides beside each other, shares of the shorter one
 SHARPEST = np.radians(150.0)  # turn of a corner
@@ -123,7 +123,9 @@ def simple_shape(outline: Outline, distance: float, area: float) -> Shape | None
             return _built(chains, offset, share * distance, outline)
 
         shape = _with_area(at, area)
-        if shape is None or not shape.is_simple(0.05 * tolerance):
+        if shape is None or abs(shape.area - area) > SAME_AREA * area:
+            continue
+        if not shape.is_simple(0.05 * tolerance):
             continue
         outer, *holes = shape.polygons(0.05 * tolerance)
         found = shapely.Polygon(outer, holes).boundary
@@ -359,12 +361,12 @@ def _crossed(sides: list[_Side], least: float) -> list[_Side]:
                 continue
             a, b = turns[k], turns[(k + 1) % n]
             reach = float((points[(k + 1) % n] - points[k]) @ side.along)
-            need = sum(least * np.tan(-0.5 * t) for t in (a, b) if -SHARPEST < t < 0.0)
-            ends = sides[k - 1], sides[(k + 1) % n]
-            if any(end.run is not None and end.arc is not None for end in ends):
-                need = 0.0
+            after, end = sides[(k + 1) % n], points[(k + 1) % n]
+            need = _taken(sides[k - 1], side, points[k], least)
+            need += _taken(side, after, end, least)
+            round_ = sides[k - 1].arc is not None or after.arc is not None
             both = BEND < abs(a + b) < SHARPEST and a * b > 0.0
-            if (both or reach <= 0.0 or _beside_axis(sides, k)) and need - reach > lacks:
+            if (both or round_ or reach <= 0.0 or _beside_axis(sides, k)) and need - reach > lacks:
                 worst, lacks = k, need - reach
         if worst < 0:
             return _through(sides, points)
@@ -376,6 +378,18 @@ def _crossed(sides: list[_Side], least: float) -> list[_Side]:
         step = (need - other.point[1]) / other.along[1]
         place = other.point + step * other.along
         sides[worst] = replace(sides[worst], point=place)
+
+
+def _taken(before: _Side, after: _Side, point: np.ndarray, least: float) -> float:
+    """Return the length of a free line that the least fillet at its corner takes, m."""
+    turn = _turn(before, after, point)
+    if not -SHARPEST < turn < 0.0:
+        return 0.0
+    if before.arc is None and after.arc is None:
+        return float(least * np.tan(-0.5 * turn))
+    found = _round_corner(before, after, point, least)
+    place = found.end if after.arc is not None else found.start
+    return float(np.linalg.norm(place - point))
 
 
 def _through(sides: list[_Side], points: list[np.ndarray]) -> list[_Side]:
