@@ -368,6 +368,8 @@ def free_outline(part: PlanePart) -> FreeOutline:
     for loop in fixed:
         found: list[Piece | int] = []
         line = np.empty((0, 2))
+        first = next(k for k, piece in enumerate(loop) if not piece.free)
+        loop = (*loop[first:], *loop[:first])  # no run goes on beyond the last piece
         for piece, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
             if not piece.free:
                 found.append(piece)
@@ -375,7 +377,7 @@ def free_outline(part: PlanePart) -> FreeOutline:
             own = piece.curve.at(piece.curve.parameters(chord))
             line = np.vstack([line, own[1:]]) if len(line) else own
             smooth = direction(piece.curve, 1.0) @ direction(after.curve, 0.0) > np.cos(KINK)
-            if not (after.free and smooth) or piece is loop[-1]:
+            if not (after.free and smooth):
                 found.append(len(runs))
                 runs.append(Run(_fitted_open(line, SPACING * cell), False))
                 line = np.empty((0, 2))
