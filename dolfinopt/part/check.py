@@ -382,7 +382,7 @@ class Check:
     def stress_converged(self) -> bool:
         """Whether the part's largest stress does not depend on the mesh."""
         limited = any(one.quantity == STRESS for one in self.part.limits)
-        refines = self.kind == "triangles"
+        refines = all(one.kind == "triangles" for one in self.meshes.values())
         return abs(self.refinement[STRESS]) <= (
             SETTLED_LIMITED if limited and refines else SETTLED_STRESS
         )

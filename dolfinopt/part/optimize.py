@@ -680,4 +680,3 @@ class Search:
 
     def _worst_triangle(self) -> float:
         return min(float(mesh.quality.min()) for mesh in self.state.bodies.values())
-
