@@ -70,7 +70,7 @@ Say = Callable[[str], None]
     "--iterations",
     type=click.IntRange(1),
     metavar="N",
-    help="of --optimize, from every start at most (60)",
+    help="of --optimize, from every start at most (80)",
 )
 @click.option(
     "--starts",

@@ -12,7 +12,8 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from math import ceil
 from typing import Any, cast
 
 import numpy as np
@@ -40,14 +41,16 @@ from dolfinopt.responses.response import Analysis, objective_of
 from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Scene
 
-ITERATIONS = 60  # default, at most, from every start
+ITERATIONS = 80  # default, at most, from every start
+FIRST = 0.75  # of them, before a finer mesh has judged
 FARTHEST = 0.2  # cells that a control point moves in a step, at most
 LEAST_RADIUS = 0.02  # of the trust region, of FARTHEST, below which no step is looked for
 SETTLED, PATIENCE = 1e-3, 6  # relative fall of the objective in so many steps that ends a round
 QUALITY = 0.15  # of a triangle, 1 where it is equilateral, below which the mesh is made anew
 MORPHED = 4  # steps that one mesh follows
 SIDES = 1.0  # of the triangles over those of the fine mesh
-ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
+ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
+HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
@@ -161,7 +164,7 @@ def optimize_parts(
         InputError: parts have no free curves.
     """
     owned = {k: part for k, part in parts.items() if k not in scene.patterns}
-    value, limits = _judged(scene, dict(parts))
+    value, limits, _ = _judged(scene, dict(parts))
     given = Found("the parts themselves", dict(parts), 0, value, limits, "as they were")
     found: list[Found] = []
     interrupted = False
@@ -213,12 +216,20 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-def _judged(scene: Scene, parts: dict[int, PlanePart]) -> tuple[float, tuple[Limit, ...]]:
-    """Return objective and limits of parts on refined meshes, stress that of the outline."""
+Judgement = tuple[float, tuple[Limit, ...], dict[int, list[np.ndarray]]]
+
+
+def _judged(scene: Scene, parts: dict[int, PlanePart]) -> Judgement:
+    """Return objective, limits and the places of largest stress of parts on refined meshes."""
     meshes = mesh_parts(parts)
     coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
-    state, column, *_ = refined(scene, parts, meshes.fine, coarse)
-    return state.evaluation.objective, column.limits
+    state, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
+    hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
+    for place, one in stress.items():
+        owner = scene.owners[place]
+        if scene.constraints.stress is not None and owner is not None and len(one.hot):
+            hot[owner] += HALVED * [one.hot]
+    return state.evaluation.objective, column.limits, hot
 
 
 def _part(outline: FreeOutline) -> PlanePart:
@@ -278,7 +289,8 @@ class Descent:
     def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
         """Return the best of what is judged, the state now among it, and the state's limits."""
         scene, made = self.problem.scene, self.problem.parts_of(self.state.outlines)
-        value, limits = _judged(scene, made)
+        value, limits, hot = _judged(scene, made)
+        self.problem = replace(self.problem, hot=hot)
         found = Found(start, made, self.done, value, limits, ending)
         if self.best is not None:
             known = self.best
@@ -288,6 +300,8 @@ class Descent:
         return found, limits
 
     def _tighten(self, limits: tuple[Limit, ...]) -> None:
+        """Go on with meshes that know where stress is largest, and what else they do not know."""
+        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
         loop = {one.name: one for one in self.state.limits}
         missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
         self.tell("tightened by what the finer mesh shows: " + ", ".join(missing))
@@ -297,16 +311,18 @@ class Descent:
     def _searched(self) -> str:
         """Go from the state to the best one that steps lead to; return why it ended."""
         self.search = Search(self.problem, self.state)
+        # Limits that a finer mesh has tightened are a few per cent, and no matter of layout.
+        first = self.best is None
+        most = ceil(FIRST * self.iterations) if first else self.iterations
         for number in range(1 + PRUNINGS):
             search = self.search
-            ending = search.run(self.iterations - self.done, self.tell, self.done)
+            ending = search.run(most - self.done, self.tell, self.done)
             self.done, search.steps = self.done + search.steps, 0
             if number and not search.best.rank < self.state.rank:
                 self.tell("no better without these struts: they stay")
                 break
             self.state = search.best
-            # Limits that a finer mesh has tightened are a few per cent, and no matter of layout.
-            if self.best is not None or self.done >= self.iterations or number == PRUNINGS:
+            if not first or self.done >= most or number == PRUNINGS:
                 break
             thinner = self._without_struts()
             if thinner is None:
@@ -411,11 +427,13 @@ class Problem:
         scene: of the run.
         parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
+        hot: places of every part (n, 2), m, near which its mesh is finer, once for every array.
     """
 
     scene: Scene
     parts: Mapping[int, PlanePart]
     tightened: Mapping[str, float]
+    hot: Mapping[int, list[np.ndarray]] = field(default_factory=dict)
 
     def every(self, outlines: Mapping[int, FreeOutline]) -> dict[int, FreeOutline]:
         """Return the outlines with those of arms that repeat them."""
@@ -445,7 +463,7 @@ class Problem:
         every = self.every(outlines)
         parts = {k: replace(one.part, shape=one.shape) for k, one in every.items()}
         if not bodies:
-            bodies = {k: part.mesh(SIDES) for k, part in parts.items()}
+            bodies = {k: part.mesh(SIDES, self.hot.get(k, ())) for k, part in parts.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -311,26 +311,45 @@ class FreeOutline:
             np.minimum(ROOM_SHARE * np.maximum(wide - least, 0.0), WIDTH_SHARE * wide)
             for wide, least in zip(self.widths(), self.least, strict=True)
         )
-        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
-        outwards = np.minimum(outwards, self._outside(points))
+        outwards = np.minimum(outwards, self._outside)
         if not self.stays.is_empty:
-            inwards = np.minimum(inwards, EDGE_SHARE * shapely.distance(points, self.stays))
+            apart = self._least_along(lambda at: shapely.distance(at, self.stays))
+            inwards = np.minimum(inwards, EDGE_SHARE * apart)
         return self._least_beside(inwards), self._least_beside(outwards)
 
-    def _outside(self, points: Any) -> np.ndarray:
-        """Return how far (n,) material may grow at places of the outline, m."""
+    @property
+    def _outside(self) -> np.ndarray:
+        """How far (count,) material may grow beside control points, m."""
         import shapely
 
-        edge = EDGE_SHARE * shapely.distance(points, self.arm.boundary)
-        return np.where(shapely.covers(self.arm, points), edge, 0.0)
+        def room(at: np.ndarray) -> np.ndarray:
+            edge = EDGE_SHARE * shapely.distance(at, self.arm.boundary)
+            return np.where(shapely.covers(self.arm, at), edge, 0.0)
+
+        return self._least_along(room)
+
+    def _least_along(self, value: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return the least value (count,) of shapely's points of the curves beside each control
+        point: where a hole ends between two of them it may come closer than both."""
+        import shapely
+
+        at = np.vstack([run.frame[0] for run in self.runs])
+        between = np.vstack(
+            [
+                piece.curve.at(np.linspace(0.0, 1.0, 4 * len(run.points))[1:-1])
+                for run in self.runs
+                for piece in run.pieces
+            ]
+        )
+        found = np.array(value(shapely.points(at)))
+        np.minimum.at(found, cKDTree(at).query(between)[1], value(shapely.points(between)))
+        return found
 
     def widened(self) -> FreeOutline:
         """Return the outline with members that are thinner than `least` a little wider."""
-        import shapely
 
-        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
         missing = 0.5 * np.maximum(self.least[0] - self.widths()[0], 0.0)
-        s = np.minimum(missing, np.minimum(WIDENED * self.part.domain.cell, self._outside(points)))
+        s = np.minimum(missing, np.minimum(WIDENED * self.part.domain.cell, self._outside))
         for run, block in zip(self.runs, self.blocks, strict=True):
             if run.closed:
                 own = s[block]

@@ -37,7 +37,7 @@ class Part(Table):
         "[-]",
     )
     iterations: int = Field(
-        default=60,
+        default=80,
         ge=1,
         le=MAX_ITERATIONS,
         description="largest number of steps of the curves from every start [-]",
