@@ -56,6 +56,7 @@ STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
 TRIALS = 30  # struts of an arm that are left out in trial, at most
 GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
+ENDED = " iterations"  # what the ending says of a search that was not allowed more
 PRUNINGS = 3  # times that struts are left out from one start
 ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
 
@@ -275,7 +276,8 @@ class Descent:
         for _ in range(ROUNDS):
             ending = self._searched()
             found, limits = self._judged(start, ending)
-            if all(one.met for one in limits) or self.done >= self.iterations:
+            kept = all(one.met for one in limits)
+            if self.done >= self.iterations or (kept and not ending.endswith(ENDED)):
                 break
             self._tighten(limits)
         return replace(found, ending=ending)
@@ -304,6 +306,8 @@ class Descent:
         self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
         loop = {one.name: one for one in self.state.limits}
         missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
+        if not missing:
+            return
         self.tell("tightened by what the finer mesh shows: " + ", ".join(missing))
         self.problem = replace(self.problem, tightened={**self.problem.tightened, **missing})
         self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
@@ -601,7 +605,7 @@ class Search:
             tell(self._line(first + self.steps))
             if self._settled():
                 return "settled"
-        return f"{first + iterations} iterations"
+        return f"{first + iterations}{ENDED}"
 
     def _keep(self) -> None:
         if self.state.rank < self.best.rank:
