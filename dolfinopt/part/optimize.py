@@ -11,6 +11,7 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import ceil
@@ -464,6 +465,7 @@ class Problem:
             InputError: an outline cannot be meshed.
             ConvergenceError: the machine cannot be simulated.
         """
+        gc.collect()  # factors of designs before stand in cycles: up to gigabytes in a search
         every = self.every(outlines)
         parts = {k: replace(one.part, shape=one.shape) for k, one in every.items()}
         if not bodies:
