@@ -168,23 +168,23 @@ def optimize_parts(
     owned = {k: part for k, part in parts.items() if k not in scene.patterns}
     value, limits, _ = _judged(scene, dict(parts))
     given = Found("the parts themselves", dict(parts), 0, value, limits, "as they were")
+    outlines = {k: _free(scene, k, part) for k, part in owned.items()}
+    if not any(one.count for one in outlines.values()):
+        raise InputError("--optimize: the parts have no free curves: nothing can move")
     found: list[Found] = []
     interrupted = False
     for number in range(1 + starts):
         name = f"trusses {number}" if number else "the densities' parts"
         descent = None
         try:
-            begun = trusses_of(owned, number - 1) if number else owned
-            outlines = {k: _free(scene, k, part) for k, part in begun.items()}
+            if number:
+                trusses = trusses_of(owned, number - 1)
+                outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
             if starts:
                 tell(f"from {name}")
-            if not any(one.count for one in outlines.values()):
-                raise InputError("--optimize: the parts have no free curves: nothing can move")
             descent = Descent(Problem(scene, parts, {}), outlines, iterations, tell)
             found.append(descent.found(name))
-        except (ConvergenceError, InputError) as error:
-            if not number:
-                raise
+        except (ConvergenceError, InputError) as error:  # the parts as they were remain
             tell(f"from {name}: {error}")
         except KeyboardInterrupt:
             interrupted = True
@@ -292,7 +292,12 @@ class Descent:
     def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
         """Return the best of what is judged, the state now among it, and the state's limits."""
         scene, made = self.problem.scene, self.problem.parts_of(self.state.outlines)
-        value, limits, hot = _judged(scene, made)
+        try:
+            value, limits, hot = _judged(scene, made)
+        except (ConvergenceError, InputError):
+            if self.best is None:
+                raise
+            return replace(self.best, iterations=self.done), self.best.limits
         self.problem = replace(self.problem, hot=hot)
         found = Found(start, made, self.done, value, limits, ending)
         if self.best is not None:
@@ -303,7 +308,7 @@ class Descent:
         return found, limits
 
     def _tighten(self, limits: tuple[Limit, ...]) -> None:
-        """Go on with meshes that know where stress is largest, and what else they do not know."""
+        """Go on with meshes that are finer where stress is largest, and with tighter limits."""
         self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
         loop = {one.name: one for one in self.state.limits}
         missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
@@ -585,12 +590,13 @@ class Search:
 
     Attributes:
         best: the best state so far: of the feasible ones that with the least objective.
+        meshed: the last one whose mesh was made anew.
         steps: taken.
     """
 
     def __init__(self, problem: Problem, state: State):
         """Begin at a state."""
-        self.problem, self.state, self.best = problem, state, state
+        self.problem, self.state, self.best, self.meshed = problem, state, state, state
         self.steps, self.radius, self.morphed = 0, 1.0, 0
         self.x = np.zeros(sum(one.count for one in state.outlines.values()))
         self.mma: MMAState = initial_state(self.x)
@@ -633,8 +639,12 @@ class Search:
     def _step(self, slopes: np.ndarray) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         if self.morphed >= MORPHED or self._worst_triangle() < QUALITY:
-            self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
-            self.morphed = 0
+            try:
+                self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+            except (ConvergenceError, InputError):  # curves that all but touch
+                self.best = self.meshed
+                return False
+            self.meshed, self.morphed = self.state, 0
             slopes = self.problem.slopes(self.state)
         before = self.state
         stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
