@@ -9,10 +9,10 @@ import pytest
 from parts import folder_with, frame
 
 from dolfinopt.cli.shared import scene_of
+from dolfinopt.part.part import make_parts
 from dolfinopt.part.plane.curves import MIRROR
 from dolfinopt.part.plane.free_outline import free_outline
 from dolfinopt.part.plane.layouts import struts_of, trusses_of, without
-from dolfinopt.part.part import make_parts
 
 pytestmark = pytest.mark.serial
 
