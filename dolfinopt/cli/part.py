@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.optimize import Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
+    from dolfinopt.scene.tables.part import Part as Asked
 
 Say = Callable[[str], None]
 
@@ -51,12 +53,11 @@ Say = Callable[[str], None]
 @click.option(
     "--curves",
     type=click.Choice(["splines", "arcs"]),
-    default="splines",
-    help="splines, or lines and arcs alone for machines that know no splines",
+    help="splines (default), or lines and arcs alone for machines that know no splines",
 )
 @click.option(
-    "--simplify",
-    is_flag=True,
+    "--simplify/--no-simplify",
+    default=None,
     help="straight lines and fillets in place of splines, both sides of struts parallel; within "
     "--tolerance of the outline, by default a quarter of a cell",
 )
@@ -66,18 +67,22 @@ Say = Callable[[str], None]
     help="simulate the machine with the parts, beside the densities they are made of",
 )
 @click.option(
-    "--optimize",
-    is_flag=True,
+    "--optimize/--no-optimize",
+    default=None,
     help="optimise the parts' free curves: the scene's objective within its limits, on a mesh of "
     "the parts themselves",
 )
 @click.option(
     "--iterations",
     type=click.IntRange(1),
-    default=60,
-    show_default=True,
     metavar="N",
-    help="of --optimize, at most",
+    help="of --optimize, from every start at most (80)",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(0),
+    metavar="N",
+    help="of --optimize: from N trusses, too; the best of all that keep the limits is kept (0)",
 )
 @overwrite_option
 @plots_option
@@ -86,11 +91,12 @@ def part(
     out: Path | None,
     tool_radius: float | None,
     tolerance: float | None,
-    curves: str,
-    simplify: bool,
+    curves: str | None,
+    simplify: bool | None,
     check: bool,
-    optimize: bool,
-    iterations: int,
+    optimize: bool | None,
+    iterations: int | None,
+    starts: int | None,
     overwrite: bool,
     plots: bool,
 ) -> None:
@@ -102,6 +108,8 @@ def part(
 
     Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
     STEP and DXF, too, for which --tool-radius, --tolerance and --curves are.
+
+    Options go over the table [part] of the scene.
     """
     world = start()
     from dolfinopt.parallel import on_root, together
@@ -112,7 +120,11 @@ def part(
     target = out or folder / "part"
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
-    if optimize and any(scene.arms[k].is_solid for k in scene.cell_counts):
+    given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
+             "simplify": simplify, "optimize": optimize, "iterations": iterations,
+             "starts": starts}  # fmt: skip
+    asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
+    if asked.optimize and any(scene.arms[k].is_solid for k in scene.cell_counts):
         raise InputError(
             f"--optimize: of arms in the plane alone; the arms of {folder} are solids; leave it out"
         )
@@ -120,9 +132,10 @@ def part(
     with _stages(world) as say:
         say("outlines and surfaces")
         # Splines are optimised, then simplified.
-        asked = Curves(tool_radius, tolerance, curves == "arcs", simplify and not optimize)
+        simple = asked.simplify and not asked.optimize
+        wanted = Curves(asked.tool_radius, asked.tolerance, asked.curves == "arcs", simple)
         try:
-            parts = make_parts(scene, folder, asked, world)
+            parts = make_parts(scene, folder, wanted, world)
         except PartsError as error:  # what there is of the others is of use
             if error.parts:
                 say("files")
@@ -133,16 +146,18 @@ def part(
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
-                made = Made(scene, parts, _meshes(parts, check or optimize, say))
+                made = Made(scene, parts, _meshes(parts, check or asked.optimize, say))
                 made = made.checked(folder, say) if check else made
-                if optimize and made.meshes is not None:
-                    made = made.optimized(folder, iterations, check, say)
-                    if simplify:
-                        made = made.simplified(folder, tolerance, check, say)
+                if asked.optimize and made.meshes is not None:
+                    made = made.optimized(folder, asked, check, say)
+                    if asked.simplify:
+                        made = made.simplified(folder, asked.tolerance, check, say)
                 say("files")
                 made.write(folder, target, plots)
     if world.rank == 0:
         made.tell(target)
+        if made.shape is not None and made.shape.interrupted:
+            raise KeyboardInterrupt(f"the best parts so far are in {target}")
 
 
 @contextmanager
@@ -158,6 +173,20 @@ def _stages(world: MPI.Comm) -> Iterator[Say]:
 
     with Console(stderr=True).status("") as status:
         yield lambda stage: status.update(f"{elapsed():.1f} s: {stage}")
+
+
+@contextmanager
+def _ended_as_interrupted() -> Iterator[None]:
+    """Let what ends a job in a queue (SIGTERM) raise KeyboardInterrupt, as Ctrl-C does."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _meshes(parts: Mapping[int, Part], coarse: bool, say: Say) -> Meshes | None:
@@ -202,17 +231,17 @@ class Made:
             warn([f"the machine with the parts cannot be compared: {error}"])
             return replace(self, check=None)
 
-    def optimized(self, run: Path, iterations: int, check: bool, say: Say) -> Made:
+    def optimized(self, run: Path, asked: Asked, check: bool, say: Say) -> Made:
         """Return it with optimised shapes, the parts before beside them in the check."""
         from dolfinopt.part.optimize import optimize_parts
         from dolfinopt.part.plane.part import PlanePart
 
         say("shapes")
         plates = {k: one for k, one in self.parts.items() if isinstance(one, PlanePart)}
-        found = optimize_parts(
-            self.scene, plates, iterations, lambda line: click.echo(line, err=True)
-        )
-        click.echo(found.sentence)
+        with _ended_as_interrupted():
+            given = self.scene, plates, asked.iterations
+            found = optimize_parts(*given, lambda line: click.echo(line, err=True), asked.starts)
+        click.echo("\n".join(found.sentences))
         after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
         return self._followed_by(after, run, check, say)
 

@@ -11,12 +11,15 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from math import ceil
+from typing import Any, cast
 
 import numpy as np
 import shapely
+from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
@@ -27,6 +30,7 @@ from dolfinopt.optimization.problem import Stage
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
 from dolfinopt.part.part import Meshes, mesh_parts
 from dolfinopt.part.plane.free_outline import CHORD, FreeOutline, free_outline
+from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without
 from dolfinopt.part.plane.mesh import BodyMesh
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.stress import OutlineStress
@@ -37,19 +41,60 @@ from dolfinopt.responses.response import Analysis, objective_of
 from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Scene
 
-ITERATIONS = 60  # default, at most
+ITERATIONS = 80  # default, at most, from every start
+FIRST = 0.75  # of them, before a finer mesh has judged
 FARTHEST = 0.2  # cells that a control point moves in a step, at most
 LEAST_RADIUS = 0.02  # of the trust region, of FARTHEST, below which no step is looked for
 SETTLED, PATIENCE = 1e-3, 6  # relative fall of the objective in so many steps that ends a round
 QUALITY = 0.15  # of a triangle, 1 where it is equilateral, below which the mesh is made anew
 MORPHED = 4  # steps that one mesh follows
 SIDES = 1.0  # of the triangles over those of the fine mesh
-ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
+ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
+HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
+TRIALS = 30  # struts of an arm that are left out in trial, at most
+GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
+ENDED = " iterations"  # what the ending says of a search that was not allowed more
+PRUNINGS = 3  # times that struts are left out from one start
+ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
 
 Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search from one start found.
+
+    Attributes:
+        start: what it began with.
+        parts: by their place in the chain.
+        iterations: steps taken.
+        value: of the objective, on fine meshes.
+        limits: of the scene, on the fine meshes.
+        ending: why it ended.
+    """
+
+    start: str
+    parts: dict[int, PlanePart]
+    iterations: int
+    value: float
+    limits: tuple[Limit, ...]
+    ending: str
+
+    @property
+    def sentence(self) -> str:
+        """What came out, in one line."""
+        missed = [one.sentence for one in self.limits if not one.met]
+        kept = "; ".join(missed) if missed else "all limits kept"
+        return f"{self.iterations} iterations ({self.ending}), objective {self.value:.4g}, {kept}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+        names = ("start", "iterations", "value", "ending")
+        met = all(one.met for one in self.limits)
+        return {name: getattr(self, name) for name in names} | {"limits_met": met}
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,84 +102,106 @@ class Optimized:
     """What the shape optimisation made of the parts.
 
     Attributes:
-        parts, meshes: optimised.
-        iterations: steps taken.
-        before, after: objective of the parts before and after, on fine meshes.
-        limits: of the result, on the fine meshes.
-        ending: why it ended.
+        best: of all starts.
+        others: what came of the other starts.
+        meshes: of the best parts.
+        before: objective of the parts before, on fine meshes.
+        interrupted: whether it was ended from outside.
     """
 
-    parts: dict[int, PlanePart]
+    best: Found
+    others: tuple[Found, ...]
     meshes: Meshes
-    iterations: int
     before: float
-    after: float
-    limits: tuple[Limit, ...]
-    ending: str
+    interrupted: bool
 
     @property
-    def sentence(self) -> str:
-        """What it brought, in one line."""
-        missed = [one.sentence for one in self.limits if not one.met]
-        kept = "; ".join(missed) if missed else "all limits kept"
-        return (
-            f"shape optimisation: {self.iterations} iterations ({self.ending}), objective "
-            f"{self.before:.4g} -> {self.after:.4g}, {kept}"
-        )
+    def parts(self) -> dict[int, PlanePart]:
+        """The optimised parts."""
+        return self.best.parts
+
+    @property
+    def sentences(self) -> list[str]:
+        """What it brought, a line for every start, the one that is kept first."""
+        first = f"shape optimisation, objective {self.before:.4g} before: from {self.best.start}"
+        rest = [f"not kept: from {one.start}: {one.sentence}" for one in self.others]
+        return [f"{first}: {self.best.sentence}", *rest]
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of part.json."""
-        names = ("iterations", "before", "after", "ending")
-        return {name: getattr(self, name) for name in names}
+        one = self.best
+        return {
+            "iterations": one.iterations,
+            "before": self.before,
+            "after": one.value,
+            "ending": one.ending,
+            "start": one.start,
+            "others": [other.to_dict() for other in self.others],
+        }
 
 
 def optimize_parts(
-    scene: Scene, parts: Mapping[int, PlanePart], iterations: int = ITERATIONS, tell: Tell = print
+    scene: Scene,
+    parts: Mapping[int, PlanePart],
+    iterations: int = ITERATIONS,
+    tell: Tell = print,
+    starts: int = 0,
 ) -> Optimized:
     """Return parts that are better by the scene's objective and keep its limits.
 
     On this rank alone. Lines, arcs, interfaces, bores and what stays solid stay where they are.
+    Of several starts the best one that keeps the limits counts. KeyboardInterrupt ends the search;
+    what is best so far is returned.
 
     Args:
         scene: of the run.
         parts: by their place in the chain.
-        iterations: at most, of all rounds together.
+        iterations: at most, from every start.
         tell: gets a line an iteration.
+        starts: trusses from which to begin, besides the parts themselves.
 
     Raises:
         ConvergenceError: the machine with the parts cannot be simulated.
-        InputError: parts have no free curves, or arms repeat each other's design.
+        InputError: parts have no free curves.
     """
-    for k, pattern in scene.patterns.items():
-        raise InputError(
-            f"--optimize: arm {scene.arms[k].name!r} repeats {scene.arms[pattern].name!r} "
-            "(arms.pattern), and every part would get a shape of its own; leave --optimize out"
-        )
-    outlines = {k: free_outline(part) for k, part in parts.items()}
+    owned = {k: part for k, part in parts.items() if k not in scene.patterns}
+    value, limits, _ = _judged(scene, dict(parts))
+    given = Found("the parts themselves", dict(parts), 0, value, limits, "as they were")
+    outlines = {k: _free(scene, k, part) for k, part in owned.items()}
     if not any(one.count for one in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")
-    before, limits = _judged(scene, dict(parts))
-    problem = Problem(scene, {})
-    found = (dict(parts), before, limits)
-    state, done, ending = problem.evaluated(outlines, {}), 0, ""
-    for _ in range(ROUNDS):
-        search = Search(problem, state)
-        ending = search.run(iterations - done, tell, done)
-        done += search.steps
-        state = search.best
-        made = {k: _part(one) for k, one in state.outlines.items()}
-        value, limits = _judged(scene, made)
-        if _rank(scene, value, limits) < _rank(scene, *found[1:]):
-            found = made, value, limits
-        if all(one.met for one in limits) or done >= iterations:
+    found: list[Found] = []
+    interrupted = False
+    for number in range(1 + starts):
+        name = f"trusses {number}" if number else "the densities' parts"
+        descent = None
+        try:
+            if number:
+                trusses = trusses_of(owned, number - 1)
+                outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
+            if starts:
+                tell(f"from {name}")
+            descent = Descent(Problem(scene, parts, {}), outlines, iterations, tell)
+            found.append(descent.found(name))
+        except (ConvergenceError, InputError) as error:  # the parts as they were remain
+            tell(f"from {name}: {error}")
+        except KeyboardInterrupt:
+            interrupted = True
+            if descent is not None:
+                tell("interrupted: the best so far is judged and kept; once more gives it up")
+                found.append(descent.so_far(name))
             break
-        loop = {one.name: one for one in state.limits}
-        missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
-        tell("tightened by what the finer mesh shows: " + ", ".join(missing))
-        problem = replace(problem, tightened={**problem.tightened, **missing})
-        state = problem.evaluated(state.outlines, {}, search.solutions)
-    made, after, limits = found
-    return Optimized(made, mesh_parts(made), done, before, after, limits, ending)
+    best = min([given, *found], key=lambda one: _rank(scene, one.value, one.limits))
+    others = tuple(one for one in found if one is not best)
+    return Optimized(best, others, mesh_parts(best.parts), value, interrupted)
+
+
+def _free(scene: Scene, k: int, part: PlanePart) -> FreeOutline:
+    """Return the free outline of a part; it is no thinner where other arms repeat it smaller."""
+    repeating = [scene.arms[j] for j, pattern in scene.patterns.items() if pattern == k]
+    one = scene.arms[k]
+    sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
+    return free_outline(part, scene.design.minimum_gap, min([1.0, *sizes]))
 
 
 def _rank(scene: Scene, value: float, limits: tuple[Limit, ...]) -> tuple[float, float]:
@@ -150,12 +217,20 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-def _judged(scene: Scene, parts: dict[int, PlanePart]) -> tuple[float, tuple[Limit, ...]]:
-    """Return objective and limits of parts on refined meshes, stress that of the outline."""
+Judgement = tuple[float, tuple[Limit, ...], dict[int, list[np.ndarray]]]
+
+
+def _judged(scene: Scene, parts: dict[int, PlanePart]) -> Judgement:
+    """Return objective, limits and the places of largest stress of parts on refined meshes."""
     meshes = mesh_parts(parts)
     coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
-    state, column, *_ = refined(scene, parts, meshes.fine, coarse)
-    return state.evaluation.objective, column.limits
+    state, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
+    hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
+    for place, one in stress.items():
+        owner = scene.owners[place]
+        if scene.constraints.stress is not None and owner is not None and len(one.hot):
+            hot[owner] += HALVED * [one.hot]
+    return state.evaluation.objective, column.limits, hot
 
 
 def _part(outline: FreeOutline) -> PlanePart:
@@ -168,6 +243,142 @@ def _part(outline: FreeOutline) -> PlanePart:
     apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
     shape = replace(outline.shape, apart=float(apart))
     return replace(part, shape=shape, outline=drawn)
+
+
+# -- from one start ----------------------------------------------------------------------------
+
+
+class Descent:
+    """Searches from one start: steps, struts left out, limits tightened by a finer mesh.
+
+    Attributes:
+        problem: with limits as tight as the finer mesh asks for.
+        state: the best of the searches that have ended.
+        search: that goes on.
+        done: steps taken in those that have ended.
+        best: of what finer meshes have judged.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        outlines: Mapping[int, FreeOutline],
+        iterations: int,
+        tell: Tell,
+    ):
+        """Begin at outlines."""
+        self.problem, self.iterations, self.tell = problem, iterations, tell
+        self.state, self.done = problem.evaluated(outlines, {}), 0
+        self.search, self.best = Search(problem, self.state), cast(Found | None, None)
+
+    def found(self, start: str) -> Found:
+        """Search to the end, and return the best of what finer meshes have judged."""
+        for _ in range(ROUNDS):
+            ending = self._searched()
+            found, limits = self._judged(start, ending)
+            kept = all(one.met for one in limits)
+            if self.done >= self.iterations or (kept and not ending.endswith(ENDED)):
+                break
+            self._tighten(limits)
+        return replace(found, ending=ending)
+
+    def so_far(self, start: str) -> Found:
+        """Return the best so far of a search that was interrupted."""
+        self.state = min(self.state, self.search.best, key=lambda one: one.rank)
+        self.done += self.search.steps
+        return replace(self._judged(start, "")[0], ending="interrupted")
+
+    def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
+        """Return the best of what is judged, the state now among it, and the state's limits."""
+        scene, made = self.problem.scene, self.problem.parts_of(self.state.outlines)
+        try:
+            value, limits, hot = _judged(scene, made)
+        except (ConvergenceError, InputError):
+            if self.best is None:
+                raise
+            return replace(self.best, iterations=self.done), self.best.limits
+        self.problem = replace(self.problem, hot=hot)
+        found = Found(start, made, self.done, value, limits, ending)
+        if self.best is not None:
+            known = self.best
+            worse = _rank(scene, value, limits) >= _rank(scene, known.value, known.limits)
+            found = replace(known, iterations=self.done) if worse else found
+        self.best = found
+        return found, limits
+
+    def _tighten(self, limits: tuple[Limit, ...]) -> None:
+        """Go on with meshes that are finer where stress is largest, and with tighter limits."""
+        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+        loop = {one.name: one for one in self.state.limits}
+        missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
+        if not missing:
+            return
+        self.tell("tightened by what the finer mesh shows: " + ", ".join(missing))
+        self.problem = replace(self.problem, tightened={**self.problem.tightened, **missing})
+        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+
+    def _searched(self) -> str:
+        """Go from the state to the best one that steps lead to; return why it ended."""
+        self.search = Search(self.problem, self.state)
+        # Limits that a finer mesh has tightened are a few per cent, and no matter of layout.
+        first = self.best is None
+        most = ceil(FIRST * self.iterations) if first else self.iterations
+        for number in range(1 + PRUNINGS):
+            search = self.search
+            ending = search.run(most - self.done, self.tell, self.done)
+            self.done, search.steps = self.done + search.steps, 0
+            if number and not search.best.rank < self.state.rank:
+                self.tell("no better without these struts: they stay")
+                break
+            self.state = search.best
+            if not first or self.done >= most or number == PRUNINGS:
+                break
+            thinner = self._without_struts()
+            if thinner is None:
+                break
+            self.search = Search(self.problem, thinner)
+        return ending
+
+    def _without_struts(self) -> State | None:
+        """Return the state without struts that weigh more than they bring; None: all do.
+
+        What they bring is told by the Lagrangian: of each by itself, then of those that promise
+        most together, as long as every further one gains.
+        """
+        state, price = self.state, self.problem.prices(self.state)
+        gain = GAIN * abs(state.values[0])
+        promised: list[tuple[float, int, int, Strut]] = []
+        for k, outline in state.outlines.items():
+            for strut in struts_of(outline)[:TRIALS]:
+                tried = self._tried({**state.outlines, k: without(outline, [strut])})
+                if tried is not None:
+                    change = (tried.against(state.held) - state.values) @ price
+                    promised.append((change, k, len(promised), strut))
+        found, least = None, 0.0
+        gone: dict[int, list[Strut]] = {k: [] for k in state.outlines}
+        for change, k, _, strut in sorted(promised, key=lambda one: one[:3]):
+            if change > -gain or not all(strut.beside.isdisjoint(o.beside) for o in gone[k]):
+                continue
+            more = {**gone, k: [*gone[k], strut]}
+            outlines = {j: without(one, more[j]) for j, one in state.outlines.items()}
+            tried = self._tried(outlines)
+            if tried is None:
+                continue
+            change = (tried.against(state.held) - state.values) @ price
+            if change < least - gain:
+                found, least, gone = tried, change, more
+        count = sum(map(len, gone.values()))
+        if found is not None:
+            self.tell(f"tried without {count} strut{'s' if count > 1 else ''}")
+        return found
+
+    def _tried(self, outlines: Mapping[int, FreeOutline]) -> State | None:
+        if not all(one.is_valid for one in outlines.values()):
+            return None
+        try:
+            return self.problem.evaluated(outlines, {}, self.state.solutions)
+        except (ConvergenceError, InputError):
+            return None
 
 
 # -- the problem at one outline ----------------------------------------------------------------
@@ -205,6 +416,17 @@ class State:
         objective = sign * self.simulated.evaluation.objective
         return np.concatenate([[objective], self.smooth / held - 1.0, self.shares])
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """What orders states, best first: feasible ones by their objective, else by excess."""
+        excess = self.values[1:].max(initial=0.0)
+        return (excess if excess > EXCESS else 0.0), self.values[0]
+
+    @property
+    def solutions(self) -> Any:
+        """Its motion, from which that of a state nearby is found."""
+        return self.simulated.trajectory.solutions
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -212,11 +434,31 @@ class Problem:
 
     Attributes:
         scene: of the run.
+        parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
+        hot: places of every part (n, 2), m, near which its mesh is finer, once for every array.
     """
 
     scene: Scene
+    parts: Mapping[int, PlanePart]
     tightened: Mapping[str, float]
+    hot: Mapping[int, list[np.ndarray]] = field(default_factory=dict)
+
+    def every(self, outlines: Mapping[int, FreeOutline]) -> dict[int, FreeOutline]:
+        """Return the outlines with those of arms that repeat them."""
+        found = dict(outlines)
+        for k, pattern in self.scene.patterns.items():
+            found[k] = outlines[pattern].scaled(self.parts[k], self._factors(k))
+        return {k: found[k] for k in sorted(found)}
+
+    def parts_of(self, outlines: Mapping[int, FreeOutline]) -> dict[int, PlanePart]:
+        """Return the parts of all arms with these outlines."""
+        return {k: _part(one) for k, one in self.every(outlines).items()}
+
+    def _factors(self, k: int) -> np.ndarray:
+        """Return length and height of an arm over those of the one whose design it repeats."""
+        one, other = self.scene.arms[k], self.scene.arms[self.scene.patterns.get(k, k)]
+        return np.array([one.length / other.length, one.height / other.height])
 
     def evaluated(
         self, outlines: Mapping[int, FreeOutline], bodies: Mapping[int, BodyMesh], *start: Any
@@ -227,28 +469,30 @@ class Problem:
             InputError: an outline cannot be meshed.
             ConvergenceError: the machine cannot be simulated.
         """
-        parts = {k: replace(one.part, shape=one.shape) for k, one in outlines.items()}
+        gc.collect()  # factors of designs before stand in cycles: up to gigabytes in a search
+        every = self.every(outlines)
+        parts = {k: replace(one.part, shape=one.shape) for k, one in every.items()}
         if not bodies:
-            bodies = {k: part.mesh(SIDES) for k, part in parts.items()}
+            bodies = {k: part.mesh(SIDES, self.hot.get(k, ())) for k, part in parts.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
         simulated = simulate_parts(self.scene, parts, bodies, *start, **changes)
         found, rows = simulated.evaluation, []
-        every = limits_of(simulated.scene, found)
-        for one, value, limit in zip(every, found.constraints, found.smooth_limits, strict=True):
+        limits = limits_of(simulated.scene, found)
+        for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
         if self.scene.constraints.stress is not None:
-            stress, analysis = self._outline_stress(simulated, outlines)
+            stress, analysis = self._outline_stress(simulated, every)
             measured, limit = stress.measure(analysis), self.scene.constraints.stress
             true, smooth = measured.values[0], measured.smooth[0]
             one = Limit(STRESS, "", true, limit, "Pa")
             rows.append((one, smooth, limit * smooth / true / self._factor(one)))
-        limits, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
+        known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
         shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
         numbers = (np.array(one, dtype=float) for one in (smooths, held, shares))
-        return State(outlines, bodies, simulated, tuple(limits), *numbers)
+        return State(outlines, bodies, simulated, tuple(known), *numbers)
 
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0 + RESERVE)
@@ -293,7 +537,7 @@ class Problem:
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
         if self.scene.constraints.stress is not None:
-            stress, analysis = self._outline_stress(one, state.outlines)
+            stress, analysis = self._outline_stress(one, self.every(state.outlines))
             (row,) = stress.gradients(analysis)
             rows.append({k: g / state.held[len(rows) - 1] for k, g in row.items()})
         parts = [self._by_x(state, rows)]
@@ -313,19 +557,28 @@ class Problem:
 
     def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:
         """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""
-        found = []
-        for k, outline in state.outlines.items():
+        found = {k: np.zeros((len(rows), one.count)) for k, one in state.outlines.items()}
+        for k, body in state.bodies.items():
+            owner, factors = self.scene.patterns.get(k, k), self._factors(k)
             places = state.simulated.arms[k].mesh.mesh.geometry.x[:, :2]
-            body = state.bodies[k]
             order = cKDTree(places).query(body.points)[1]
-            by_s = [
-                outline.by_s(body, body.at_outline(row[k][order]))
-                if k in row
-                else np.zeros(outline.count)
-                for row in rows
-            ]
-            found.append(outline.by_x(np.array(by_s)))
-        return np.hstack(found)
+            for number, row in enumerate(rows):
+                if k in row:
+                    by_outline = body.at_outline(row[k][order]) * factors
+                    found[owner][number] += state.outlines[owner].by_s(body, by_outline)
+        return np.hstack([state.outlines[k].by_x(by_s) for k, by_s in found.items()])
+
+    def prices(self, state: State) -> np.ndarray:
+        """Return 1 and the multipliers of the limits (1 + m,), by least squares."""
+        slopes, values = self.slopes(state), state.values
+        room = np.concatenate([np.minimum(*one.room()) for one in state.outlines.values()])
+        free, active = room > 0.0, values[1:] > -ACTIVE
+        found = np.zeros(len(values))
+        found[0] = 1.0
+        if active.any():
+            A = slopes[1:][active][:, free].T
+            found[1:][active] = nnls(A, -slopes[0][free])[0]
+        return found
 
 
 # -- the steps ---------------------------------------------------------------------------------
@@ -336,12 +589,13 @@ class Search:
 
     Attributes:
         best: the best state so far: of the feasible ones that with the least objective.
+        meshed: the last one whose mesh was made anew.
         steps: taken.
     """
 
     def __init__(self, problem: Problem, state: State):
         """Begin at a state."""
-        self.problem, self.state, self.best = problem, state, state
+        self.problem, self.state, self.best, self.meshed = problem, state, state, state
         self.steps, self.radius, self.morphed = 0, 1.0, 0
         self.x = np.zeros(sum(one.count for one in state.outlines.values()))
         self.mma: MMAState = initial_state(self.x)
@@ -358,14 +612,10 @@ class Search:
             tell(self._line(first + self.steps))
             if self._settled():
                 return "settled"
-        return f"{first + iterations} iterations"
+        return f"{first + iterations}{ENDED}"
 
     def _keep(self) -> None:
-        def rank(state: State) -> tuple[float, float]:
-            excess = state.values[1:].max(initial=0.0)
-            return (excess if excess > EXCESS else 0.0), state.values[0]
-
-        if rank(self.state) < rank(self.best):
+        if self.state.rank < self.best.rank:
             self.best = self.state
         self.falls.append(self.best.values[0])
 
@@ -388,8 +638,12 @@ class Search:
     def _step(self, slopes: np.ndarray) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         if self.morphed >= MORPHED or self._worst_triangle() < QUALITY:
-            self.state = self.problem.evaluated(self.state.outlines, {}, self.solutions)
-            self.morphed = 0
+            try:
+                self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+            except (ConvergenceError, InputError):  # curves that all but touch
+                self.best = self.meshed
+                return False
+            self.meshed, self.morphed = self.state, 0
             slopes = self.problem.slopes(self.state)
         before = self.state
         stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
@@ -443,21 +697,19 @@ class Search:
         for k, one in self.state.outlines.items():
             s = one.filtered(x[first : first + one.count] - self.x[first : first + one.count])
             first += one.count
-            outlines[k] = one.moved(np.clip(s, -room[k][0], room[k][1]))
+            outlines[k] = one.moved(np.clip(s, -room[k][0], room[k][1])).rounded()
             if not outlines[k].is_valid:
                 return None
         try:
-            bodies = {k: self.state.bodies[k].morphed(one.shape) for k, one in outlines.items()}
+            bodies = {
+                k: self.state.bodies[k].morphed(one.shape)
+                for k, one in self.problem.every(outlines).items()
+            }
             if any(one.is_folded for one in bodies.values()):
                 bodies = {}
-            return self.problem.evaluated(outlines, bodies, self.solutions)
+            return self.problem.evaluated(outlines, bodies, self.state.solutions)
         except (ConvergenceError, InputError):
             return None
-
-    @property
-    def solutions(self) -> Any:
-        """The motion of the last state, from which the next one's is found."""
-        return self.state.simulated.trajectory.solutions
 
     def _worst_triangle(self) -> float:
         return min(float(mesh.quality.min()) for mesh in self.state.bodies.values())
