@@ -44,6 +44,7 @@ TABLES = {
     "constraints": "Limits besides that of the volume.",
     "design": "The design variables, their filter and projection.",
     "optimizer": "The optimiser and when it ends.",
+    "part": "What `dolfinopt part` makes of the result; options of the command go over it.",
     "scenarios": "An array of tables, one `[[scenarios]]` a use of the machine that the design "
     "must serve besides the others.",
 }

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.optimize import Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
+    from dolfinopt.scene.tables.part import Part as Asked
 
 Say = Callable[[str], None]
 
@@ -51,8 +53,13 @@ Say = Callable[[str], None]
 @click.option(
     "--curves",
     type=click.Choice(["splines", "arcs"]),
-    default="splines",
-    help="splines, or lines and arcs alone for machines that know no splines",
+    help="splines (default), or lines and arcs alone for machines that know no splines",
+)
+@click.option(
+    "--simplify/--no-simplify",
+    default=None,
+    help="straight lines and fillets in place of splines, both sides of struts parallel; within "
+    "--tolerance of the outline, by default a quarter of a cell",
 )
 @click.option(
     "--check/--no-check",
@@ -60,18 +67,22 @@ Say = Callable[[str], None]
     help="simulate the machine with the parts, beside the densities they are made of",
 )
 @click.option(
-    "--optimize",
-    is_flag=True,
+    "--optimize/--no-optimize",
+    default=None,
     help="optimise the parts' free curves: the scene's objective within its limits, on a mesh of "
     "the parts themselves",
 )
 @click.option(
     "--iterations",
     type=click.IntRange(1),
-    default=60,
-    show_default=True,
     metavar="N",
-    help="of --optimize, at most",
+    help="of --optimize, from every start at most (80)",
+)
+@click.option(
+    "--starts",
+    type=click.IntRange(0),
+    metavar="N",
+    help="of --optimize: from N trusses, too; the best of all that keep the limits is kept (0)",
 )
 @overwrite_option
 @plots_option
@@ -80,10 +91,12 @@ def part(
     out: Path | None,
     tool_radius: float | None,
     tolerance: float | None,
-    curves: str,
+    curves: str | None,
+    simplify: bool | None,
     check: bool,
-    optimize: bool,
-    iterations: int,
+    optimize: bool | None,
+    iterations: int | None,
+    starts: int | None,
     overwrite: bool,
     plots: bool,
 ) -> None:
@@ -95,32 +108,52 @@ def part(
 
     Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
     STEP and DXF, too, for which --tool-radius, --tolerance and --curves are.
+
+    Options go over the table [part] of the scene.
     """
     world = start()
     from dolfinopt.parallel import on_root, together
     from dolfinopt.part.files.folder import file_names
-    from dolfinopt.part.part import Curves, make_parts
+    from dolfinopt.part.part import Curves, PartsError, make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
     target = out or folder / "part"
     if not scene.cell_counts:
         raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
+    given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
+             "simplify": simplify, "optimize": optimize, "iterations": iterations,
+             "starts": starts}  # fmt: skip
+    asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
     claim(world, target, overwrite, file_names(scene), scene=scene)
     with _stages(world) as say:
         say("outlines and surfaces")
-        asked = Curves(tool_radius, tolerance, curves == "arcs")
-        parts = make_parts(scene, folder, asked, world)
+        # Splines are optimised, then simplified.
+        simple = asked.simplify and not asked.optimize
+        wanted = Curves(asked.tool_radius, asked.tolerance, asked.curves == "arcs", simple)
+        try:
+            parts = make_parts(scene, folder, wanted, world)
+        except PartsError as error:  # what there is of the others is of use
+            if error.parts:
+                say("files")
+                Made(scene, error.parts, None).write(folder, target, plots)
+                names = ", ".join(one.name for one in error.parts.values())
+                warn([f"only files of {names} in {target}"])
+            raise
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
-                made = Made(scene, parts, _meshes(parts, check or optimize, say))
+                made = Made(scene, parts, _meshes(parts, check or asked.optimize, say))
                 made = made.checked(folder, say) if check else made
-                if optimize and made.meshes is not None:
-                    made = made.optimized(folder, iterations, check, say)
+                if asked.optimize and made.meshes is not None:
+                    made = made.optimized(folder, asked, check, say)
+                    if asked.simplify:
+                        made = made.simplified(folder, asked.tolerance, check, say)
                 say("files")
                 made.write(folder, target, plots)
     if world.rank == 0:
         made.tell(target)
+        if made.shape is not None and made.shape.interrupted:
+            raise KeyboardInterrupt(f"the best parts so far are in {target}")
 
 
 @contextmanager
@@ -136,6 +169,20 @@ def _stages(world: MPI.Comm) -> Iterator[Say]:
 
     with Console(stderr=True).status("") as status:
         yield lambda stage: status.update(f"{elapsed():.1f} s: {stage}")
+
+
+@contextmanager
+def _ended_as_interrupted() -> Iterator[None]:
+    """Let what ends a job in a queue (SIGTERM) raise KeyboardInterrupt, as Ctrl-C does."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _meshes(parts: Mapping[int, Part], coarse: bool, say: Say) -> Meshes | None:
@@ -180,20 +227,38 @@ class Made:
             warn([f"the machine with the parts cannot be compared: {error}"])
             return replace(self, check=None)
 
-    def optimized(self, run: Path, iterations: int, check: bool, say: Say) -> Made:
+    def optimized(self, run: Path, asked: Asked, check: bool, say: Say) -> Made:
         """Return it with optimised shapes, the parts before beside them in the check."""
         from dolfinopt.part.optimize import optimize_parts
 
         say("shapes")
-        found = optimize_parts(
-            self.scene, self.parts, iterations, lambda line: click.echo(line, err=True)
-        )
-        click.echo(found.sentence)
-        after = replace(self, parts=found.parts, meshes=found.meshes, shape=found, check=None)
+        with _ended_as_interrupted():
+            given = self.scene, self.parts, asked.iterations
+            found = optimize_parts(*given, lambda line: click.echo(line, err=True), asked.starts)
+        click.echo("\n".join(found.sentences))
+        after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
+        return self._followed_by(after, run, check, say)
+
+    def simplified(self, run: Path, tolerance: float | None, check: bool, say: Say) -> Made:
+        """Return it with optimised shapes in straight lines and fillets."""
+        from dolfinopt.part.plane.part import PlanePart, simplified
+
+        parts = {
+            k: simplified(one, tolerance)
+            for k, one in self.parts.items()
+            if isinstance(one, PlanePart)
+        }
+        after = replace(self, parts=parts, meshes=_meshes(parts, check, say))
+        return self._followed_by(after, run, check, say)
+
+    def _followed_by(self, after: Made, run: Path, check: bool, say: Say) -> Made:
+        """Return other parts with what they do, and that of the first ones beside it."""
+        after = replace(after, check=None)
         after = after.checked(run, say) if check else after
         if self.check is None or after.check is None:
             return after
-        return replace(after, check=replace(after.check, before=self.check.part))
+        before = self.check.before or self.check.part
+        return replace(after, check=replace(after.check, before=before))
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""

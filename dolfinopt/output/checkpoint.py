@@ -39,7 +39,9 @@ MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations"
 
 def _scene_text(scene: Scene) -> str:
     """Return the scene as JSON; its files by their content, so that a project can be moved."""
-    return json.dumps(with_digests(scene.to_dict()), sort_keys=True)
+    data = with_digests(scene.to_dict())
+    del data["part"]  # which comes after the run
+    return json.dumps(data, sort_keys=True)
 
 
 def begin(folder: Path, scene: Scene) -> None:

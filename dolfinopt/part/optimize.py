@@ -11,11 +11,13 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import ceil
+from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
@@ -25,7 +27,8 @@ from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
-from dolfinopt.part.plane.free_outline import free_outline
+from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
+from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.solid.free_surface import free_form
 from dolfinopt.part.solid.part import SolidPart
@@ -37,17 +40,58 @@ from dolfinopt.responses.response import Analysis, objective_of
 from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Scene
 
-ITERATIONS = 60  # default, at most
+ITERATIONS = 80  # default, at most, from every start
+FIRST = 0.75  # of them, before a finer mesh has judged
 FARTHEST = 0.2  # cells that a control point moves in a step, at most
 LEAST_RADIUS = 0.02  # of the trust region, of FARTHEST, below which no step is looked for
 SETTLED, PATIENCE = 1e-3, 6  # relative fall of the objective in so many steps that ends a round
 SIDES = 1.0  # of the triangles over those of the fine mesh
-ROUNDS = 3  # of iterations, each with limits tightened by what the finer mesh showed
+ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
+HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
+TRIALS = 30  # struts of an arm that are left out in trial, at most
+GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
+ENDED = " iterations"  # what the ending says of a search that was not allowed more
+PRUNINGS = 3  # times that struts are left out from one start
+ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
 
 Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search from one start found.
+
+    Attributes:
+        start: what it began with.
+        parts: by their place in the chain.
+        iterations: steps taken.
+        value: of the objective, on fine meshes.
+        limits: of the scene, on the fine meshes.
+        ending: why it ended.
+    """
+
+    start: str
+    parts: dict[int, Part]
+    iterations: int
+    value: float
+    limits: tuple[Limit, ...]
+    ending: str
+
+    @property
+    def sentence(self) -> str:
+        """What came out, in one line."""
+        missed = [one.sentence for one in self.limits if not one.met]
+        kept = "; ".join(missed) if missed else "all limits kept"
+        return f"{self.iterations} iterations ({self.ending}), objective {self.value:.4g}, {kept}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+        names = ("start", "iterations", "value", "ending")
+        met = all(one.met for one in self.limits)
+        return {name: getattr(self, name) for name in names} | {"limits_met": met}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,84 +99,110 @@ class Optimized:
     """What the shape optimisation made of the parts.
 
     Attributes:
-        parts, meshes: optimised.
-        iterations: steps taken.
-        before, after: objective of the parts before and after, on fine meshes.
-        limits: of the result, on the fine meshes.
-        ending: why it ended.
+        best: of all starts.
+        others: what came of the other starts.
+        meshes: of the best parts.
+        before: objective of the parts before, on fine meshes.
+        interrupted: whether it was ended from outside.
     """
 
-    parts: dict[int, Part]
+    best: Found
+    others: tuple[Found, ...]
     meshes: Meshes
-    iterations: int
     before: float
-    after: float
-    limits: tuple[Limit, ...]
-    ending: str
+    interrupted: bool
 
     @property
-    def sentence(self) -> str:
-        """What it brought, in one line."""
-        missed = [one.sentence for one in self.limits if not one.met]
-        kept = "; ".join(missed) if missed else "all limits kept"
-        return (
-            f"shape optimisation: {self.iterations} iterations ({self.ending}), objective "
-            f"{self.before:.4g} -> {self.after:.4g}, {kept}"
-        )
+    def parts(self) -> dict[int, Part]:
+        """The optimised parts."""
+        return self.best.parts
+
+    @property
+    def sentences(self) -> list[str]:
+        """What it brought, a line for every start, the one that is kept first."""
+        first = f"shape optimisation, objective {self.before:.4g} before: from {self.best.start}"
+        rest = [f"not kept: from {one.start}: {one.sentence}" for one in self.others]
+        return [f"{first}: {self.best.sentence}", *rest]
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of part.json."""
-        names = ("iterations", "before", "after", "ending")
-        return {name: getattr(self, name) for name in names}
+        one = self.best
+        return {
+            "iterations": one.iterations,
+            "before": self.before,
+            "after": one.value,
+            "ending": one.ending,
+            "start": one.start,
+            "others": [other.to_dict() for other in self.others],
+        }
 
 
 def optimize_parts(
-    scene: Scene, parts: Mapping[int, Part], iterations: int = ITERATIONS, tell: Tell = print
+    scene: Scene,
+    parts: Mapping[int, Part],
+    iterations: int = ITERATIONS,
+    tell: Tell = print,
+    starts: int = 0,
 ) -> Optimized:
     """Return parts that are better by the scene's objective and keep its limits.
 
     On this rank alone. Lines, arcs, interfaces, bores and what stays solid stay where they are.
+    Of several starts the best one that keeps the limits counts. KeyboardInterrupt ends the search;
+    what is best so far is returned.
 
     Args:
         scene: of the run.
         parts: by their place in the chain.
-        iterations: at most, of all rounds together.
+        iterations: at most, from every start.
         tell: gets a line an iteration.
+        starts: trusses from which to begin, besides the parts themselves.
 
     Raises:
         ConvergenceError: the machine with the parts cannot be simulated.
-        InputError: parts have no free curves, or arms repeat each other's design.
+        InputError: parts have no free curves.
     """
-    for k, pattern in scene.patterns.items():
-        raise InputError(
-            f"--optimize: arm {scene.arms[k].name!r} repeats {scene.arms[pattern].name!r} "
-            "(arms.pattern), and every part would get a shape of its own; leave --optimize out"
-        )
-    outlines = {k: _free(part) for k, part in parts.items()}
+    owned = {k: part for k, part in parts.items() if k not in scene.patterns}
+    value, limits, _ = _judged(scene, dict(parts))
+    given = Found("the parts themselves", dict(parts), 0, value, limits, "as they were")
+    outlines = {k: _free(scene, k, part) for k, part in owned.items()}
     if not any(one.count for one in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")
-    before, limits = _judged(scene, dict(parts))
-    problem = Problem(scene, {})
-    found = (dict(parts), before, limits)
-    state, done, ending = problem.evaluated(outlines, {}), 0, ""
-    for _ in range(ROUNDS):
-        search = Search(problem, state)
-        ending = search.run(iterations - done, tell, done)
-        done += search.steps
-        state = search.best
-        made = {k: one.made for k, one in state.outlines.items()}
-        value, limits = _judged(scene, made)
-        if _rank(scene, value, limits) < _rank(scene, *found[1:]):
-            found = made, value, limits
-        if all(one.met for one in limits) or done >= iterations:
+    found: list[Found] = []
+    interrupted = False
+    for number in range(1 + starts):
+        name = f"trusses {number}" if number else "the densities' parts"
+        descent = None
+        try:
+            if number:
+                plates = {k: one for k, one in owned.items() if isinstance(one, PlanePart)}
+                trusses = trusses_of(plates, number - 1)
+                outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
+            if starts:
+                tell(f"from {name}")
+            descent = Descent(Problem(scene, parts, {}), outlines, iterations, tell)
+            found.append(descent.found(name))
+        except (ConvergenceError, InputError) as error:  # the parts as they were remain
+            tell(f"from {name}: {error}")
+        except KeyboardInterrupt:
+            interrupted = True
+            if descent is not None:
+                tell("interrupted: the best so far is judged and kept; once more gives it up")
+                found.append(descent.so_far(name))
             break
-        loop = {one.name: one for one in state.limits}
-        missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
-        tell("tightened by what the finer mesh shows: " + ", ".join(missing))
-        problem = replace(problem, tightened={**problem.tightened, **missing})
-        state = problem.evaluated(state.outlines, {}, search.solutions)
-    made, after, limits = found
-    return Optimized(made, mesh_parts(made), done, before, after, limits, ending)
+    best = min([given, *found], key=lambda one: _rank(scene, one.value, one.limits))
+    others = tuple(one for one in found if one is not best)
+    return Optimized(best, others, mesh_parts(best.parts), value, interrupted)
+
+
+def _free(scene: Scene, k: int, part: Part) -> FreeForm:
+    """Return what moves of a part; it is no thinner where other arms repeat it smaller."""
+    repeating = [scene.arms[j] for j, pattern in scene.patterns.items() if pattern == k]
+    one = scene.arms[k]
+    sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
+    if isinstance(part, PlanePart):
+        return free_outline(part, scene.design.minimum_gap, min([1.0, *sizes]))
+    assert isinstance(part, SolidPart)
+    return free_form(part, SIDES)
 
 
 def _rank(scene: Scene, value: float, limits: tuple[Limit, ...]) -> tuple[float, float]:
@@ -148,20 +218,157 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[float, tuple[Limit, ...]]:
-    """Return objective and limits of parts on refined meshes, stress that of the outline."""
+Judgement = tuple[float, tuple[Limit, ...], dict[int, list[np.ndarray]]]
+
+
+def _judged(scene: Scene, parts: dict[int, Part]) -> Judgement:
+    """Return objective, limits and the places of largest stress of parts on refined meshes."""
     meshes = mesh_parts(parts)
     coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
-    state, column, *_ = refined(scene, parts, meshes.fine, coarse)
-    return state.evaluation.objective, column.limits
+    state, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
+    hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
+    for place, one in stress.items():
+        owner = scene.owners[place]
+        if scene.constraints.stress is not None and owner is not None and len(one.hot):
+            hot[owner] += HALVED * [one.hot]
+    return state.evaluation.objective, column.limits, hot
 
 
-def _free(part: Part) -> FreeForm:
-    """Return what moves of a part."""
-    if isinstance(part, PlanePart):
-        return free_outline(part)
-    assert isinstance(part, SolidPart)
-    return free_form(part, SIDES)
+# -- from one start ----------------------------------------------------------------------------
+
+
+class Descent:
+    """Searches from one start: steps, struts left out, limits tightened by a finer mesh.
+
+    Attributes:
+        problem: with limits as tight as the finer mesh asks for.
+        state: the best of the searches that have ended.
+        search: that goes on.
+        done: steps taken in those that have ended.
+        best: of what finer meshes have judged.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        outlines: Mapping[int, FreeForm],
+        iterations: int,
+        tell: Tell,
+    ):
+        """Begin at outlines."""
+        self.problem, self.iterations, self.tell = problem, iterations, tell
+        self.state, self.done = problem.evaluated(outlines, {}), 0
+        self.search, self.best = Search(problem, self.state), cast(Found | None, None)
+
+    def found(self, start: str) -> Found:
+        """Search to the end, and return the best of what finer meshes have judged."""
+        for _ in range(ROUNDS):
+            ending = self._searched()
+            found, limits = self._judged(start, ending)
+            kept = all(one.met for one in limits)
+            if self.done >= self.iterations or (kept and not ending.endswith(ENDED)):
+                break
+            self._tighten(limits)
+        return replace(found, ending=ending)
+
+    def so_far(self, start: str) -> Found:
+        """Return the best so far of a search that was interrupted."""
+        self.state = min(self.state, self.search.best, key=lambda one: one.rank)
+        self.done += self.search.steps
+        return replace(self._judged(start, "")[0], ending="interrupted")
+
+    def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
+        """Return the best of what is judged, the state now among it, and the state's limits."""
+        scene, made = self.problem.scene, self.problem.parts_of(self.state.outlines)
+        try:
+            value, limits, hot = _judged(scene, made)
+        except (ConvergenceError, InputError):
+            if self.best is None:
+                raise
+            return replace(self.best, iterations=self.done), self.best.limits
+        self.problem = replace(self.problem, hot=hot)
+        found = Found(start, made, self.done, value, limits, ending)
+        if self.best is not None:
+            known = self.best
+            worse = _rank(scene, value, limits) >= _rank(scene, known.value, known.limits)
+            found = replace(known, iterations=self.done) if worse else found
+        self.best = found
+        return found, limits
+
+    def _tighten(self, limits: tuple[Limit, ...]) -> None:
+        """Go on with meshes that are finer where stress is largest, and with tighter limits."""
+        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+        loop = {one.name: one for one in self.state.limits}
+        missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
+        if not missing:
+            return
+        self.tell("tightened by what the finer mesh shows: " + ", ".join(missing))
+        self.problem = replace(self.problem, tightened={**self.problem.tightened, **missing})
+        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+
+    def _searched(self) -> str:
+        """Go from the state to the best one that steps lead to; return why it ended."""
+        self.search = Search(self.problem, self.state)
+        # Limits that a finer mesh has tightened are a few per cent, and no matter of layout.
+        first = self.best is None
+        most = ceil(FIRST * self.iterations) if first else self.iterations
+        for number in range(1 + PRUNINGS):
+            search = self.search
+            ending = search.run(most - self.done, self.tell, self.done)
+            self.done, search.steps = self.done + search.steps, 0
+            if number and not search.best.rank < self.state.rank:
+                self.tell("no better without these struts: they stay")
+                break
+            self.state = search.best
+            if not first or self.done >= most or number == PRUNINGS:
+                break
+            thinner = self._without_struts()
+            if thinner is None:
+                break
+            self.search = Search(self.problem, thinner)
+        return ending
+
+    def _without_struts(self) -> State | None:
+        """Return the state without struts that weigh more than they bring; None: all do.
+
+        What they bring is told by the Lagrangian: of each by itself, then of those that promise
+        most together, as long as every further one gains.
+        """
+        state, price = self.state, self.problem.prices(self.state)
+        gain = GAIN * abs(state.values[0])
+        promised: list[tuple[float, int, int, Strut]] = []
+        plates = {k: o for k, o in state.outlines.items() if isinstance(o, FreeOutline)}
+        for k, outline in plates.items():
+            for strut in struts_of(outline)[:TRIALS]:
+                tried = self._tried({**state.outlines, k: without(outline, [strut])})
+                if tried is not None:
+                    change = (tried.against(state.held) - state.values) @ price
+                    promised.append((change, k, len(promised), strut))
+        found, least = None, 0.0
+        gone: dict[int, list[Strut]] = {k: [] for k in state.outlines}
+        for change, k, _, strut in sorted(promised, key=lambda one: one[:3]):
+            if change > -gain or not all(strut.beside.isdisjoint(o.beside) for o in gone[k]):
+                continue
+            more = {**gone, k: [*gone[k], strut]}
+            outlines = {j: without(one, more[j]) for j, one in plates.items()}
+            tried = self._tried(outlines)
+            if tried is None:
+                continue
+            change = (tried.against(state.held) - state.values) @ price
+            if change < least - gain:
+                found, least, gone = tried, change, more
+        count = sum(map(len, gone.values()))
+        if found is not None:
+            self.tell(f"tried without {count} strut{'s' if count > 1 else ''}")
+        return found
+
+    def _tried(self, outlines: Mapping[int, FreeForm]) -> State | None:
+        if not all(one.is_valid for one in outlines.values()):
+            return None
+        try:
+            return self.problem.evaluated(outlines, {}, self.state.solutions)
+        except (ConvergenceError, InputError):
+            return None
 
 
 class FreeForm(Protocol):
@@ -205,10 +412,16 @@ class FreeForm(Protocol):
     def moved(self, s: np.ndarray) -> FreeForm:
         """Return the form moved outwards by s (count,)."""
 
+    def rounded(self) -> FreeForm:
+        """Return the form with concave corners that the tool reaches."""
+
+    def scaled(self, part: Any, factors: np.ndarray) -> FreeForm:
+        """Return the form of an arm that repeats this one's design; factors of its sizes."""
+
     def room(self) -> tuple[np.ndarray, np.ndarray]:
         """Return how far (count,) it may move inwards and outwards in a step, m."""
 
-    def meshed(self, coarser: float) -> tuple[FreeForm, PartMesh]:
+    def meshed(self, coarser: float, finer: Sequence[np.ndarray]) -> tuple[FreeForm, PartMesh]:
         """Return a new mesh of it, and it: variables may be others then."""
 
     def followed(self, mesh: Any) -> PartMesh | None:
@@ -256,6 +469,17 @@ class State:
         objective = sign * self.simulated.evaluation.objective
         return np.concatenate([[objective], self.smooth / held - 1.0, self.shares])
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """What orders states, best first: feasible ones by their objective, else by excess."""
+        excess = self.values[1:].max(initial=0.0)
+        return (excess if excess > EXCESS else 0.0), self.values[0]
+
+    @property
+    def solutions(self) -> Any:
+        """Its motion, from which that of a state nearby is found."""
+        return self.simulated.trajectory.solutions
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -263,11 +487,32 @@ class Problem:
 
     Attributes:
         scene: of the run.
+        parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
+        hot: places of every part (n, 2), m, near which its mesh is finer, once for every array.
     """
 
     scene: Scene
+    parts: Mapping[int, Part]
     tightened: Mapping[str, float]
+    hot: Mapping[int, list[np.ndarray]] = field(default_factory=dict)
+
+    def every(self, outlines: Mapping[int, FreeForm]) -> dict[int, FreeForm]:
+        """Return the outlines with those of arms that repeat them."""
+        found = dict(outlines)
+        for k, pattern in self.scene.patterns.items():
+            found[k] = outlines[pattern].scaled(self.parts[k], self._factors(k))
+        return {k: found[k] for k in sorted(found)}
+
+    def parts_of(self, outlines: Mapping[int, FreeForm]) -> dict[int, Part]:
+        """Return the parts of all arms with these outlines."""
+        return {k: one.made for k, one in self.every(outlines).items()}
+
+    def _factors(self, k: int) -> np.ndarray:
+        """Return the sizes of an arm over those of the one whose design it repeats."""
+        one, other = self.scene.arms[k], self.scene.arms[self.scene.patterns.get(k, k)]
+        sizes = [one.length / other.length, one.height / other.height]
+        return np.array([*sizes, one.thickness / other.thickness][: self.scene.dimension])
 
     def evaluated(
         self, outlines: Mapping[int, FreeForm], bodies: Mapping[int, PartMesh], *start: Any
@@ -278,30 +523,32 @@ class Problem:
             InputError: an outline cannot be meshed.
             ConvergenceError: the machine cannot be simulated.
         """
+        every = self.every(outlines)
         if not bodies:
-            anew = {k: one.meshed(SIDES) for k, one in outlines.items()}
-            outlines = {k: one for k, (one, _) in anew.items()}
+            anew = {k: one.meshed(SIDES, self.hot.get(k, ())) for k, one in every.items()}
+            every = {k: one for k, (one, _) in anew.items()}
+            outlines = {k: every[k] for k in outlines}
             bodies = {k: mesh for k, (_, mesh) in anew.items()}
-        parts = {k: one.current for k, one in outlines.items()}
+        parts = {k: one.current for k, one in every.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
         simulated = simulate_parts(self.scene, parts, bodies, *start, **changes)
         found, rows = simulated.evaluation, []
-        every = limits_of(simulated.scene, found)
-        for one, value, limit in zip(every, found.constraints, found.smooth_limits, strict=True):
+        limits = limits_of(simulated.scene, found)
+        for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
         if self.scene.constraints.stress is not None:
-            stress, analysis = self._outline_stress(simulated, outlines)
+            stress, analysis = self._outline_stress(simulated, every)
             measured, limit = stress.measure(analysis), self.scene.constraints.stress
             true, smooth = measured.values[0], measured.smooth[0]
             one = Limit(STRESS, "", true, limit, "Pa")
             rows.append((one, smooth, limit * smooth / true / self._factor(one)))
-        limits, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
+        known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
         shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
         numbers = (np.array(one, dtype=float) for one in (smooths, held, shares))
-        return State(outlines, bodies, simulated, tuple(limits), *numbers)
+        return State(outlines, bodies, simulated, tuple(known), *numbers)
 
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0 + RESERVE)
@@ -346,7 +593,7 @@ class Problem:
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
         if self.scene.constraints.stress is not None:
-            stress, analysis = self._outline_stress(one, state.outlines)
+            stress, analysis = self._outline_stress(one, self.every(state.outlines))
             (row,) = stress.gradients(analysis)
             rows.append({k: g / state.held[len(rows) - 1] for k, g in row.items()})
         parts = [self._by_x(state, rows)]
@@ -366,18 +613,28 @@ class Problem:
 
     def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:
         """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""
-        found = []
-        for k, outline in state.outlines.items():
-            body = state.bodies[k]
+        found = {k: np.zeros((len(rows), one.count)) for k, one in state.outlines.items()}
+        for k, body in state.bodies.items():
+            owner, factors = self.scene.patterns.get(k, k), self._factors(k)
             mesh = state.simulated.arms[k].mesh
-            places = mesh.mesh.geometry.x[:, : mesh.dim]
-            order = cKDTree(places).query(body.points)[1]
-            by_s = [
-                outline.by_s(body, row[k][order]) if k in row else np.zeros(outline.count)
-                for row in rows
-            ]
-            found.append(outline.by_x(np.array(by_s)))
-        return np.hstack(found)
+            order = cKDTree(mesh.mesh.geometry.x[:, : mesh.dim]).query(body.points)[1]
+            for number, row in enumerate(rows):
+                if k in row:
+                    by_nodes = row[k][order] * factors
+                    found[owner][number] += state.outlines[owner].by_s(body, by_nodes)
+        return np.hstack([state.outlines[k].by_x(by_s) for k, by_s in found.items()])
+
+    def prices(self, state: State) -> np.ndarray:
+        """Return 1 and the multipliers of the limits (1 + m,), by least squares."""
+        slopes, values = self.slopes(state), state.values
+        room = np.concatenate([np.minimum(*one.room()) for one in state.outlines.values()])
+        free, active = room > 0.0, values[1:] > -ACTIVE
+        found = np.zeros(len(values))
+        found[0] = 1.0
+        if active.any():
+            A = slopes[1:][active][:, free].T
+            found[1:][active] = nnls(A, -slopes[0][free])[0]
+        return found
 
 
 # -- the steps ---------------------------------------------------------------------------------
@@ -388,12 +645,13 @@ class Search:
 
     Attributes:
         best: the best state so far: of the feasible ones that with the least objective.
+        meshed: the last one whose mesh was made anew.
         steps: taken.
     """
 
     def __init__(self, problem: Problem, state: State):
         """Begin at a state."""
-        self.problem, self.state, self.best = problem, state, state
+        self.problem, self.state, self.best, self.meshed = problem, state, state, state
         self.steps, self.radius, self.morphed = 0, 1.0, 0
         self.x = np.zeros(0)
         self.mma: MMAState = initial_state(self.x)
@@ -418,14 +676,10 @@ class Search:
             tell(self._line(first + self.steps))
             if self._settled():
                 return "settled"
-        return f"{first + iterations} iterations"
+        return f"{first + iterations}{ENDED}"
 
     def _keep(self) -> None:
-        def rank(state: State) -> tuple[float, float]:
-            excess = state.values[1:].max(initial=0.0)
-            return (excess if excess > EXCESS else 0.0), state.values[0]
-
-        if rank(self.state) < rank(self.best):
+        if self.state.rank < self.best.rank:
             self.best = self.state
         self.falls.append(self.best.values[0])
 
@@ -439,8 +693,8 @@ class Search:
         one = self.state
         worst = one.values[1:].max(initial=0.0)
         words = "limits met" if worst <= EXCESS else f"{100.0 * worst:.2g} % over a limit"
-        scene = self.problem.scene
-        mass = sum(scene.material_of(k).density * o.current.volume for k, o in one.outlines.items())
+        bodies = one.simulated.trajectory.mechanism.bodies
+        mass = sum(bodies[k].mass for k in self.problem.parts)
         return (
             f"{number} objective {one.simulated.evaluation.objective:.5g}, mass {mass:.4g} kg, "
             f"{words}, trust region {self.radius:.2g}"
@@ -449,8 +703,12 @@ class Search:
     def _step(self, slopes: np.ndarray) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         if self._is_worn():
-            self.state = self.problem.evaluated(self.state.outlines, {}, self.solutions)
-            self.morphed = 0
+            try:
+                self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
+            except (ConvergenceError, InputError):  # curves that all but touch
+                self.best = self.meshed
+                return False
+            self.meshed, self.morphed = self.state, 0
             self._begin()
             slopes = self.problem.slopes(self.state)
         before = self.state
@@ -505,21 +763,17 @@ class Search:
         for k, one in self.state.outlines.items():
             s = one.filtered(x[first : first + one.count] - self.x[first : first + one.count])
             first += one.count
-            outlines[k] = one.moved(np.clip(s, -room[k][0], room[k][1]))
+            outlines[k] = one.moved(np.clip(s, -room[k][0], room[k][1])).rounded()
             if not outlines[k].is_valid:
                 return None
         try:
-            after = {k: one.followed(self.state.bodies[k]) for k, one in outlines.items()}
+            every = self.problem.every(outlines)
+            after = {k: one.followed(self.state.bodies[k]) for k, one in every.items()}
             bodies = {k: body for k, body in after.items() if body is not None}
             anew = len(bodies) < len(after)
-            return self.problem.evaluated(outlines, {} if anew else bodies, self.solutions)
+            return self.problem.evaluated(outlines, {} if anew else bodies, self.state.solutions)
         except (ConvergenceError, InputError):
             return None
-
-    @property
-    def solutions(self) -> Any:
-        """The motion of the last state, from which the next one's is found."""
-        return self.state.simulated.trajectory.solutions
 
     def _is_worn(self) -> bool:
         """Whether meshes have followed too many steps."""

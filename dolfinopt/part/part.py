@@ -33,11 +33,13 @@ class Curves:
         tool_radius: of concave corners, m; None: a fifth of a cell.
         tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
         arcs: lines and arcs in place of splines.
+        simplify: straight lines and fillets within the tolerance.
     """
 
     tool_radius: float | None = None
     tolerance: float | None = None
     arcs: bool = False
+    simplify: bool = False
 
     @property
     def is_default(self) -> bool:
@@ -55,6 +57,19 @@ class Curves:
 
 
 DEFAULTS = Curves()
+
+
+class PartsError(InputError):
+    """Some arms have no part; `parts` are those of the others, by their place in the chain."""
+
+    parts: Mapping[int, Part]
+
+    def __init__(self, message: str, parts: Mapping[int, Part]) -> None:
+        super().__init__(message)
+        self.parts = parts
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str]]:
+        return InputError, (str(self),)  # on other ranks, which have none
 
 
 class PartMesh(Protocol):
@@ -169,8 +184,10 @@ def make_parts(
         Parts by their place in the chain, on the root; none elsewhere.
 
     Raises:
-        InputError: no design in the folder, one that does not fit the scene's arms, or no part can
-            be made of it with these values; on all ranks.
+        InputError: no design in the folder, or one that does not fit the scene's arms; on all
+            ranks.
+        PartsError: no part can be made of some arm with these values; on the root, elsewhere its
+            InputError.
     """
     from mpi4py import MPI
 
@@ -190,11 +207,30 @@ def make_parts(
         }
     designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
     with together(world):
-        mine = {k: _made(scene, k, mesh, designs[k], curves) for k, mesh in meshes.items()}
-    found: dict[int, Part] = {}
+        mine = {k: _tried(scene, k, mesh, designs[k], curves) for k, mesh in meshes.items()}
+    found: dict[int, Part | InputError] = {}
     for pieces in world.gather(mine, root=0) or ():
         found.update(pieces)
-    return {k: found[k] for k in sorted(found)}
+    parts = {k: one for k in sorted(found) if not isinstance(one := found[k], InputError)}
+    with together(world):
+        if len(parts) < len(found):
+            failed = [str(one) for one in found.values() if isinstance(one, InputError)]
+            raise PartsError("; ".join(failed), parts)
+    return parts
+
+
+def _tried(
+    scene: Scene,
+    index: int,
+    mesh: ArmMesh,
+    design: tuple[np.ndarray, np.ndarray | None],
+    curves: Curves,
+) -> Part | InputError:
+    """Return the part of an arm, or why there is none."""
+    try:
+        return _made(scene, index, mesh, design, curves)
+    except InputError as error:
+        return error
 
 
 def _check(folder: Path, curves: Curves) -> None:

@@ -25,6 +25,7 @@ from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer
 from dolfinopt.scene.tables.machine import Closure, Control, Damping, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
+from dolfinopt.scene.tables.part import Part
 from dolfinopt.scene.tables.simulation import Reduction, Simulation
 
 
@@ -72,6 +73,7 @@ class Scene(Table):
     constraints: Constraints = Field(default=Constraints(), description="limits besides the volume")
     design: Design = Field(default=Design(), description="design variables")
     optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
+    part: Part = Field(default=Part(), description="parts for the workshop")
     scenarios: tuple[Scenario, ...] = Field(
         default=(), description="scenarios that the objective combines; none: the scene itself"
     )

@@ -39,7 +39,7 @@ def form(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("dolfinopt.part.solid.mesh.ACROSS", 1.0)  # large cells take little time
         (part,) = make_parts(scene, folder).values()
-        problem = Problem(scene, {})
+        problem = Problem(scene, {1: part}, {})
         yield folder, scene, part, problem, problem.evaluated({1: free_form(part, 1.0)}, {})
 
 

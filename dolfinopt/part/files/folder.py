@@ -62,6 +62,7 @@ def figures_of(
         name: parts[k].figures(scene.material_of(k).density)
         | ({} if meshes is None else {"mesh": meshes[k].figures()})
         for name, k in _owners(scene).items()
+        if k in parts
     }
     known = {key for row in arms.values() for key in row}
     units = {key: unit for key, unit in UNITS.items() if key in known}
@@ -89,7 +90,7 @@ def write_parts(
     Args:
         folder: exists.
         scene: of the arms.
-        parts: by their place in the chain.
+        parts: by their place in the chain; files of arms without one are not there.
         meshes: that the scene of the parts has, likewise; None: there is no part.toml.
         check, optimized: what the parts do, and what optimising their shape brought, if it is
             known.
@@ -103,6 +104,8 @@ def write_parts(
     with tempfile.TemporaryDirectory(prefix="dolfinopt-part-") as name:
         made = Path(name)
         for arm, k in _owners(scene).items():
+            if k not in parts:
+                continue
             for ending, data in parts[k].files(arm, f"{arm} of {scene.name}"):
                 raw = data.encode() if isinstance(data, str) else data
                 write_bytes(made / f"{arm}{ending}", raw)

@@ -37,6 +37,7 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
         meshes: folder of the meshes, NAME.msh.
     """
     data = scene.to_tree()
+    del data["part"]
     data["name"] = f"{scene.name}: part"
     for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
         if owner is not None:

@@ -13,6 +13,7 @@ DEGREE = 3
 _GAUSS = 0.5 + 0.5 * np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
 _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 MIRROR = np.array([1.0, -1.0])
+KINK = np.radians(1.0)  # turn of the outline at a joint from which on it is a corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,8 +330,16 @@ class Shape:
 
     @cached_property
     def concave_radius(self) -> float:
-        """Smallest radius of concave places on free curves, m; infinity without any."""
+        """Smallest radius of concave places on free curves, m; infinity without any.
+
+        0 where they make a concave corner, with each other or with the arm's own.
+        """
         least = np.inf
+        for loop in self.loops:
+            for before, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+                a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
+                if (before.free or after.free) and _cross(a, b) < -np.sin(KINK):
+                    return 0.0
         for piece in self.pieces:
             if piece.free:
                 t = np.linspace(0.0, 1.0, 33 if isinstance(piece.curve, Arc) else 2001)[1:-1]

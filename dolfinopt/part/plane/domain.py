@@ -8,11 +8,12 @@ on one line or circle within rounding become that line or arc again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
+from scipy.spatial import cKDTree
 
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -22,7 +23,9 @@ from dolfinopt.scene.load import Scene
 if TYPE_CHECKING:
     from shapely import Geometry
 
-    from dolfinopt.mesh.arm_mesh import ArmMesh
+    from dolfinopt.scene.tables.arms import Arm
+    from dolfinopt.scene.tables.design import Region as Box
+    from dolfinopt.scene.tables.design import RegionKind
 
 
 SAME = 2e-8  # distance from a line or circle, of the extent: Gmsh's points, files of eight digits
@@ -219,14 +222,21 @@ INBOARD, OUTBOARD = "inboard", "outboard"
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of the plane by the closed loops of curves around it."""
+    """A part of the plane by the closed loops of curves around it.
+
+    Attributes:
+        loops: one within another one is a hole.
+        others: regions that belong to it, too, wherever they are.
+    """
 
     loops: Sequence[Sequence[Edge]]
+    others: Sequence[Region] = ()
 
     @property
     def edges(self) -> list[Edge]:
         """All curves."""
-        return [edge for loop in self.loops for edge in loop]
+        own = [edge for loop in self.loops for edge in loop]
+        return [*own, *(edge for one in self.others for edge in one.edges)]
 
     def area_inside(self, tolerance: float) -> Geometry:
         """Return the region as polygons whose sides stay within a distance of the curves, m."""
@@ -238,7 +248,7 @@ class Region:
         whole = shapely.Polygon()
         for line in sorted(lines, key=lambda one: -shapely.Polygon(one).area):
             whole = whole.symmetric_difference(shapely.Polygon(line))
-        return whole
+        return shapely.union_all([whole, *(one.area_inside(tolerance) for one in self.others)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,6 +328,58 @@ def _boundary(
     return found
 
 
+def _kept(
+    mesh: ArmMesh, cells: Cells, chosen: np.ndarray, arm: Arm, kind: RegionKind, outline: Region
+) -> Region:
+    """Return what stays solid or void: shapes that the scene states, and chosen cells (n,)."""
+    stated, shapes = _stated(arm, kind, outline, mesh.centroid)
+    return replace(region_of(mesh, cells, chosen & ~stated), others=shapes)
+
+
+def _stated(
+    arm: Arm, kind: RegionKind, outline: Region, centroid: np.ndarray
+) -> tuple[np.ndarray, list[Region]]:
+    """Return which cells (n,) the scene's lengths and regions keep, and their exact shapes."""
+    found, shapes = np.zeros(len(centroid), dtype=bool), []
+    for one in arm.regions:
+        if one.kind == kind and one.depth is None:
+            for mirror in (1.0, -1.0) if arm.symmetric else (1.0,):
+                found |= one.covers(centroid[:, 0], mirror * centroid[:, 1])
+                shapes.append(Region([_shape(one, mirror)]))
+    if kind == "solid" and arm.cells is None and arm.solid_ends > 0.0:
+        for edge in outline.edges:
+            ring = edge.curve
+            if edge.label and isinstance(ring, Arc) and ring.is_circle:
+                radius = ring.radius + arm.solid_ends
+                found |= np.linalg.norm(centroid - ring.centre, axis=1) < radius
+                circle = Arc(ring.centre, radius, 0.0, 2.0 * np.pi)
+                shapes.append(Region([[Edge(circle, "")]]))
+    return found, shapes
+
+
+def _shape(region: Box, mirror: float) -> list[Edge]:
+    """Return the curves around a region of the scene or its mirror image."""
+    if region.circle is not None:
+        x, y, radius = region.circle
+        return [Edge(Arc(np.array([x, mirror * y]), radius, 0.0, 2.0 * np.pi), "")]
+    x0, y0, x1, y1 = region.bounds
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) * [1.0, mirror]
+    return [Edge(Line(corners[k - 1], corners[k]), "") for k in range(4)]
+
+
+def _without_kept(mesh: ArmMesh, kept: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Return a field with that of the nearest other cell where cells are kept.
+
+    Shapes that are exact take their place; the steps of their cells must not show beside them.
+    """
+    if not kept.any() or kept.all():
+        return field
+    nearest = cKDTree(mesh.centroid[~kept]).query(mesh.centroid[kept])[1]
+    found = field.copy()
+    found[kept] = field[~kept][nearest]
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Domain:
     """One arm before its outline is drawn.
@@ -330,6 +392,7 @@ class Domain:
         x_phys: (n_cells,) physical densities.
         field: (n_cells,) what is smooth from cell to cell and falls where x_phys does: the
             filtered densities before they are projected, or x_phys itself.
+        beside: (n_cells,) `field`, in cells that stay solid or void that of the nearest other one.
         crisp: whether `field` is a projected design, which leaps from cell to cell.
         links: (n, 2, 2) m, lines between the centroids of solid cells of a projected design that
             share a corner at least, where one of them is in a member no wider than a cell.
@@ -350,6 +413,7 @@ class Domain:
     area: np.ndarray
     x_phys: np.ndarray
     field: np.ndarray
+    beside: np.ndarray
     crisp: bool
     links: np.ndarray
     contacts: int
@@ -416,6 +480,11 @@ def domain_of(
     entry, like = scene.arms[index], scene.arms[scene.patterns.get(index, index)]
     cells = cells_of(mesh)
     rim, rim_cells = cells.rim()
+    outline = region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool))
+    solid, void = region_of(mesh, cells, mesh.passive), region_of(mesh, cells, mesh.void)
+    if index not in scene.patterns:  # there regions are scaled, and those of another arm
+        solid = _kept(mesh, cells, mesh.passive, entry, "solid", outline)
+        void = _kept(mesh, cells, mesh.void, entry, "void", outline)
     return Domain(
         name=entry.name,
         corners=cells.corners,
@@ -423,14 +492,15 @@ def domain_of(
         area=mesh.area,
         x_phys=x_phys,
         field=x_phys if field is None else field,
+        beside=_without_kept(mesh, mesh.fixed, x_phys if field is None else field),
         crisp=field is None and bool(scene.design.projection),
         links=_links(cells.nodes, mesh.centroid, x_phys, bool(scene.design.projection)),
         contacts=_contacts(cells.nodes, x_phys > 0.5),
         rim=rim,
         rim_cells=rim_cells,
-        outline=region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool)),
-        solid=region_of(mesh, cells, mesh.passive),
-        void=region_of(mesh, cells, mesh.void),
+        outline=outline,
+        solid=solid,
+        void=void,
         grid=None if entry.cells is None else entry.cells[:2],
         length=entry.length,
         thickness=entry.thickness,

@@ -16,16 +16,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.plane.curves import DEGREE, MIRROR, Line, Piece, Shape, Spline
+from dolfinopt.part.plane.curves import DEGREE, KINK, MIRROR, Line, Piece, Shape, Spline, direction
 from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
-from dolfinopt.part.plane.outline import thinnest_member
 from dolfinopt.part.plane.part import PlanePart
 
 if TYPE_CHECKING:
@@ -45,6 +44,7 @@ ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 WIDENED, WIDENINGS = 0.06, 12  # cells by which thin members grow at a time, and how often
+ROUNDER, ROUNDED, ROUNDINGS = 1.03, 1e-3, 60  # radius asked for; move that ends it, over the tool's
 BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
 
@@ -111,6 +111,32 @@ class Run:
         along = along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None]
         return at, np.stack([along[:, 1], -along[:, 0]], axis=1)
 
+    def sharper(self, radius: float) -> np.ndarray:
+        """Return how far (n,) control points would move outwards, m, to round concave corners.
+
+        By h^2 / 2 (1 / r - 1 / radius) where the radius r is smaller: half of it is what makes it
+        right there, h being their spacing. 0 where control points stay.
+        """
+        n = len(self.points)
+        if self.closed:
+            t = ((np.arange(n) - 1) % n) / n
+            d, dd = (_periodic(n, t, order) @ self.points for order in (1, 2))
+            ends = np.roll(self.points, 1, axis=0), np.roll(self.points, -1, axis=0)
+        else:
+            knots = _curves_of(n, False)[0][0]
+            curve = Spline(knots, self.points)
+            t = np.clip([knots[k + 1 : k + 4].mean() for k in range(n)], 0.0, 1.0)
+            d, dd = curve.derivative(t), curve.derivative(t, 2)
+            padded = np.vstack([self.points[:1], self.points, self.points[-1:]])
+            ends = padded[:-2], padded[2:]
+        speed = np.maximum(np.linalg.norm(d, axis=1), 1e-300)
+        bend = -(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3
+        spacing = sum(0.5 * np.linalg.norm(self.points - end, axis=1) for end in ends)
+        s = 0.25 * spacing**2 * np.maximum(bend - 1.0 / radius, 0.0)
+        if not self.closed:
+            s[[0, 1, -2, -1]] = 0.0
+        return np.asarray(s)
+
     def filter(self, reach: float) -> np.ndarray:
         """Return F (n, n) with s = F x; rows of control points that stay are zero."""
         n = len(self.points)
@@ -142,6 +168,7 @@ class FreeOutline:
         arm, stays: where material may be, and where it must be (shapely).
         least: smallest widths of members and gaps, m.
         partner: (count,) control point that moves the mirror image; None without symmetry.
+        scale: least factor by which arms that repeat this one's design are smaller than it.
     """
 
     part: PlanePart
@@ -151,6 +178,7 @@ class FreeOutline:
     stays: Geometry
     least: tuple[float, float]
     partner: np.ndarray | None
+    scale: float = 1.0
 
     STEPS: ClassVar[int] = 4  # that one mesh follows
 
@@ -184,7 +212,7 @@ class FreeOutline:
         old, *gaps = part.shape.polygons(chord)
         apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
         shape = replace(self.shape, apart=float(apart))
-        return replace(part, shape=shape, outline=drawn, thinnest=thinnest_member(drawn))
+        return replace(part, shape=shape, outline=drawn)
 
     def is_worn(self, mesh: BodyMesh) -> bool:
         """Whether a mesh is to be made anew: a triangle is nearly flat."""
@@ -195,9 +223,11 @@ class FreeOutline:
         """Area, m2."""
         return self.shape.area
 
-    def meshed(self, coarser: float) -> tuple[FreeOutline, BodyMesh]:
+    def meshed(
+        self, coarser: float, finer: Sequence[np.ndarray] = ()
+    ) -> tuple[FreeOutline, BodyMesh]:
         """Return the outline with a new mesh; variables stay."""
-        return self, self.current.mesh(coarser)
+        return self, self.current.mesh(coarser, finer)
 
     def followed(self, mesh: BodyMesh) -> BodyMesh | None:
         """Return a mesh of an outline nearby, moved to this one; None where it folds."""
@@ -324,26 +354,45 @@ class FreeOutline:
             np.minimum(ROOM_SHARE * np.maximum(wide - least, 0.0), WIDTH_SHARE * wide)
             for wide, least in zip(self.widths(), self.least, strict=True)
         )
-        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
-        outwards = np.minimum(outwards, self._outside(points))
+        outwards = np.minimum(outwards, self._outside)
         if not self.stays.is_empty:
-            inwards = np.minimum(inwards, EDGE_SHARE * shapely.distance(points, self.stays))
+            apart = self._least_along(lambda at: shapely.distance(at, self.stays))
+            inwards = np.minimum(inwards, EDGE_SHARE * apart)
         return self._least_beside(inwards), self._least_beside(outwards)
 
-    def _outside(self, points: Any) -> np.ndarray:
-        """Return how far (n,) material may grow at places of the outline, m."""
+    @property
+    def _outside(self) -> np.ndarray:
+        """How far (count,) material may grow beside control points, m."""
         import shapely
 
-        edge = EDGE_SHARE * shapely.distance(points, self.arm.boundary)
-        return np.where(shapely.covers(self.arm, points), edge, 0.0)
+        def room(at: np.ndarray) -> np.ndarray:
+            edge = EDGE_SHARE * shapely.distance(at, self.arm.boundary)
+            return np.where(shapely.covers(self.arm, at), edge, 0.0)
+
+        return self._least_along(room)
+
+    def _least_along(self, value: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return the least value (count,) of shapely's points of the curves beside each control
+        point: where a hole ends between two of them it may come closer than both."""
+        import shapely
+
+        at = np.vstack([run.frame[0] for run in self.runs])
+        between = np.vstack(
+            [
+                piece.curve.at(np.linspace(0.0, 1.0, 4 * len(run.points))[1:-1])
+                for run in self.runs
+                for piece in run.pieces
+            ]
+        )
+        found = np.array(value(shapely.points(at)))
+        np.minimum.at(found, cKDTree(at).query(between)[1], value(shapely.points(between)))
+        return found
 
     def widened(self) -> FreeOutline:
         """Return the outline with members that are thinner than `least` a little wider."""
-        import shapely
 
-        points = shapely.points(np.vstack([run.frame[0] for run in self.runs]))
         missing = 0.5 * np.maximum(self.least[0] - self.widths()[0], 0.0)
-        s = np.minimum(missing, np.minimum(WIDENED * self.part.domain.cell, self._outside(points)))
+        s = np.minimum(missing, np.minimum(WIDENED * self.part.domain.cell, self._outside))
         for run, block in zip(self.runs, self.blocks, strict=True):
             if run.closed:
                 own = s[block]
@@ -351,6 +400,40 @@ class FreeOutline:
             else:
                 s[block][[0, 1, -2, -1]] = 0.0
         return self.moved(self._symmetric(s))
+
+    def rounded(self) -> FreeOutline:
+        """Return the outline with concave corners as wide as the tool, by more material there."""
+        made, tool = self, ROUNDER * self.part.outline.tool_radius / self.scale
+        for _ in range(ROUNDINGS if tool > 0.0 and self.runs else 0):
+            s = np.concatenate([run.sharper(tool) for run in made.runs])
+            if s.max() < ROUNDED * tool:
+                break
+            made = made.moved(self._symmetric(s))
+        return made
+
+    def scaled(self, part: PlanePart, factors: np.ndarray) -> FreeOutline:
+        """Return the outline of a part that repeats this one's design, stretched by (2,) factors.
+
+        Raises:
+            InputError: circles would become ellipses.
+        """
+
+        def stretched(piece: Piece) -> Piece:
+            if isinstance(piece.curve, Line):
+                return replace(
+                    piece, curve=Line(piece.curve.start * factors, piece.curve.end * factors)
+                )
+            raise InputError(
+                f"--optimize: arm {part.domain.name!r} repeats a design with circles "
+                "(arms.pattern), which it would stretch; leave --optimize out"
+            )
+
+        loops = tuple(
+            tuple(one if isinstance(one, int) else stretched(one) for one in loop)
+            for loop in self.loops
+        )
+        runs = tuple(replace(run, points=run.points * factors) for run in self.runs)
+        return replace(self, part=part, loops=loops, runs=runs)
 
     def _least_beside(self, room: np.ndarray) -> np.ndarray:
         """Return the least of every control point and those beside it."""
@@ -388,15 +471,21 @@ def _samples(piece: Piece, spacing: float) -> np.ndarray:
     return np.linspace(0.0, 1.0, 4 * count)
 
 
-def free_outline(part: PlanePart) -> FreeOutline:
+def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) -> FreeOutline:
     """Return the outline of a part with free runs of evenly spaced control points.
+
+    Args:
+        part: whose free curves are splines.
+        minimum_gap: least width of gaps, m; they are as wide as the tool whatever it is.
+        scale: least factor by which arms that repeat this one's design are smaller than it.
 
     Raises:
         InputError: its free curves are lines and arcs.
     """
     import shapely
 
-    if any(piece.free and not isinstance(piece.curve, Spline) for piece in part.shape.pieces):
+    free = [piece.curve for piece in part.shape.pieces if piece.free]
+    if free and not any(isinstance(curve, Spline) for curve in free):  # those of fillets are arcs
         raise InputError("--optimize: expected splines, not --curves arcs")
 
     domain, shape = part.domain, part.shape
@@ -408,24 +497,34 @@ def free_outline(part: PlanePart) -> FreeOutline:
     fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]
     for loop in fixed:
         found: list[Piece | int] = []
-        for piece in loop:
-            if piece.free:
-                found.append(len(runs))
-                line = piece.curve.at(piece.curve.parameters(chord))
-                runs.append(Run(_fitted_open(line, SPACING * cell), False))
-            else:
+        line = np.empty((0, 2))
+        first = next(k for k, piece in enumerate(loop) if not piece.free)
+        loop = (*loop[first:], *loop[:first])  # no run goes on beyond the last piece
+        for piece, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+            if not piece.free:
                 found.append(piece)
+                continue
+            own = piece.curve.at(piece.curve.parameters(chord))
+            line = np.vstack([line, own[1:]]) if len(line) else own
+            smooth = direction(piece.curve, 1.0) @ direction(after.curve, 0.0) > np.cos(KINK)
+            if not (after.free and smooth):
+                found.append(len(runs))
+                runs.append(Run(_fitted_open(line, SPACING * cell), False))
+                line = np.empty((0, 2))
         loops.append(tuple(found))
     tool = part.outline.tool_radius
     for ring in _free_rings(shape, tool, chord, len(fixed)):
         loops.append((len(runs),))
-        runs.append(Run(_fitted_closed(ring, SPACING * cell, domain.symmetric), True))
+        runs.append(Run(fitted_closed(ring, SPACING * cell, domain.symmetric), True))
     partner = None
     if domain.symmetric:
-        runs, partner = _mirrored(runs)
-    least = max(domain.minimum_member, LEAST_MEMBER * cell), max(2.0 * tool, LEAST_GAP * cell)
-    made = FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner)
+        runs, partner = mirrored(runs)
+    member = max(domain.minimum_member / scale, LEAST_MEMBER * cell)
+    least = member, max(2.0 * tool / scale, minimum_gap / scale, LEAST_GAP * cell)
+    made = FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner, scale).rounded()
     for _ in range(WIDENINGS if runs else 0):
+        if made.widths()[0].min() >= least[0]:
+            break
         made = made.widened()
     return made
 
@@ -467,7 +566,7 @@ def _length(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def _fitted_closed(ring: np.ndarray, spacing: float, symmetric: bool) -> np.ndarray:
+def fitted_closed(ring: np.ndarray, spacing: float, symmetric: bool) -> np.ndarray:
     """Return control points (n, 2) of a periodic spline through a ring of corners."""
     if symmetric and ring[:, 1].min() < 0.0 < ring[:, 1].max():  # begin on the axis
         ring = np.roll(ring, -int(np.argmin(np.abs(ring[:, 1]))), axis=0)
@@ -501,7 +600,7 @@ def _fitted_open(line: np.ndarray, spacing: float) -> np.ndarray:
     return found
 
 
-def _mirrored(runs: Sequence[Run]) -> tuple[list[Run], np.ndarray]:
+def mirrored(runs: Sequence[Run]) -> tuple[list[Run], np.ndarray]:
     """Return runs that are mirror images of each other or of themselves, and every partner."""
     found = list(runs)
     starts = np.cumsum([0, *(len(run.points) for run in runs)])

@@ -250,7 +250,21 @@ def body_mesh(
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
         sizes = [0.5 * size for size in sizes]
-    raise InputError("the outline of a part cannot be meshed: its curves nearly touch")
+    x, y = 1e3 * _nearest_sides(samples, shape)
+    raise InputError(
+        f"its outline cannot be meshed: curves nearly touch at ({x:.1f}, {y:.1f}) mm; choose "
+        "another --tool-radius or --tolerance"
+    )
+
+
+def _nearest_sides(samples: Sequence[np.ndarray], shape: Shape) -> np.ndarray:
+    """Return a place (2,) on the outline where a member is narrowest, m."""
+    curves = shape.curves
+    points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
+    inward = -np.vstack([normals(c, t) for c, t in zip(curves, samples, strict=True)])
+    near = cKDTree(points).query(points, k=min(NEAREST, len(points)))[1]
+    both = [facing(points, sign * inward, near, 1.0) for sign in (1.0, -1.0)]
+    return np.asarray(points[np.argmin(np.minimum(*both))])
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,6 @@ Where the material of a part ends: the level of the density that holds the mater
 
 What stays solid, the interfaces and the arm's own outline are kept; islands are dropped, and every
 hole, gap and concave corner is as wide as the tool.
-
-How wide the thinnest member of an outline is.
 """
 
 from __future__ import annotations
@@ -96,22 +94,29 @@ def _step(tried: list[tuple[float, float]], slope: float) -> float:
     return BEYOND * excess / slope
 
 
-QUADRANT = 12  # sides of a quarter of the tool's circle
-SLIVER = 2e-3  # area of a corner that is rounded, squares of the radius: turns of 20 degrees
+QUADRANT = 12  # sides of a quarter of a disc
+SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
+SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
 
 
-def rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
+def rounded(whole: Geometry, radius: float, chord: float) -> tuple[Geometry, np.ndarray]:
     """Return the polygons with all that a disc cannot reach from without added to them.
 
-    Elsewhere their sides stay what they are to the bit.
+    Elsewhere their sides stay what they are to the bit. With them points (n, 2), m, the centres of
+    all arcs of the disc among them.
     """
     import shapely
 
-    closed = whole.buffer(radius, quad_segs=QUADRANT).buffer(-radius, quad_segs=QUADRANT)
+    tolerance = chord / CHORD
+    quadrant = max(int(np.ceil(0.25 * np.pi / np.sqrt(2.0 * SAGITTA * tolerance / radius))), 6)
+    swept = whole.buffer(radius, quad_segs=quadrant)
+    closed = swept.buffer(-radius, quad_segs=quadrant)
     added = shapely.get_parts(closed.difference(whole))
     # The rounding of numbers, and every corner of the polygon, leave slivers all along.
-    added = added[shapely.area(added) > SLIVER * radius * radius]
-    return shapely.union_all([whole, *shapely.buffer(added, 0.1 * chord, join_style="mitre")])
+    added = added[shapely.area(added) > (SHALLOW * tolerance) ** 2]
+    deep = shapely.area(shapely.buffer(added, -0.5 * SHALLOW * tolerance, quad_segs=2)) > 0.0
+    added = shapely.buffer(added[deep], 0.1 * chord, join_style="mitre")
+    return shapely.union_all([whole, *added]), shapely.get_coordinates(swept)
 
 
 def without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
@@ -269,8 +274,7 @@ NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must
 # Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
 # one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
 CHECKERED, FEW = 0.4, 100
-# Corners are rounded by the tool's radius and so many tolerances: curves may turn a little sharper.
-ROUNDING = 8.0
+ROUNDING = 1.0  # by which concave corners are rounder than the tool, tolerances
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,10 +287,10 @@ class Outline:
         level: of the field.
         offset: by which the outline was moved outwards, m; 0 where the level alone would do.
         tool_radius: m.
-        rounding: radius of its concave corners, m.
         chord: distance of its sides from the arm's own curves, m.
         islands, islands_area: number of pieces that join no interface and were dropped; m2.
         filled: number of holes narrower than the tool, closed.
+        centres: (n, 2) m, those of the tool's arcs on the polygon among them.
     """
 
     domain: Domain
@@ -294,11 +298,21 @@ class Outline:
     level: float
     offset: float
     tool_radius: float
-    rounding: float
     chord: float
     islands: int
     islands_area: float
     filled: int
+    centres: np.ndarray
+
+    @property
+    def tolerance(self) -> float:
+        """Of the part, m."""
+        return self.chord / CHORD
+
+    @property
+    def rounding(self) -> float:
+        """Radius of its concave corners, m: curves within the tolerance may turn sharper."""
+        return _rounding(self.tool_radius, self.chord)
 
     @property
     def area(self) -> float:
@@ -324,22 +338,22 @@ class _Given:
     outboard: Geometry
 
 
+def _rounding(tool: float, chord: float) -> float:
+    return tool + ROUNDING * chord / CHORD
+
+
 def default_tool(domain: Domain) -> float:
     """Return the tool's radius where none is asked for, m."""
     return TOOL * domain.cell
 
 
-def draw_outline(
-    domain: Domain, tool_radius: float, tolerance: float, rounding: float | None = None
-) -> Outline:
+def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outline:
     """Find the outline whose area is the material's volume over the thickness.
 
     Args:
         domain: the arm.
         tool_radius: of every concave corner, m.
         tolerance: of the part, m; the polygon is far closer to the arm's own curves.
-        rounding: radius of the polygon's concave corners, m; by default so much more than the
-            tool's that curves within the tolerance can hardly turn sharper than it.
 
     Raises:
         InputError: the tool does not fit into the arm; the design is a checkerboard; no material
@@ -357,10 +371,7 @@ def draw_outline(
             f"{where}: its {solid} solid cells touch each other in {domain.contacts} corners: a "
             "checkerboard has no outline; give design.filter_radius the length of two cells or more"
         )
-    radius = tool_radius + ROUNDING * tolerance if rounding is None else rounding
-    radius = 0.0 if tool_radius == 0.0 else radius
     given = _given(domain, CHORD * tolerance)
-    raster = rasterise(domain)
     target = domain.volume
     if given.stays.area > target * (1.0 + AREA):
         raise InputError(
@@ -370,26 +381,36 @@ def draw_outline(
 
     if target > given.arm.area * (1.0 - AREA):
         polygon = max(polygons_of(given.arm), key=lambda p: p.area)
-        return Outline(domain, polygon, 0.0, 0.0, tool_radius, radius, CHORD * tolerance, 0, 0.0, 0)
+        chord, none = CHORD * tolerance, np.empty((0, 2))
+        return Outline(domain, polygon, 0.0, 0.0, tool_radius, chord, 0, 0.0, 0, none)
     if float(np.ptp(domain.field)) < UNIFORM:
         raise InputError(
             f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
             "optimise it first"
         )
 
+    for field in (domain.beside, domain.field):
+        found = _found(replace(domain, field=field), given, tool_radius, tolerance)
+        if _off(found) <= LEAP:
+            return replace(found, domain=domain)
+    raise InputError(
+        f"{where}: the material of the design does not hang together: at no level has the "
+        "piece that joins both interfaces the design's volume; let the optimisation go on "
+        "until the design is crisp (design.projection)"
+    )
+
+
+def _found(domain: Domain, given: _Given, tool_radius: float, tolerance: float) -> Outline:
+    """Return the outline whose area is nearest to the design's volume."""
+    raster = rasterise(domain)
+
     def at(level: float, offset: float = 0.0) -> Outline:
-        return _at(domain, given, raster, level, offset, radius, CHORD * tolerance)
+        return _at(domain, given, raster, level, offset, tool_radius, CHORD * tolerance)
 
     found = _at_level(at, lambda level: _rough(given, raster, domain, level), domain, raster)
     if _off(found) > LEAP:  # a large piece joins or leaves: move the outline itself
         found = _at_offset(at, found)
-    if _off(found) > LEAP:
-        raise InputError(
-            f"{where}: the material of the design does not hang together: at no level has the "
-            "piece that joins both interfaces the design's volume; let the optimisation go on "
-            "until the design is crisp (design.projection)"
-        )
-    return replace(found, tool_radius=tool_radius, rounding=radius)
+    return found
 
 
 def _given(domain: Domain, chord: float) -> _Given:
@@ -426,7 +447,14 @@ def _material(
     above = shapely.simplify(raster.above(level), straight)
     if offset:
         above = above.buffer(offset, quad_segs=QUADRANT)
-    return shapely.union_all([above.intersection(given.arm), given.stays, given.links])
+    whole = shapely.union_all([above.intersection(given.arm), given.stays])
+    whole = shapely.union_all(polygons_of(whole))  # without points and lines
+    missing = shapely.get_parts(given.links.difference(whole))
+    near = 1e-3 * straight
+    joints = shapely.buffer(shapely.intersection(shapely.buffer(missing, near), whole), near)
+    # What touches the material in one place alone joins nothing.
+    joins = [len(polygons_of(one)) > 1 for one in joints]
+    return shapely.union_all([whole, *shapely.buffer(missing[joins], near)])
 
 
 def _at(
@@ -442,9 +470,10 @@ def _at(
     import shapely
 
     whole = _material(given, raster, level, offset, STRAIGHT * chord / CHORD)
-    before = polygons_of(whole)
+    before, centres = polygons_of(whole), np.empty((0, 2))
     if tool > 0.0:
-        whole = rounded(whole, tool, chord).intersection(given.arm)
+        whole, centres = rounded(whole, _rounding(tool, chord), chord)
+        whole = whole.intersection(given.arm)
     whole = without_necks(whole, NECK * chord / CHORD, chord)
     parts = polygons_of(whole)
     near = 1e-6 * domain.extent
@@ -460,11 +489,11 @@ def _at(
         level=level,
         offset=offset,
         tool_radius=tool,
-        rounding=tool,
         chord=chord,
         islands=len(dropped),
         islands_area=float(sum(p.area for p in dropped)),
         filled=max(closed - len(holes), 0),
+        centres=centres,
     )
 
 
@@ -522,34 +551,3 @@ def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline
     slope = max(float(found.polygon.length), found.domain.length) / found.domain.volume
     moved = search(lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), AREA)
     return min(found, moved, key=_off)
-
-
-WIDTH_STEPS = 11  # of the bisection: to a four thousandth of the height
-WIDTH_STRAIGHT = 1e-4  # distance of corners that are left out, heights
-TIP = 0.05  # area of a piece that counts as a wider part, squares of the width
-
-
-def thinnest_member(outline: Outline) -> float | None:
-    """Return the largest width up to which nothing falls apart when half of it is taken off.
-
-    None where nothing falls apart before the half of the height is gone.
-    """
-    polygon: Any = outline.polygon.simplify(WIDTH_STRAIGHT * outline.domain.height)
-    low, high = 0.0, 0.5 * outline.domain.height
-    if not _falls_apart(polygon, high):
-        return None
-    for _ in range(WIDTH_STEPS):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if _falls_apart(polygon, middle) else (middle, high)
-    return low
-
-
-def _falls_apart(polygon: Any, width: float) -> bool:
-    """Return whether a member is thinner: the polygon eroded by half the width has more pieces."""
-    import shapely
-
-    eroded = polygon.buffer(-0.5 * width, quad_segs=4)
-    parts = shapely.get_parts(eroded)
-    large = np.asarray(shapely.area(parts)) > TIP * width * width
-    lost_hole = sum(len(p.interiors) for p in parts) < len(polygon.interiors)
-    return int(large.sum()) != 1 or lost_hole

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -16,8 +17,10 @@ from dolfinopt.part.files.triangles import MM, extruded_facets, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.domain import Domain
+from dolfinopt.part.plane.gauge import TightPlace, thinnest_member, tight_places
 from dolfinopt.part.plane.mesh import BodyMesh, body_mesh
-from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline, thinnest_member
+from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
+from dolfinopt.part.plane.simplify import simple_shape
 from dolfinopt.part.plane.stress import corner_stress, is_regular
 from dolfinopt.part.plane.trace import make_shape
 
@@ -26,8 +29,9 @@ if TYPE_CHECKING:
     from dolfinopt.part.stress import CornerStress
 
 
+TOLD = 5  # tight places that a sentence names
+SIMPLE = 0.25  # distance of simplified outlines by default, cells
 TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
-TRIES, ENOUGH = 3, 0.98  # of the radius of concave corners; share of the tool's that will do
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +43,14 @@ class PlanePart:
         outline: its polygon.
         shape: its curves.
         tolerance: of the curves, m.
-        thinnest: width of its thinnest member, m; None where nothing is thin.
+        kept_splines: whether no straight lines and fillets were found that were asked for.
     """
 
     domain: Domain
     outline: Outline
     shape: Shape
     tolerance: float
-    thinnest: float | None
+    kept_splines: bool = False
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
@@ -56,6 +60,16 @@ class PlanePart:
     def name(self) -> str:
         """The arm's name."""
         return self.domain.name
+
+    @cached_property
+    def thinnest(self) -> float | None:
+        """Width of its thinnest member, m; None where nothing is thin."""
+        return thinnest_member(self.shape, self.domain.cell)
+
+    @cached_property
+    def tight(self) -> list[TightPlace]:
+        """Places that the tool does not reach."""
+        return tight_places(self.shape, self.outline.tool_radius, self.tolerance)
 
     @property
     def volume(self) -> float:
@@ -100,6 +114,18 @@ class PlanePart:
                 f"arm {one.name!r}: {number} without a joint to both interfaces "
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
             )
+        if self.kept_splines:
+            found.append(
+                f"arm {one.name!r}: --simplify: no straight lines and fillets without crossings; "
+                "splines instead; choose a smaller --tolerance"
+            )
+        if self.tight:
+            listed = "; ".join(map(str, self.tight[:TOLD]))
+            more = f"; {len(self.tight) - TOLD} more in part.json" if len(self.tight) > TOLD else ""
+            tool = 1e3 * outline.tool_radius
+            found.append(
+                f"arm {one.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
+            )
         if self.thinnest is not None and self.thinnest < 0.9 * one.minimum_member:
             found.append(
                 f"arm {one.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, below "
@@ -128,6 +154,7 @@ class PlanePart:
             "loops": len(shape.loops),
             "tool_radius": self.outline.tool_radius,
             "smallest_concave_radius": radius if math.isfinite(radius) else None,
+            "tight_places": [[*one.place, one.radius] for one in self.tight],
             "thinnest_member": self.thinnest,
             "islands_left_out": self.outline.islands,
             "holes_filled": self.outline.filled,
@@ -152,7 +179,10 @@ class PlanePart:
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> BodyMesh:
         """Return triangles along its curves, see `part.Part`."""
-        return body_mesh(self.shape, self.domain.cell, coarser, finer)
+        try:
+            return body_mesh(self.shape, self.domain.cell, coarser, finer)
+        except InputError as error:
+            raise InputError(f"arm {self.name!r}: {error}") from None
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 2) are away from where stress has no limit (n,)."""
@@ -174,17 +204,22 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
             f"{domain.cell:.3g} m"
         )
     tool = default_tool(domain) if tool_radius is None else tool_radius
-    # Where nobody has asked for a tool, curves within the tolerance of its path will do.
-    least = max(tool - tolerance, 0.0) if tool_radius is None else ENOUGH * tool
-    rounding = None
-    for _ in range(TRIES):
-        outline = draw_outline(domain, tool, tolerance, rounding)
-        shape = make_shape(outline, tolerance, curves.arcs)
-        radius = shape.concave_radius
-        if radius >= least:
-            break
-        rounding = outline.rounding * min(1.1 * tool / radius, 2.0)
-    return PlanePart(domain, outline, shape, tolerance, thinnest_member(outline))
+    fine = min(tolerance, TOLERANCE, CELLS * domain.cell) if curves.simplify else tolerance
+    outline = draw_outline(domain, tool, fine)
+    if curves.simplify:
+        distance = SIMPLE * domain.cell if curves.tolerance is None else tolerance
+        shape = simple_shape(outline, distance, domain.volume)
+        if shape is not None:
+            return PlanePart(domain, outline, shape, fine)
+    shape = make_shape(outline, fine, curves.arcs)
+    return PlanePart(domain, outline, shape, fine, curves.simplify)
+
+
+def simplified(part: PlanePart, tolerance: float | None = None) -> PlanePart:
+    """Return a part in straight lines and fillets, within a tolerance of it, m, if there are."""
+    distance = SIMPLE * part.domain.cell if tolerance is None else tolerance
+    shape = simple_shape(part.outline, distance, part.shape.area)
+    return replace(part, kept_splines=True) if shape is None else replace(part, shape=shape)
 
 
 def _count(number: int, name: str) -> str:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.plane.curves import (
@@ -40,7 +41,10 @@ SMOOTH = np.radians(15.0)  # difference of directions up to which a joint is smo
 REACH = 0.15  # over which directions are measured, cells
 TURN = np.radians(8.0)  # of a polyline at a corner that counts among its points
 DENT = 0.2  # depth of a free run in the arm's own edge that is not followed, tolerances
-AXIS = "axis"
+AXIS, FILLET = "axis", "fillet"
+# Sweep of an arc of the tool from which on it is one of the outline: beside a curve of the arm, and
+# between free curves, which follow shorter ones as well.
+BESIDE, BETWEEN = np.radians(10.0), np.radians(60.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +53,7 @@ class Run:
 
     Attributes:
         points: (n, 2) m.
-        edge: the arm's curve that it lies on, None where it is free.
+        edge: the arm's curve that it lies on, or the tool's arc (`FILLET`), None where it is free.
     """
 
     points: np.ndarray
@@ -102,6 +106,7 @@ def _runs(
     on = _owners(points, lines, 3.0 * outline.chord)
     on = _without_dents(points, on, lines, DENT * tol)
     on = _without_specks(points, on, tol)
+    edges = [*edges, *_fillets(points, on, outline, len(edges))]
     reach = REACH * outline.domain.cell
     if outline.tool_radius > 0.0:  # its roundings are none
         reach = min(reach, 0.4 * outline.tool_radius)
@@ -136,6 +141,29 @@ def _owners(points: np.ndarray, lines: Sequence[Any], near: float) -> np.ndarray
         better = (distance < near) & (distance < best - 1e-3 * near)
         on[better], best[better] = k, distance[better]
     return on
+
+
+def _fillets(points: np.ndarray, on: np.ndarray, outline: Outline, first: int) -> list[Edge]:
+    """Return the tool's arcs on free sides of a closed polygon, and put their numbers in `on`."""
+    if not len(outline.centres):
+        return []
+    radius, near = outline.rounding, 0.5 * outline.chord
+    after = np.roll(points, -1, axis=0)
+    nearest = cKDTree(outline.centres).query(0.5 * (points + after))[1]
+    centre = outline.centres[nearest]
+    arms = points - centre, after - centre
+    off = np.max([np.abs(np.linalg.norm(arm, axis=1) - radius) for arm in arms], axis=0)
+    owner = np.where((on == -1) & (off < near) & (_turn(*arms) < 0.0), nearest, -1)
+    found: list[Edge] = []
+    for block in _blocks(owner):
+        if owner[block[0]] == -1:
+            continue
+        free = on[block[0] - 1] == -1 and on[(block[-1] + 1) % len(on)] == -1
+        sweep = -_turn(arms[0][block], arms[1][block]).sum()
+        if sweep > (BETWEEN if free else BESIDE):
+            on[block] = first + len(found)
+            found.append(Edge(Arc(centre[block[0]], radius, 0.0, -2.0 * np.pi), FILLET))
+    return found
 
 
 def _blocks(on: np.ndarray) -> list[np.ndarray]:
@@ -257,24 +285,50 @@ def _on_spline(curve: Spline, point: np.ndarray) -> tuple[np.ndarray, float]:
     return curve.at(np.array([best]))[0], best
 
 
+TANGENT = 10.0  # distance of the tool's arc from a curve that it touches, at most, chords
 SQUARE = np.radians(30.0)  # a curve meets the axis of symmetry at a right angle, or as a corner
 
 
 def pieces_along(
-    runs: Sequence[Run], spacing: float, reach: float, tolerance: float
+    runs: Sequence[Run], spacing: float, reach: float, tolerance: float, chord: float
 ) -> list[Piece]:
     """Return the pieces of a ring; of one along the axis the label is `AXIS`."""
     if len(runs) == 1:
         return _closed(runs[0], spacing, reach, tolerance)
+    runs = [_tangential(runs, k, chord) for k in range(len(runs))]
     joints = [_joint(runs[k - 1], run, reach) for k, run in enumerate(runs)]
     found = []
     for k, run in enumerate(runs):
         first, last = joints[k], joints[(k + 1) % len(runs)]
         if run.edge is not None:
-            found.append(Piece(_along(run, first.point, last.point), run.edge.label))
+            fillet = run.edge.label == FILLET
+            curve = piece_along(run, first.point, last.point)
+            found.append(Piece(curve, "" if fillet else run.edge.label, free=fillet))
         else:
             found.append(_fitted(run.points, first, last, spacing, tolerance))
     return found
+
+
+def _tangential(runs: Sequence[Run], k: int, chord: float) -> Run:
+    """Return a run; an arc of the tool exactly tangential to curves of the arm beside it."""
+    run, beside = runs[k], (runs[k - 1].edge, runs[(k + 1) % len(runs)].edge)
+    if run.edge is None or run.edge.label != FILLET:
+        return run
+    arc = run.edge.curve
+    assert isinstance(arc, Arc)
+    centre = arc.centre
+    for _ in range(4):
+        rows, gaps = [], []
+        for edge in beside:
+            if edge is not None and edge.label not in (FILLET, AXIS):
+                to = centre - projected(edge.curve, centre)[0]
+                gap = arc.radius - np.linalg.norm(to)
+                if abs(gap) < TANGENT * chord:
+                    rows.append(to / np.linalg.norm(to))
+                    gaps.append(gap)
+        if rows:
+            centre = centre + np.linalg.lstsq(np.array(rows), np.array(gaps), rcond=1e-3)[0]
+    return replace(run, edge=Edge(replace(arc, centre=centre), FILLET))
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +348,12 @@ class _Joint:
 def _joint(before: Run, after: Run, reach: float) -> _Joint:
     point = after.points[0]
     if before.edge is not None and after.edge is not None:
-        return _Joint(_common(before.edge, after.edge, point), None)
+        for one, other in ((before.edge, after.edge), (after.edge, before.edge)):
+            if one.label == FILLET and isinstance(one.curve, Arc) and other.label != AXIS:
+                place = projected(other.curve, one.curve.centre)[0]
+                if abs(np.linalg.norm(place - one.curve.centre) - one.curve.radius) < 1e-12:
+                    return _Joint(place, None)
+        return _Joint(common(before.edge, after.edge, point), None)
     if before.edge is None and after.edge is None:  # a corner of the free outline
         return _Joint(point, None, free=True)
     edge = before.edge if before.edge is not None else after.edge
@@ -311,7 +370,7 @@ def _joint(before: Run, after: Run, reach: float) -> _Joint:
     return _Joint(place, along if angle_between(ahead, along) < SMOOTH else None)
 
 
-def _common(first: Edge, second: Edge, point: np.ndarray) -> np.ndarray:
+def common(first: Edge, second: Edge, point: np.ndarray) -> np.ndarray:
     """Return where two curves meet, near a point."""
     for _ in range(20):
         rows, gaps = [], []
@@ -328,7 +387,7 @@ def _common(first: Edge, second: Edge, point: np.ndarray) -> np.ndarray:
     return point
 
 
-def _along(run: Run, start: np.ndarray, end: np.ndarray) -> Curve:
+def piece_along(run: Run, start: np.ndarray, end: np.ndarray) -> Curve:
     """Return the piece of a run's curve between two points of it."""
     assert run.edge is not None
     curve = run.edge.curve
@@ -450,16 +509,16 @@ def whole(chain: list[Piece]) -> list[Piece]:
 def _joined(first: Piece, second: Piece) -> Piece | None:
     """Return one piece for two that go on as the same line or arc, None where they do not."""
     a, b = first.curve, second.curve
-    if first.label != second.label or first.free or second.free:
+    if first.label != second.label or first.free != second.free:
         return None
     if isinstance(a, Line) and isinstance(b, Line):
         if angle_between(direction(a, 1.0), direction(b, 0.0)) < 1e-6:
-            return Piece(Line(a.start, b.end), first.label)
+            return replace(first, curve=Line(a.start, b.end))
     if isinstance(a, Arc) and isinstance(b, Arc):
         apart = np.linalg.norm(a.centre - b.centre) + abs(a.radius - b.radius)
         if apart < 1e-7 * a.radius and a.sweep * b.sweep > 0.0:
             sweep = a.sweep + b.sweep
-            return Piece(Arc(a.centre, a.radius, a.begin, sweep), first.label)
+            return replace(first, curve=Arc(a.centre, a.radius, a.begin, sweep))
     return None
 
 
@@ -479,25 +538,31 @@ def with_area(
     length = sum(
         float(np.linalg.norm(np.diff(sampled([p.curve], 1e-6), axis=0), axis=1).sum())
         for p in shape.pieces
-        if p.free
+        if p.free and isinstance(p.curve, Spline)
     )
     if length == 0.0:
         return change(shape)
-    offset = 0.0
+    offset, slope = 0.0, length  # curves with ends that stay gain less than that
     moved = change(shape)
     for _ in range(STEPS):
         missing = area - moved.area
         if abs(missing) < 1e-9 * area:
             break
-        offset += missing / length
+        step = missing / slope
+        offset += step
         moved = change(_offset(shape, offset))
+        gained = (missing - (area - moved.area)) / step
+        slope = gained if gained > 0.1 * slope else slope
     return replace(moved, offset=offset)
 
 
 def _offset(shape: Shape, distance: float) -> Shape:
     return Shape(
         tuple(
-            tuple(replace(p, curve=_moved(p, distance)) if p.free else p for p in loop)
+            tuple(
+                replace(p, curve=_moved(p, distance)) if isinstance(p.curve, Spline) else p
+                for p in loop
+            )
             for loop in shape.loops
         )
     )
@@ -506,6 +571,8 @@ def _offset(shape: Shape, distance: float) -> Shape:
 def _moved(piece: Piece, distance: float) -> Curve:
     """Return a free curve moved along its outward normals, but for the ends that are fixed."""
     curve = piece.curve
+    if not piece.free:
+        return curve
     assert isinstance(curve, Spline)
     knots, n = curve.knots, len(curve.points)
     t = np.array([knots[k + 1 : k + 4].mean() for k in range(n)])
@@ -526,6 +593,7 @@ POINTS = 8  # of a free run in a cell that the splines are fitted to
 # Shares of the tolerance and of the distance of these points, one attempt after the other: splines
 # may leave the outline between points, or cross each other where it is narrow.
 ATTEMPTS = ((1.0, 1.0), (1.0, 0.3), (0.75, 0.3), (0.5, 0.2), (0.25, 0.2))
+ENOUGH = 0.98  # share of the tool's radius for which no other attempt is made
 ARCS = 0.25  # share of the tolerance for arcs in place of splines
 
 
@@ -544,11 +612,18 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     def change(shape: Shape) -> Shape:
         return with_arcs(shape, ARCS * tolerance) if arcs else shape
 
+    best: Shape | None = None
     for share, finer in ATTEMPTS:
         finest = share * tolerance * (1.0 - ARCS if arcs else 1.0)
         shape = with_area(_follow(outline, finest, finer), outline.domain.volume, change)
-        if shape.distance <= tolerance and shape.is_simple(0.1 * share * tolerance):
+        if shape.distance > tolerance or not shape.is_simple(0.1 * share * tolerance):
+            continue
+        if shape.concave_radius >= ENOUGH * outline.tool_radius:
             return shape
+        if best is None or shape.concave_radius > best.concave_radius:
+            best = shape
+    if best is not None:  # the command tells where
+        return best
     raise InputError(
         f"arm {outline.domain.name!r}: no smooth curves within {tolerance:g} m of the outline; "
         "choose a smaller or larger --tolerance"
@@ -568,7 +643,7 @@ def _follow(outline: Outline, tolerance: float, finer: float = 1.0) -> Shape:
     reach = REACH * outline.domain.cell
 
     def pieces(runs: Sequence[Run]) -> list[list[Piece]]:
-        chains = half_chains(pieces_along(runs, spacing, reach, FITTED * tolerance))
+        chains = half_chains(pieces_along(runs, spacing, reach, FITTED * tolerance, outline.chord))
         return [whole(chain) for chain in chains] if outline.domain.symmetric else chains
 
     found = [loop for runs in trace(outline, tolerance) for loop in pieces(runs)]

@@ -13,6 +13,7 @@ Source: Lazarov & Sigmund (2011), doi:10.1002/nme.3072.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -22,6 +23,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.mesh import facing
@@ -46,6 +48,12 @@ EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 # Worst shape of a cell over that when the mesh was made: a new one is due, or a step goes too far.
 WORN, SPOILT = 0.6, 0.2
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
+
+
+REPEATED = (
+    "--optimize: arm {name!r} repeats the design of another solid (arms.pattern); its part would "
+    "get a shape of its own; leave --optimize out"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +86,17 @@ class FreeSurface:
         """The part with this surface."""
         return self.made
 
-    def meshed(self, coarser: float) -> tuple[FreeSurface, Tetrahedra]:
+    def rounded(self) -> FreeSurface:
+        """Return it as it is: no cutter makes a free-form surface."""
+        return self
+
+    def scaled(self, part: SolidPart, factors: np.ndarray) -> FreeSurface:
+        """Raise InputError: arms that repeat a solid's design each have their own surface."""
+        raise InputError(REPEATED.format(name=part.name))
+
+    def meshed(
+        self, coarser: float, finer: Sequence[np.ndarray] = ()
+    ) -> tuple[FreeSurface, Tetrahedra]:
         """Return the surface with a new mesh, whose nodes are other variables."""
         mesh = self.made.mesh(coarser)
         return free_surface(self.made, mesh), mesh
@@ -293,9 +311,19 @@ class FreePlate:
         """Return how far (count,) control points may move inwards and outwards, m."""
         return self.outline.room()
 
-    def meshed(self, coarser: float) -> tuple[FreePlate, Tetrahedra]:
+    def rounded(self) -> FreePlate:
+        """Return the plate with concave corners as wide as the tool."""
+        return replace(self, outline=self.outline.rounded())
+
+    def scaled(self, part: SolidPart, factors: np.ndarray) -> FreePlate:
+        """Raise InputError: arms that repeat a solid's design each have their own outline."""
+        raise InputError(REPEATED.format(name=part.name))
+
+    def meshed(
+        self, coarser: float, finer: Sequence[np.ndarray] = ()
+    ) -> tuple[FreePlate, Tetrahedra]:
         """Return it with a new mesh; variables stay."""
-        return self, self.current.mesh(coarser)
+        return self, self.current.mesh(coarser, finer)
 
     def followed(self, mesh: PlateMesh) -> PlateMesh | None:
         """Return a mesh of a plate nearby, moved to this one; None where it folds."""

@@ -1,0 +1,163 @@
+"""Outlines as a shop cuts them: the tool's radius, rings, straight lines and fillets."""
+
+import numpy as np
+import pytest
+import shapely
+from cutter import deepest_left
+
+from dolfinopt.part.part import Curves
+from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, direction
+from dolfinopt.part.plane.gauge import thinnest_member, tight_places
+from dolfinopt.part.plane.part import make_part
+
+pytestmark = pytest.mark.serial
+SIZE = 1e-4  # m, of rasters
+
+SCARA = """
+SetFactory("OpenCASCADE");
+DefineConstant[
+  length = {0.325, Name "Parameters/1 length (m)"},
+  size = {0.004, Name "Parameters/3 mesh size (m)"}
+];
+Disk(1) = {0, 0, 0, 0.06}; Disk(2) = {length, 0, 0, 0.042};
+Point(101) = {0, -0.052, 0}; Point(102) = {length, -0.036, 0};
+Point(103) = {length, 0.036, 0}; Point(104) = {0, 0.052, 0};
+Line(101) = {101, 102}; Line(102) = {102, 103}; Line(103) = {103, 104}; Line(104) = {104, 101};
+Curve Loop(101) = {101, 102, 103, 104}; Plane Surface(3) = {101};
+body() = BooleanUnion{ Surface{1}; Delete; }{ Surface{2, 3}; Delete; };
+Disk(11) = {0, 0, 0, 0.031}; Disk(12) = {length, 0, 0, 0.02};
+cut() = BooleanDifference{ Surface{body()}; Delete; }{ Surface{11, 12}; Delete; };
+r = 0.0311; s = 0.0201; e = 1e-4;
+Physical Curve("inboard", 1) = Curve In BoundingBox {-r, -r, -e, r, r, e};
+Physical Curve("outboard", 2) = Curve In BoundingBox {length - s, -s, -e, length + s, s, e};
+Physical Surface("design", 3) = {cut()};
+MeshSize {:} = size;
+"""
+
+
+def webbed(x, y):
+    """Two flanges and slanted webs of about 10 mm between rings; the ends are void."""
+    flange = 0.05 - 0.045 * x
+    between = (x > 0.04) & (x < 0.29)
+    webs = between & (np.abs(np.abs((x - 0.07) % 0.12 - 0.06) - 0.06 * (y + 0.04) / 0.08) < 0.006)
+    return (((np.abs(y) > flange - 0.012) & (np.abs(y) < flange) & (x > 0.0)) | webs) * 1.0
+
+
+@pytest.fixture
+def scara(design, tmp_path):
+    """The domain of a SCARA-like arm of triangles with bearing bores and rings of 6 mm."""
+    path = tmp_path / "scara.geo"
+    path.write_text(SCARA)
+    changes = (f"arms.0.mesh={path}", "arms.0.length=0.325", "arms.0.height=0.12",
+               "arms.0.mesh_size=0.004", "arms.0.passive=0.006",
+               'arms.0.regions=[{kind="solid", circle=[0.16, 0.0, 0.012]}]')  # fmt: skip
+    return design(webbed, *changes, "motion.radius=0.4", "arms.1.length=1.0")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("simplify", [False, True])
+def test_a_cutter_of_3_mm_leaves_nothing_in_a_scara(scara, simplify):
+    part = make_part(scara, Curves(0.003, simplify=simplify))
+    shape = part.shape
+    assert shape.area == pytest.approx(scara.volume, rel=1e-5)
+    deep, _ = deepest_left(shape, 0.003, SIZE)
+    assert deep <= part.tolerance + 1.5 * SIZE
+    # Told are the arm's own corners, where the bar meets the boss; elsewhere a trifle may be.
+    own = [one for one in part.tight if np.hypot(*(np.abs(one.place) - [0.305, 0.037])) < 2e-3]
+    assert all(one.radius > 0.8 * 0.003 for one in part.tight if one not in own)
+    if simplify:
+        assert {type(curve) for curve in shape.curves} == {Line, Arc}
+    circles = {
+        round(p.curve.radius, 9) for p in shape.pieces if not p.free and isinstance(p.curve, Arc)
+    }
+    assert {0.031, 0.02, 0.037, 0.026} <= circles  # bores, and the rings around them
+    # The boss of 12 mm that `regions` keeps is there to the tolerance of polygons.
+    outer, *holes = shape.polygons(1e-7)
+    assert shapely.Polygon(outer, holes).buffer(2e-7).covers(shapely.Point(0.16, 0.0).buffer(0.012))
+
+
+def corners_of(part):
+    """Return the turns (n,) of the outline at joints, rad, negative where concave."""
+    found = []
+    for loop in part.shape.loops:
+        for before, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+            a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
+            found.append(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
+    return np.array(found)
+
+
+def test_openings_are_rounded_by_the_tool_alone(design):
+    """One of 18 x 14 cells keeps its size: four fillets take (4 - pi) r^2."""
+
+    def density(x, y):
+        return ~((np.abs(x - 0.5) < 0.0215) & (np.abs(y) < 0.014))
+
+    part = make_part(design(density, "arms.0.cells=[400,30]"), Curves(0.003))
+    hole = shapely.Polygon(part.shape.polygons(1e-7)[1])
+    x0, y0, x1, y1 = hole.bounds
+    assert (x1 - x0, y1 - y0) == pytest.approx((0.045, 0.028), abs=5e-4)
+    rounding = (x1 - x0) * (y1 - y0) - hole.area
+    assert 0.8 * (4.0 - np.pi) * 0.003**2 < rounding < 3.0 * (4.0 - np.pi) * 0.003**2
+
+
+def struts(x, y):
+    """Flanges of 15 mm whose inner sides wave by 1 mm, and slanted struts of constant width."""
+    wave = 0.001 * np.sin(40.0 * x)
+    slanted = np.abs((x - 0.125) % 0.25 - 0.125 - y) < 0.012
+    return (np.abs(y) > 0.015 + wave) | slanted
+
+
+def test_simplified_parts_have_straight_flanges_and_parallel_struts(design):
+    domain = design(struts, "arms.0.cells=[400,24]")
+    splines, simple = (
+        make_part(domain, Curves(0.002, 5e-4, simplify=simplify)) for simplify in (False, True)
+    )
+    assert simple.shape.area == pytest.approx(domain.volume, rel=1e-8)
+    assert simple.shape.is_simple(1e-6) and not simple.tight
+    assert (corners_of(simple)[[not p.free for p in simple.shape.pieces]] > -1e-6).all()
+    assert simple.shape.concave_radius >= 0.002
+    assert len(simple.shape.loops) == len(splines.shape.loops)
+    lines = [p.curve for p in simple.shape.pieces if p.free and isinstance(p.curve, Line)]
+    steep = [np.subtract(c.end, c.start) for c in lines]
+    steep = [d / np.linalg.norm(d) for d in steep if abs(d[1]) > 0.008]
+    assert len(steep) >= 4
+    for d in steep:  # each has another one, in the opposite direction
+        assert min(np.linalg.norm(d + other) for other in steep) < 1e-3
+
+
+def square(side, notch=None):
+    """Return a square about the origin as a shape, a sharp hole in it."""
+
+    def loop(half, sense):
+        corners = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]][::sense], dtype=float)
+        return tuple(Piece(Line(corners[k - 1], corners[k]), free=True) for k in range(4))
+
+    return Shape((loop(0.5 * side, 1), loop(0.5 * notch, -1)) if notch else (loop(0.5 * side, 1),))
+
+
+def test_places_that_the_tool_does_not_reach_are_told():
+    found = tight_places(square(0.1, 0.04), 0.003, 1e-4)
+    assert len(found) == 4
+    for one in found:
+        assert np.abs(one.place) == pytest.approx([0.02, 0.02], abs=2e-3)
+        assert one.radius < 1e-4  # but for what a tenth of the tolerance hides
+    assert square(0.1, 0.04).concave_radius == 0.0
+    assert not tight_places(square(0.1), 0.003, 1e-4)
+    assert deepest_left(square(0.1, 0.04), 0.003, SIZE)[1] == 4
+
+
+def outline(*corners):
+    corners = np.array(corners, dtype=float)
+    return Shape((tuple(Piece(Line(corners[k - 1], corners[k]), free=True)
+                        for k in range(len(corners))),))  # fmt: skip
+
+
+def test_the_thinnest_member_is_a_neck_or_a_dead_end():
+    dumbbell = [(0, -0.02), (0.06, -0.02), (0.06, -0.003), (0.1, -0.003), (0.1, -0.02),
+                (0.16, -0.02), (0.16, 0.02), (0.1, 0.02), (0.1, 0.003), (0.06, 0.003),
+                (0.06, 0.02), (0, 0.02)]  # fmt: skip
+    assert thinnest_member(outline(*dumbbell), 0.005) == pytest.approx(0.006, rel=0.02)
+    tail = [(0, -0.02), (0.06, -0.02), (0.06, -0.002), (0.09, -0.002), (0.09, 0.002),
+            (0.06, 0.002), (0.06, 0.02), (0, 0.02)]  # fmt: skip
+    assert thinnest_member(outline(*tail), 0.005) == pytest.approx(0.004, rel=0.02)
+    assert thinnest_member(outline((0, 0), (0.1, 0), (0.1, 0.04), (0, 0.04)), 0.005) is None
