@@ -23,7 +23,17 @@ from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.plane.curves import DEGREE, KINK, MIRROR, Line, Piece, Shape, Spline, direction
+from dolfinopt.part.plane.curves import (
+    DEGREE,
+    KINK,
+    MIRROR,
+    Arc,
+    Line,
+    Piece,
+    Shape,
+    Spline,
+    direction,
+)
 from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
 from dolfinopt.part.plane.part import PlanePart
 
@@ -495,7 +505,7 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
     loops: list[tuple[Piece | int, ...]] = []
     runs: list[Run] = []
     fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]
-    for loop in fixed:
+    for loop in map(_with_fillets, fixed):
         found: list[Piece | int] = []
         line = np.empty((0, 2))
         first = next(k for k, piece in enumerate(loop) if not piece.free)
@@ -527,6 +537,17 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
             break
         made = made.widened()
     return made
+
+
+def _with_fillets(loop: tuple[Piece, ...]) -> tuple[Piece, ...]:
+    """Return a loop whose arcs of the tool beside pieces that stay, stay with them."""
+    around = zip(loop, (loop[-1], *loop[:-1]), (*loop[1:], loop[0]), strict=True)
+    return tuple(
+        replace(piece, free=False)
+        if isinstance(piece.curve, Arc) and not (before.free and after.free)
+        else piece
+        for piece, before, after in around
+    )
 
 
 def _free_rings(shape: Shape, tool: float, chord: float, fixed: int) -> list[np.ndarray]:
