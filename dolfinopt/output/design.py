@@ -110,7 +110,7 @@ def arms_with_design(
     arms = build_arms(scene, partition, profile)
     if design is not None:
         return partition, arms, read_design(design, partition, arms)
-    return partition, arms, uniform_design(scene, partition, arms, scene.design.initial)
+    return partition, arms, uniform_design(scene, partition, arms)
 
 
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
