@@ -42,7 +42,7 @@ class Hull:
 
     def points(self, thickness: np.ndarray | float) -> np.ndarray:
         """Return outer and then inner nodes (2 s r, 3), given the thickness (s, r), m."""
-        inner = self.outer + np.reshape(thickness, np.shape(thickness) + (1,)) * self.inward
+        inner = self.outer + np.reshape(thickness, (*np.shape(thickness), 1)) * self.inward
         return np.concatenate([self.outer.reshape(-1, 3), inner.reshape(-1, 3)])
 
     def member(self, thickness: float) -> Member:
