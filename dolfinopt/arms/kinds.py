@@ -33,6 +33,9 @@ class Kind(Protocol):
     def at(self, x_phys: np.ndarray) -> tuple[Interpolated, ElasticArm]:
         """Return the cells' relative stiffness and mass, and the arm (collective on the arm)."""
 
+    def points(self, x_phys: np.ndarray) -> np.ndarray:
+        """Return the places (n_nodes, d) of the elements' nodes, m (collective on the arm)."""
+
     def share(self, x_phys: np.ndarray) -> np.ndarray:
         """Return how much of every cell is solid, in [0, 1]."""
 
@@ -59,6 +62,10 @@ class Densities:
         law = self._law
         material = interpolate(x_phys, law.law, law.penalty, law.floor)
         return material, _elastic(self._substructure, self._solid, material)
+
+    def points(self, x_phys: np.ndarray) -> np.ndarray:
+        """Return where they always are, see `Kind`."""
+        return self._substructure.operators.points
 
     def share(self, x_phys: np.ndarray) -> np.ndarray:
         """Return x_phys, see `Kind`."""
@@ -99,6 +106,10 @@ class WallThickness:
         all_of_it, none = np.ones(len(x_phys)), np.zeros(len(x_phys))
         material = Interpolated(all_of_it, none, all_of_it, none)
         return material, _elastic(moved, self._solid, material)
+
+    def points(self, x_phys: np.ndarray) -> np.ndarray:
+        """Return where the wall's thickness puts them, see `Kind`."""
+        return self.wall.points(self._substructure.mesh.comm, x_phys)[self._order]
 
     def share(self, x_phys: np.ndarray) -> np.ndarray:
         """Return ones, see `Kind`."""

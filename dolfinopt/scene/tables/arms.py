@@ -531,6 +531,13 @@ class Arm(Table):
         least = 0.5 * self.wall if self.min_wall is None else self.min_wall
         return least, 2.0 * self.wall if self.max_wall is None else self.max_wall
 
+    def wall_at(self, x: Any) -> Any:
+        """Return the thickness of a hollow arm's wall for x in [0, 1], m; None of another arm."""
+        if not self.hollow:
+            return None
+        least, most = self.wall_limits
+        return least + (most - least) * x
+
     @property
     def cells_around(self) -> int:
         """Count the cells round the section of a box of cells: 2 (ny + nz)."""
