@@ -196,7 +196,8 @@ def solid_design_figure(
     figure, panels = _box_axes([_bounds(view) for view in views], title, foot)
     marks = scale_marks(thickest)
     for view, axes in zip(views, panels, strict=True):
-        surface, look = material(view), {}
+        surface = material(view)
+        look: dict[str, Any] = {}
         if view.wall is not None:
             wall = MILLI * view.wall[surface.cells]
             look = {"scalars": wall, "cmap": WALL_COLOURS, "clim": (0.0, marks[-1])}
