@@ -45,8 +45,8 @@ class Hull:
         inner = self.outer + np.reshape(thickness, (*np.shape(thickness), 1)) * self.inward
         return np.concatenate([self.outer.reshape(-1, 3), inner.reshape(-1, 3)])
 
-    def member(self, thickness: float) -> Member:
-        """Return the mesh of a wall of uniform thickness, m."""
+    def member(self, thickness: np.ndarray | float) -> Member:
+        """Return the mesh of a wall of this thickness, one or (s, r), m."""
         along, around = self.shape
         count = (along + 1) * around
         k = np.arange(around)

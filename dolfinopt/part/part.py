@@ -238,7 +238,11 @@ def _made(
     design: tuple[np.ndarray, np.ndarray | None],
     curves: Curves,
 ) -> Part:
-    """Return the part of an arm: a surface in space, an outline in the plane."""
+    """Return the part of an arm: a surface in space or a wall, an outline in the plane."""
+    if mesh.wall is not None:
+        from dolfinopt.part.hollow import make_hollow_part
+
+        return make_hollow_part(mesh, design[0], curves)
     if scene.arms[index].is_solid:
         from dolfinopt.part.solid.domain import domain_in_scene
         from dolfinopt.part.solid.part import make_solid_part

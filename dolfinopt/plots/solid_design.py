@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from dolfinopt.part.hollow import HollowPart
     from dolfinopt.part.solid.part import SolidPart
 
 WALL_COLOURS = "viridis_r"
@@ -272,7 +273,9 @@ def solid_stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     return figure
 
 
-def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[float]) -> Figure:
+def solid_parts_figure(
+    parts: Sequence[SolidPart | HollowPart], title: str, masses: Sequence[float]
+) -> Figure:
     """Return the picture of parts below each other, to one scale.
 
     Args:
@@ -286,8 +289,7 @@ def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[
         _draw_boxed(axes, box, part.surface, edges=False)
         words = [_size_of(part.name, box), f"volume {1e6 * part.volume:.4g} cm3"]
         words += [f"mass {mass:.4g} kg"]
-        widths = {"thinnest member": part.widths.member, "narrowest gap": part.widths.gap}
-        words += [f"{name} {MILLI * w:.2g} mm" for name, w in widths.items() if w is not None]
+        words += part.width_words
         axes.set_title(", ".join(words), loc="left", fontsize=10, parse_math=False)
     return figure
 

@@ -109,6 +109,11 @@ class Scene(Table):
         """Indices of the arms with design variables of their own."""
         return tuple(i for i, arm in enumerate(self.arms) if arm.designed)
 
+    @property
+    def has_walls(self) -> bool:
+        """Whether arms with a design are hollow."""
+        return any(self.arms[k].hollow for k in self.designed)
+
     def initial(self, index: int) -> float:
         """Return the initial design variable of every cell of arm `index`."""
         arm = self.arms[index]
