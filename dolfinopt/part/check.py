@@ -146,8 +146,8 @@ def _simulated(
 def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
     """Return the columns of the densities and of the crisp design.
 
-    None of hollow arms, and of a crisp design whose solid cells do not join the interfaces, or that is so weak that
-    its simulation takes `PATIENCE` times the work of the densities'.
+    None of hollow arms, and of a crisp design whose solid cells do not join the interfaces, or
+    that is so weak that its simulation takes `PATIENCE` times the work of the densities'.
     """
     from dolfinopt.output.design import read_design
 

@@ -458,7 +458,7 @@ class Arm(Table):
         if not self.hollow:
             for key in WALL_KEYS:
                 if getattr(self, key) is not None:
-                    raise Refusal("expected only with hollow = true", (key,), ("hollow",))
+                    raise Refusal("expected only with hollow = true", (key,))
             return self
         if not self.flexible:
             return self
@@ -467,7 +467,7 @@ class Arm(Table):
                 "expected false without cells = [nx, ny, nz]: the hull of a hollow arm is a box "
                 "or a tube",
                 ("hollow",),
-                ("mesh",) if self.mesh is not None else ("cells",),
+                *((("mesh",),) if self.mesh is not None else ()),
             )
         if self.wall is None:
             raise Refusal(
