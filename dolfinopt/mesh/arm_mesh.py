@@ -456,9 +456,9 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
 
     Its ends over `arms.solid_ends` are flanges, rings that stay as thick as that.
     """
-    with together(comm):
-        hull, limits = _hull(arm), arm.wall_limits
+    limits = arm.wall_limits
     with gmsh_on_root(comm) as gmsh:
+        hull = on_root(comm, _hull, gmsh, arm)
         with together(comm):
             if comm.rank == 0:
                 add_cells(gmsh.model, hull.member(limits[1]))
@@ -468,13 +468,17 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         wall = wall_of(hull, limits, mesh.mesh.geometry.x, mesh.centroid)
         # As exact as the hull: the ends' faces stay where they are whatever the thickness.
         mesh.mesh.geometry.x[:] = hull.points(limits[1])[wall.nodes]
-        x = mesh.centroid[:, 0]
-        ends = np.minimum(x, arm.length - x) < arm.solid_ends
+        x, ends = mesh.centroid[:, 0], hull.outer[[0, -1], 0, 0]
+        ends = np.minimum(x - ends[0], ends[1] - x) < arm.solid_ends
         return replace(mesh, wall=wall, passive=ends)
 
 
-def _hull(arm: scenes.Arm) -> Hull:
-    """Return the outer surface of a hollow arm."""
+def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:
+    """Return the outer surface of a hollow arm (on the root)."""
+    if arm.hull is not None:
+        from dolfinopt.mesh.hull_file import read_hull
+
+        return read_hull(gmsh, arm)
     assert arm.cells is not None and len(arm.cells) == 3
     size = arm.length, arm.height, arm.thickness
     if arm.section == "tube":

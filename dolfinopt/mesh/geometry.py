@@ -429,6 +429,28 @@ def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
         return _checked(gmsh, groups, arm)
 
 
+def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Read the solid of a .msh file, of whatever cells.
+
+    Returns:
+        Points by their tags (n, 3), m; cells (m, c) in Gmsh's order; points (k, 3) of the inboard
+        and of the outboard interface.
+
+    Raises:
+        InputError: one line that names file, arm and remedy.
+    """
+    with _telling_where(_where(arm)):
+        groups = _read_groups(gmsh, arm)
+        tags, places, _ = gmsh.model.mesh.getNodes()
+        points = np.zeros((int(tags.max()) + 1, 3))
+        points[tags.astype(int)] = places.reshape(-1, 3)
+        cells = _elements(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
+        ends = [points[np.unique(_elements(gmsh, 2, groups[tag]))] for tag in ENDS]
+        for name, at, x in zip(("inboard", "outboard"), ends, (0.0, arm.length), strict=True):
+            _check_place(at, name, x, arm)
+    return points, cells, ends
+
+
 def _mesh(gmsh: Any, arm: Arm) -> None:
     """Mesh the volumes: tetrahedra, or hexahedra by cutting each into four."""
     size = arm.cell_size

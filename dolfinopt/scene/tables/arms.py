@@ -200,7 +200,7 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 SectionName = Literal["box", "tube"]
 WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
-WALL_KEYS = ("section", "wall", "min_wall", "max_wall")
+WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall")
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
@@ -310,6 +310,11 @@ class Arm(Table):
         default=None,
         description='section of a hollow arm; default: "box"; "tube" is round, height = thickness '
         "[-]",
+    )
+    hull: FileName | None = Field(
+        default=None,
+        description="mesh file (.msh) of a solid whose outer surface a hollow arm has in place of "
+        "a section; seen from the arm's axis it lies nowhere one behind the other [-]",
     )
     wall: WallThickness | None = Field(
         default=None, description="initial thickness of the wall of a hollow arm [m]"
@@ -496,6 +501,11 @@ class Arm(Table):
     def _check_wall(self) -> None:
         """Refuse limits of the wall that leave no room or no hollow."""
         least, most = self.wall_limits
+        if self.hull is not None:
+            if self.section is not None:
+                raise Refusal("expected none with hull", ("section",), ("hull",))
+            if Path(self.hull).suffix.lower() != ".msh":
+                raise Refusal("expected a file that ends in .msh", ("hull",))
         if self.section == "tube" and self.height != self.thickness:
             raise Refusal(
                 f'expected thickness = {self.thickness} [m], the diameter, with section = "tube"',
