@@ -8,8 +8,9 @@ from solids import solid_arm
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes, check_cells
-from dolfinopt.mesh.geometry import TENSOR
+from dolfinopt.mesh.geometry import TENSOR, msh_bytes
 from dolfinopt.mesh.hollow import Wall, box_hull, hull_of, stations, tube_hull
+from dolfinopt.mesh.sections import Member
 
 SIZE, CELLS, WALL = (0.5, 0.08, 0.06), (6, 4, 3), 0.004  # m
 ROUND = (0.5, 0.06, 0.06)
@@ -104,3 +105,52 @@ def test_no_plane_arm_is_hollow():
     """It has no inside."""
     with refused("hollow", "cells = [nx, ny, nz]"):
         do.load_scene(ROOT / "demos" / "two_arm.toml", ("arms.hollow=true", "arms.wall=0.002"))
+
+
+# -- hulls from a file ---------------------------------------------------------------------------
+
+
+def taper(cells: tuple[int, int, int] = (6, 4, 4)) -> Member:
+    """Return a solid whose section shrinks along it from 60 x 40 mm to half of both."""
+    counts = np.array(cells) + 1
+    grid = np.indices(counts).reshape(3, -1).T / (counts - 1.0)
+    x, y, z = grid.T
+    points = np.column_stack([0.5 * x, *((1.0 - 0.5 * x) * (np.array([[0.06], [0.04]])
+                              * (np.array([y, z]) - 0.5)))])  # fmt: skip
+    number = np.arange(len(grid)).reshape(counts)
+    a = number[:-1, :-1, :-1], number[:-1, 1:, :-1], number[:-1, 1:, 1:], number[:-1, :-1, 1:]
+    b = number[1:, :-1, :-1], number[1:, 1:, :-1], number[1:, 1:, 1:], number[1:, :-1, 1:]
+    hexahedra = np.stack([one.ravel() for one in (*a, *b)], axis=1)
+    first = np.stack([one[0].ravel() for one in a], axis=1)
+    last = np.stack([one[-1].ravel() for one in b], axis=1)
+    return Member(points, hexahedra, first[:, ::-1], last)
+
+
+def hull_arm(tmp_path, mesh: Member, **keys):
+    """Return the arm whose hull is a mesh's."""
+    path = tmp_path / "hull.msh"
+    path.write_bytes(msh_bytes(mesh))
+    size = {"height": 0.06, "thickness": 0.04, "cells": (10, 4, 4)}
+    told = {"hollow": True, "hull": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
+    return solid_arm(MPI.COMM_SELF, **(size | told | keys))
+
+
+@pytest.mark.serial
+def test_hull_of_a_file_lies_on_its_surface(tmp_path):
+    """Every point on a side of the taper, and the wall as thick as it should be there."""
+    arm = hull_arm(tmp_path, taper())
+    outer = arm.mesh.wall.hull.outer
+    half = (1.0 - outer[:, :, 0]) * 0.5 * np.array([[[0.06]], [[0.04]]])
+    apart = np.abs(outer[:, :, 1:].transpose(2, 0, 1)) / half
+    assert apart.max(axis=0) == pytest.approx(np.ones(apart.shape[1:]), abs=1e-5)
+    assert outer[[0, -1], 0, 0] == pytest.approx([0.0, 0.5])
+
+
+@pytest.mark.serial
+def test_hulls_that_are_refused(tmp_path):
+    """A surface behind another one, and a wall that would cross itself."""
+    behind = box_hull((0.5, 0.06, 0.04), (6, 4, 4), 0.005).member(0.005)
+    with refused("hull.msh", "2 times", "star-shaped", "section"):
+        hull_arm(tmp_path, behind)
+    with refused("arms.max_wall = 0.015", "crosses itself", "thinner"):
+        hull_arm(tmp_path, taper(), max_wall=0.015)
