@@ -6,7 +6,9 @@ section of the hull is a polygon. A wall of thickness t has its inner nodes at
     X_inner = X_outer + t d,
 
 with a fixed direction d of every point in the plane of its section, such that t is the distance of
-the two surfaces: at the corners of a box d is the mitre.
+the two surfaces: at the corners of a box d is the mitre. Nodes beside a box's corners slide along
+the outer surface with the thickness at the corner, so that the cells there are as short as the
+wall is thick: the flow of shear turns in them, and cells of constant shear resist that.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from dolfinopt.mesh.measured import CORNER_CELL_RATIO, SECTION_END_CELLS
+from dolfinopt.mesh.measured import CORNER_CELL_RATIO, SECTION_END_CELLS, SHORT_CELL_SHARE
 from dolfinopt.mesh.sections import Member
 
 
@@ -30,10 +32,15 @@ class Hull:
         outer: (s, r, 3) points in the arm's frame, x the same at a station, m; round the axis from
             y towards z.
         inward: (s, r, 3) d, the inner node's displacement by the wall's thickness; no x component.
+        slide: (s, r, 3) displacement of both nodes by the thickness at another point of the same
+            section, along the surface; 0 of most.
+        lead: (r,) that point.
     """
 
     outer: np.ndarray
     inward: np.ndarray
+    slide: np.ndarray
+    lead: np.ndarray
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -41,9 +48,17 @@ class Hull:
         return self.outer.shape[0] - 1, self.outer.shape[1]
 
     def points(self, thickness: np.ndarray | float) -> np.ndarray:
-        """Return outer and then inner nodes (2 s r, 3), given the thickness (s, r), m."""
-        inner = self.outer + np.reshape(thickness, (*np.shape(thickness), 1)) * self.inward
-        return np.concatenate([self.outer.reshape(-1, 3), inner.reshape(-1, 3)])
+        """Return outer and then inner nodes (2 s r, 3), given the thickness, one or (s, r), m."""
+        t = np.broadcast_to(thickness, self.outer.shape[:2])[:, :, None]
+        outer = self.outer + t[:, self.lead] * self.slide
+        return np.concatenate([outer, outer + t * self.inward]).reshape(-1, 3)
+
+    def by_thickness(self, by_points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (s, r) by the thickness, given those by `points` (2 s r, 3)."""
+        outer, inner = by_points.reshape(2, *self.outer.shape)
+        found = (inner * self.inward).sum(axis=2)
+        np.add.at(found.T, self.lead, ((outer + inner) * self.slide).sum(axis=2).T)
+        return np.asarray(found)
 
     def member(self, thickness: np.ndarray | float) -> Member:
         """Return the mesh of a wall of this thickness, one or (s, r), m."""
@@ -73,7 +88,12 @@ def hull_of(outer: np.ndarray) -> Hull:
     slope = (np.gradient(section, outer[:, 0, 0], axis=0) * mitre).sum(axis=2)
     slope /= (mitre * mitre).sum(axis=2)
     mitre *= np.sqrt(1.0 + slope * slope)[:, :, None]
-    return Hull(outer, np.concatenate([np.zeros((*slope.shape, 1)), mitre], axis=2))
+    return _still(outer, np.concatenate([np.zeros((*slope.shape, 1)), mitre], axis=2))
+
+
+def _still(outer: np.ndarray, inward: np.ndarray) -> Hull:
+    """Return a hull whose outer nodes stay where they are."""
+    return Hull(outer, inward, np.zeros_like(outer), np.arange(outer.shape[1]))
 
 
 def stations(length: float, along: int) -> np.ndarray:
@@ -92,24 +112,35 @@ def box_hull(
     """Return the hull of a box of length, height (y) and thickness (z), m, with so many cells."""
     length, height, thickness = size
     along, ny, nz = cells
-    y, z = _side(height, ny, largest_wall), _side(thickness, nz, largest_wall)
+    short = CORNER_CELL_RATIO * largest_wall
+    y, z = _side(height, ny, short), _side(thickness, nz, short)
     half = np.concatenate(
         [
             np.column_stack([y, np.full(len(y), 0.5 * thickness)]),
             np.column_stack([np.full(len(z), -0.5 * height), z]),
         ]
     )
-    return hull_of(_prism(stations(length, along), np.concatenate([half, -half])))
+    hull = hull_of(_prism(stations(length, along), np.concatenate([half, -half])))
+    corners = np.cumsum([0, len(y), len(z), len(y)])
+    sides = (height / ny, thickness / nz) * 2
+    for k, corner in enumerate(corners):
+        # After the corner begins one side, before it ends another.
+        for at, side in ((corner + 1, sides[k]), (corner - 1, sides[k - 1])):
+            if _has_short(side, short):
+                hull.slide[:, at] = (hull.outer[:, at] - hull.outer[:, corner]) / largest_wall
+                hull.outer[:, at], hull.lead[at] = hull.outer[:, corner], corner
+    return hull
 
 
-def _side(size: float, count: int, largest_wall: float) -> np.ndarray:
-    """Return the places along a side of a box but the last, m, with short cells at both corners.
+def _has_short(side: float, short: float) -> bool:
+    """Return whether cells of this side, m, are long enough for short ones at the corners."""
+    return SHORT_CELL_SHARE * side > short
 
-    There the flow of shear turns, and a mitred cell of constant shear resists it all along itself.
-    """
+
+def _side(size: float, count: int, short: float) -> np.ndarray:
+    """Return the places along a side of a box but the last, m, with short cells at both corners."""
     places = size * np.linspace(0.5, -0.5, count + 1)
-    short = CORNER_CELL_RATIO * largest_wall
-    if 2.0 * short < size / count:
+    if _has_short(size / count, short):
         places = np.insert(places, [1, count], [0.5 * size - short, short - 0.5 * size])
     return places[:-1]
 
@@ -127,7 +158,7 @@ def tube_hull(size: tuple[float, float, float], cells: tuple[int, int, int]) -> 
     turns = angle * np.arange(around)
     circle = scale * np.column_stack([np.cos(turns), np.sin(turns)])
     outer = _prism(stations(length, along), 0.5 * diameter * circle)
-    return Hull(outer, -_prism(np.zeros(len(outer)), circle))
+    return _still(outer, -_prism(np.zeros(len(outer)), circle))
 
 
 def _prism(x: np.ndarray, section: np.ndarray) -> np.ndarray:
@@ -177,12 +208,9 @@ class Wall:
     def backward(self, by_points: np.ndarray) -> np.ndarray:
         """Return the derivative by x (n_cells,), given that by this rank's nodes (n, 3)."""
         along, around = self.hull.shape
-        inner = self.nodes - (along + 1) * around
-        here = inner >= 0
-        inner = inner[here]
-        by_thickness = np.zeros((along + 1) * around)
-        by_thickness[inner] = (by_points[here] * self.hull.inward.reshape(-1, 3)[inner]).sum(axis=1)
-        share = by_thickness.reshape(-1, around) / self._around
+        whole = np.zeros((2 * (along + 1) * around, 3))
+        whole[self.nodes] = by_points
+        share = self.hull.by_thickness(whole) / self._around
         rows = share[:-1] + share[1:]
         rows = rows + np.roll(rows, -1, axis=1)
         return (self.most - self.least) * rows.ravel()[self.cells]

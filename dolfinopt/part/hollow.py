@@ -156,8 +156,10 @@ class HollowPart:
         """Return hexahedra: the design's, or a quarter of each, see `part.Part`."""
         hull, thickness = self.hull, self.thickness
         if coarser < self.COARSER:
-            outer, inward = _halved(hull.outer), _halved(thickness[:, :, None] * hull.inward)
-            hull, thickness = Hull(outer, inward), np.ones(outer.shape[:2])
+            grid = hull.points(thickness).reshape(2, *hull.outer.shape)
+            outer, inner = map(_halved, grid)
+            still = np.zeros_like(outer), np.arange(outer.shape[1])
+            hull, thickness = Hull(outer, inner - outer, *still), np.ones(outer.shape[:2])
         found = hull.member(thickness)
         return WallMesh(found.points, found.cells, found.inboard, found.outboard)
 

@@ -26,7 +26,7 @@ def flexibility(section: str, size: tuple[float, float, float], cells) -> np.nda
     t = min(height, thickness) / 40.0
     arm = solid_arm(
         SELF, length=length, height=height, thickness=thickness, cells=cells, hollow=True,
-        section=section, wall=t, min_wall=0.5 * t, max_wall=t, passive=0.0,
+        section=section, wall=t, min_wall=0.5 * t, max_wall=4.0 * t, passive=0.0,
     )  # fmt: skip
     found = static_response(arm.state(arm.uniform()).elastic, LOADS).tip
     return found[[1, 2, 0, 3], range(4)]
