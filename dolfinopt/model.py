@@ -501,7 +501,7 @@ class Model:
             self._built = partition, arms
         return self._built
 
-    def _uniform(self, density: float) -> dict[int, np.ndarray]:
+    def _uniform(self, density: float | None = None) -> dict[int, np.ndarray]:
         partition, arms = self._arms()
         return uniform_design(self.scene, partition, arms, density)
 
@@ -512,7 +512,7 @@ class Model:
         for arm in arms.values():
             arm.forget_modes()
         if x is None:
-            return partition, arms, self._uniform(self.scene.design.initial)
+            return partition, arms, self._uniform()
         if isinstance(x, SimulationResult):
             x = x.design
         if isinstance(x, (str, os.PathLike)):

@@ -13,10 +13,11 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState, InitialVectors, options, same_basis
+from dolfinopt.arms.kinds import kind_of
 from dolfinopt.arms.vibration import Carried, LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import AxisSymmetry, Extrusion, HelmholtzFilter
-from dolfinopt.density.interpolation import Interpolated, interpolate
+from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
@@ -85,6 +86,7 @@ class Arm:
         solid: the arm's solid material.
         averages: over cells whose design is the same, applied before the filter.
         substructure: finite elements whatever the design.
+        kind: what physical designs are: densities, or the thickness of a wall.
         coordinates: number q of the basis; None until `set_order`, where the scene says "auto".
         stiffening: whether its bodies have geometric stiffness; None until `set_stiffening`.
         initial: eigenvectors from which the next design's searches set out.
@@ -114,6 +116,7 @@ class Arm:
             radius = scene.filter_radius(index) if pattern is None else 0.0
             # A member along an edge would be half as thin if the filter mirrored it there.
             self.filter = HelmholtzFilter(self.mesh, radius, scene.design.controls_widths)
+        self.kind = kind_of(self.substructure, self.solid, scene.interpolation)
         self.coordinates = scene.reduction.count or None
         # Of a mesh file known only now.
         if self.coordinates is not None and self.coordinates > self.substructure.T.num_dofs:
@@ -167,9 +170,13 @@ class Arm:
         x_phys = self.mesh.keep(np.clip(x_filtered, 0.0, 1.0))
         return PhysicalDesign(x_phys, None, clipped)
 
-    def uniform(self, density: float) -> np.ndarray:
-        """Return the physical densities of the same design variable in every cell."""
-        return self.physical(np.full(self.mesh.num_cells, density))
+    def uniform(self, density: float | None = None) -> np.ndarray:
+        """Return the physical densities of the same design variable in every cell.
+
+        That of the initial design where none is given.
+        """
+        x = self.scene.initial(self.places[0]) if density is None else density
+        return self.physical(np.full(self.mesh.num_cells, x))
 
     def physical_designs(
         self, x: np.ndarray, beta: float, threshold: float
@@ -240,19 +247,16 @@ class Arm:
         known = last is not None and np.array_equal(x_phys, last.x_phys)
         if self.mesh.comm.allreduce(known, op=MPI.LAND):
             return self.current
-        law = self.scene.interpolation
         with together(self.mesh.comm):
             if reason := self.refusal(x_phys):
                 raise InputError(reason)
-            material = interpolate(x_phys, law.law, law.penalty, law.floor)
-        elastic = self.substructure.at(
-            self.solid.young_modulus * material.stiffness, self.solid.density * material.mass
-        )
+        material, elastic = self.kind.at(x_phys)
         self._state = DesignState(
             x_phys,
             material,
             elastic,
             self.solid,
+            self.kind,
             self.scene,
             self.coordinates,
             self.initial,
@@ -414,14 +418,15 @@ class Arm:
         return options(self.scene, num_modes)
 
     def volume_fraction(self, x_phys: np.ndarray) -> float:
-        """Return sum x V / sum V over the whole arm (collective on the arm)."""
-        parts = np.array([self.mesh.area @ x_phys, self.mesh.area.sum()])
+        """Return the solid volume over the largest one (collective on the arm)."""
+        parts = np.array([self.mesh.area @ self.kind.filled(x_phys), self.mesh.area.sum()])
         volume, total = self.mesh.comm.allreduce(parts)
         return float(volume / total)
 
     def grayness(self, x_phys: np.ndarray) -> float:
         """Return 4 mean x (1 - x) over the arm's cells: 0 is crisp, 1 all grey; eq. (12)."""
-        parts = np.array([self.mesh.area @ (4.0 * x_phys * (1.0 - x_phys)), self.mesh.area.sum()])
+        x = self.kind.share(x_phys)
+        parts = np.array([self.mesh.area @ (4.0 * x * (1.0 - x)), self.mesh.area.sum()])
         grey, total = self.mesh.comm.allreduce(parts)
         return float(grey / total)
 
@@ -637,13 +642,13 @@ def _grid_place(arm: Arm, scene: Scene) -> np.ndarray:
 
 
 def uniform_design(
-    scene: Scene, partition: Partition, arms: Mapping[int, Arm], density: float
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], density: float | None = None
 ) -> dict[int, np.ndarray]:
     """Return the physical densities of the same design variable in all cells (collective).
 
     Args:
         scene, partition, arms: which arms there are, and this rank's.
-        density: the design variable, in [0, 1].
+        density: the design variable, in [0, 1]; None: that of every arm's initial design.
     """
     with together(partition.world):
         mine = {k: arm.uniform(density) for k, arm in arms.items() if k not in scene.patterns}

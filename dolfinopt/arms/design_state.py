@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinopt.arms.kinds import Kind
 from dolfinopt.arms.vibration import Carried, LoadedModes, full_first_frequency, loaded_modes
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
@@ -47,6 +48,7 @@ class DesignState:
         material: their interpolated stiffness and mass.
         elastic: stiffness, mass and constraint modes.
         solid: the material where x_phys is 1.
+        kind: what x_phys is.
         scene: says how to reduce, and the damping.
         num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
         stiffened: whether its body has geometric stiffness.
@@ -59,6 +61,7 @@ class DesignState:
         material: Interpolated,
         elastic: ElasticArm,
         solid: Material,
+        kind: Kind,
         scene: scenes.Scene,
         num_modes: int | None,
         initial: InitialVectors,
@@ -66,7 +69,7 @@ class DesignState:
     ):
         self.x_phys = x_phys.copy()
         self.x_phys.setflags(write=False)
-        self.material, self.elastic, self.solid = material, elastic, solid
+        self.material, self.elastic, self.solid, self.kind = material, elastic, solid, kind
         self.scene, self.num_modes, self.stiffened = scene, num_modes, stiffened
         self.kept: dict[str, Any] = {}
         self._initial = initial
@@ -78,6 +81,11 @@ class DesignState:
     def mesh(self) -> ArmMesh:
         """The arm's mesh."""
         return self.elastic.mesh
+
+    @property
+    def share(self) -> np.ndarray:
+        """How much of every cell is solid (n_cells,), in [0, 1]."""
+        return self.kind.share(self.x_phys)
 
     @property
     def young_slope(self) -> np.ndarray:
@@ -180,6 +188,7 @@ class DesignState:
             self.material,
             self.elastic,
             self.solid,
+            self.kind,
             scene,
             num_modes,
             initial,

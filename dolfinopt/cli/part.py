@@ -298,7 +298,7 @@ class Made:
             part = self.parts[owner]
             mass = scene.material_of(owner).density * part.volume
             click.echo(f"{arm.name}: {mass:.4g} kg, {part.sentence}")
-            if not part.has_curves:
+            if not part.has_curves and not scene.arms[owner].hollow:
                 rough.append(arm.name)
         if self.check is not None:
             tell(self.check)

@@ -8,6 +8,7 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -26,7 +27,7 @@ from dolfinopt.fem.assembly import (
     cells_of,
     single,
 )
-from dolfinopt.fem.elements import ElementOperators, Quadrature, quadrature
+from dolfinopt.fem.elements import ElementOperators, Quadrature, moved_operators, quadrature
 from dolfinopt.fem.interface import (
     Connectivity,
     ConstraintModes,
@@ -86,9 +87,9 @@ class Substructure:
             self._stiffness: AffineMatrix | CellMatrix
             self._mass: AffineMatrix | CellMatrix
             if dim == 3:  # where memory counts
-                pairs = NodePairs(cells, size)
-                self._stiffness = CellMatrix(pairs, self.cells.stiffness)
-                self._mass = CellMatrix(pairs, self.cells.mass)
+                self._pairs = NodePairs(cells, size)
+                self._stiffness = CellMatrix(self._pairs, self.cells.stiffness)
+                self._mass = CellMatrix(self._pairs, self.cells.mass)
             else:
                 dofs = (dim * cells[:, :, None] + np.arange(dim)).reshape(len(cells), -1)
                 self._stiffness = AffineMatrix(dofs, operators.stiffness, dim * size)
@@ -101,6 +102,28 @@ class Substructure:
         )
         self._statics_alone, self._solution = statics_alone, (tolerance, wider)
         self._last: ElasticArm | None = None
+
+    def moved(self, mesh: ArmMesh, points: np.ndarray) -> Substructure:
+        """Return a solid arm's with its nodes elsewhere (collective).
+
+        Numbering, patterns and the one solver are shared: an arm of either that asks for the
+        factor has its own from then on.
+
+        Args:
+            mesh: `ArmMesh.moved`.
+            points: (n_nodes, 3) of the elements' nodes, m.
+        """
+        other = copy(self)
+        for name, value in vars(Substructure).items():
+            if isinstance(value, cached_property):
+                other.__dict__.pop(name, None)
+        other.mesh = mesh
+        other.cells = cells_of(mesh.comm, moved_operators(self.operators, mesh, points))
+        other.operators = other.cells.operators
+        other._stiffness = CellMatrix(self._pairs, other.cells.stiffness)
+        other._mass = CellMatrix(self._pairs, other.cells.mass)
+        other.T, other._last = self.T.moved(points), None
+        return other
 
     @cached_property
     def extended(self) -> ExtendedSystem | None:

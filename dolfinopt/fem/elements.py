@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol
 
 import basix
@@ -465,26 +465,49 @@ def quadrature_operators(
         poisson_ratio: nu.
         modes: whether cells have the incompatible modes, see `IncompatibleElement`.
     """
-    degree, dim, recovery = element.degree, mesh.dim, None
+    degree, dim = element.degree, mesh.dim
     space = compat.lagrange_space(mesh.mesh, degree, components=dim)
     t = thickness if dim == 2 else 1.0
     with together(mesh.comm):
-        corners = quadrature_corners(mesh)
-        stiffness = by_cells(lambda part: _full(part, degree, poisson_ratio, modes), corners)
-        if modes:
-            recovery = by_cells(_recovery, stiffness)
-            stiffness = by_cells(_condensed, stiffness, recovery)
+        stiffness, mass, recovery = _matrices(mesh, degree, poisson_ratio, modes)
         return ElementOperators(
             space=space,
             cells=compat.cell_nodes(space, mesh.num_cells),
             points=space.tabulate_dof_coordinates()[:, :dim].copy(),
             stiffness=by_cells(lambda k: t * k, stiffness),
-            mass=by_cells(lambda part: t * _mass(part, degree), corners),
+            mass=by_cells(lambda m: t * m, mass),
             element=element,
             thickness=t,
             poisson_ratio=poisson_ratio,
             recovery=recovery,
         )
+
+
+def moved_operators(
+    operators: ElementOperators, mesh: ArmMesh, points: np.ndarray
+) -> ElementOperators:
+    """Return the matrices of the same elements of a solid arm with their corners elsewhere.
+
+    Args:
+        operators: of the mesh before.
+        mesh: `ArmMesh.moved`.
+        points: (n_nodes, 3) of the elements' nodes, m.
+    """
+    modes, degree = operators.recovery is not None, operators.element.degree
+    stiffness, mass, recovery = _matrices(mesh, degree, operators.poisson_ratio, modes)
+    return replace(operators, points=points, stiffness=stiffness, mass=mass, recovery=recovery)
+
+
+def _matrices(
+    mesh: ArmMesh, degree: int, poisson_ratio: float, modes: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return k_e, m_e of unit thickness and the modes' recovery, see `quadrature_operators`."""
+    corners, recovery = quadrature_corners(mesh), None
+    stiffness = by_cells(lambda part: _full(part, degree, poisson_ratio, modes), corners)
+    if modes:
+        recovery = by_cells(_recovery, stiffness)
+        stiffness = by_cells(_condensed, stiffness, recovery)
+    return stiffness, by_cells(lambda part: _mass(part, degree), corners), recovery
 
 
 def nodal_gradients(corners: np.ndarray, degree: int, points: np.ndarray) -> np.ndarray:

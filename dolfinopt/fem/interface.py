@@ -6,6 +6,7 @@ There are b = 3 outboard coordinates in the plane, in space 6 of every outboard 
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -84,6 +85,15 @@ class InterfaceTransformation:
             self._add_further(mesh)
         self.num_coordinates = self.rigid.shape[2]
         self._number_interior(graph)
+
+    def moved(self, points: np.ndarray) -> InterfaceTransformation:
+        """Return that of the same interfaces with the nodes at other points (n_nodes, d), m."""
+        other = copy(self)
+        other.__dict__.pop("_fit", None)
+        other.points = points
+        fields = [other._rigid_field(at, x) for at, x in zip(self.ends, self.places, strict=True)]
+        other.rigid = np.concatenate(fields, axis=2)
+        return other
 
     def _rigid_field(self, at: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Return the rigid motions (n_nodes, d, 3 or 6) about a point of the nodes `at`."""

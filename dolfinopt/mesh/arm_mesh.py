@@ -15,8 +15,9 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
-from dolfinopt.mesh.geometry import build_model
+from dolfinopt.mesh.geometry import add_cells, build_model
 from dolfinopt.mesh.gmsh_session import FURTHER, INBOARD, OUTBOARD, PASSIVE, gmsh_on_root, mesh_geo
+from dolfinopt.mesh.hollow import Hull, Wall, box_hull, tube_hull, wall_of
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
@@ -56,6 +57,7 @@ class ArmMesh:
         outboard_point: (d,) reference point of the outboard interface, m.
         notes: what is doubtful about its file, a sentence each.
         further: outboard interfaces besides that one.
+        wall: of a hollow arm, whose mesh has its largest thickness; None of others.
     """
 
     name: str
@@ -70,6 +72,17 @@ class ArmMesh:
     outboard_point: np.ndarray
     notes: tuple[str, ...] = ()
     further: tuple[InterfaceFacets, ...] = ()
+    wall: Wall | None = None
+
+    def moved(self, points: np.ndarray) -> ArmMesh:
+        """Return the mesh with its nodes at other points (n, 3), m, its interfaces where they are.
+
+        For cells' matrices and their derivatives; it makes no function spaces.
+        """
+        mesh = compat.MovedMesh(self.mesh, points)
+        corners = compat.cell_coordinates(mesh, self.num_cells)
+        middle, volume = corners.mean(axis=1), cell_volumes(corners)
+        return replace(self, mesh=mesh, centroid=middle, area=volume)
 
     @property
     def further_points(self) -> np.ndarray:
@@ -124,6 +137,8 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         compat.check_form_cache()
     like = arm if pattern is None else pattern
     scales = [like.length / arm.length, like.height / arm.height, like.thickness / arm.thickness]
+    if arm.hollow:
+        return hollow_arm(comm, arm)
     if arm.mesh is not None:
         mesh = file_arm(comm, arm)
     else:
@@ -431,3 +446,41 @@ def _problem(comm: MPI.Comm, own: np.ndarray, taken: np.ndarray, distance: np.nd
     if count == 0:
         return f"the nearest side of a cell on the arm's surface has its middle {least:.4g} m away"
     return "it has sides of cells that belong to another interface" if other else ""
+
+
+# -- hollow links: one layer of hexahedra in the wall, whose thickness is the design -------------
+
+
+def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
+    """Mesh the wall of a hollow arm, `arms.max_wall` thick (collective).
+
+    Its ends over `arms.solid_ends` are flanges, rings that stay as thick as that.
+    """
+    limits = arm.wall_limits
+    with gmsh_on_root(comm) as gmsh:
+        hull = on_root(comm, _hull, gmsh, arm)
+        with together(comm):
+            if comm.rank == 0:
+                add_cells(gmsh.model, hull.member(limits[1]))
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
+    with together(comm):
+        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+        wall = wall_of(hull, limits, mesh.mesh.geometry.x, mesh.centroid)
+        # As exact as the hull: the ends' faces stay where they are whatever the thickness.
+        mesh.mesh.geometry.x[:] = hull.points(limits[1])[wall.nodes]
+        x, ends = mesh.centroid[:, 0], hull.outer[[0, -1], 0, 0]
+        ends = np.minimum(x - ends[0], ends[1] - x) < arm.solid_ends
+        return replace(mesh, wall=wall, passive=ends)
+
+
+def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:
+    """Return the outer surface of a hollow arm (on the root)."""
+    if arm.hull is not None:
+        from dolfinopt.mesh.hull_file import read_hull
+
+        return read_hull(gmsh, arm)
+    assert arm.cells is not None and len(arm.cells) == 3
+    size = arm.length, arm.height, arm.thickness
+    if arm.section == "tube":
+        return tube_hull(size, arm.cells)
+    return box_hull(size, arm.cells, arm.wall_limits[1])

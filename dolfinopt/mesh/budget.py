@@ -81,7 +81,7 @@ def _cells_for_one(arm: Arm) -> float:
 def _least_bytes(scene: Scene, index: int) -> float:
     """Return the bytes a cell of a solid arm takes if its cells are not all alike; else 0."""
     arm = scene.arms[index]
-    if arm.mesh is None or not arm.is_solid:
+    if not arm.is_solid or (arm.mesh is None and not arm.hollow):
         return 0.0
     stiffened = scene.simulation.stiffening is not False
     element = arm.element or DEFAULT_ELEMENT[arm.shape]

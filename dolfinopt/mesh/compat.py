@@ -125,6 +125,26 @@ def cell_coordinates(mesh: Any, num_cells: int) -> np.ndarray:
     return mesh.geometry.x[cell_geometry_nodes(mesh, num_cells)]
 
 
+class MovedMesh:
+    """A mesh whose nodes lie elsewhere, and that shares all else with the one it was.
+
+    DOLFINx 0.5 cannot copy one. Function spaces are the other one's.
+    """
+
+    def __init__(self, mesh: Any, points: np.ndarray):
+        """Place the nodes at (n, 3) points, m."""
+        self.topology = mesh.topology
+        self.geometry = _MovedGeometry(mesh.geometry, points)
+
+
+class _MovedGeometry:
+    def __init__(self, geometry: Any, points: np.ndarray):
+        self._geometry, self.x = geometry, points
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._geometry, name)
+
+
 def cell_facets(mesh: Any, num_cells: int) -> np.ndarray:
     """Return the facets' local numbers (num_cells, facets a cell) of the first cells.
 

@@ -429,6 +429,28 @@ def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
         return _checked(gmsh, groups, arm)
 
 
+def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Read the solid of a .msh file, of whatever cells.
+
+    Returns:
+        Points by their tags (n, 3), m; cells (m, c) in Gmsh's order; points (k, 3) of the inboard
+        and of the outboard interface.
+
+    Raises:
+        InputError: one line that names file, arm and remedy.
+    """
+    with _telling_where(_where(arm)):
+        groups = _read_groups(gmsh, arm)
+        tags, places, _ = gmsh.model.mesh.getNodes()
+        points = np.zeros((int(tags.max()) + 1, 3))
+        points[tags.astype(int)] = places.reshape(-1, 3)
+        cells = _elements(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
+        ends = [points[np.unique(_elements(gmsh, 2, groups[tag]))] for tag in ENDS]
+        for name, at, x in zip(("inboard", "outboard"), ends, (0.0, arm.length), strict=True):
+            _check_place(at, name, x, arm)
+    return points, cells, ends
+
+
 def _mesh(gmsh: Any, arm: Arm) -> None:
     """Mesh the volumes: tetrahedra, or hexahedra by cutting each into four."""
     size = arm.cell_size
@@ -851,25 +873,29 @@ class InterfaceMesh(Protocol):
 
 def msh_bytes(mesh: InterfaceMesh) -> bytes:
     """Return the .msh file that `arms.mesh` reads back, on this process alone."""
-    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
-    cell, side = kinds[mesh.cells.shape[1]]
-    dim = mesh.points.shape[1]
-    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
     with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
-        model = gmsh.model
-        model.add("solid")
-        solid = model.addDiscreteEntity(dim)
-        model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
-        model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
-        model.addPhysicalGroup(dim, [solid], DESIGN)
-        model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
-        for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
-            face = model.addDiscreteEntity(dim - 1)
-            model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
-            model.addPhysicalGroup(dim - 1, [face], group)
-            model.setPhysicalName(dim - 1, group, NAMES[group])
+        add_cells(gmsh.model, mesh)
         gmsh.option.setNumber("Mesh.Binary", 1)
         gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
         path = Path(folder) / "solid.msh"
         gmsh.write(str(path))
         return path.read_bytes()
+
+
+def add_cells(model: Any, mesh: InterfaceMesh) -> None:
+    """Make a mesh and its interfaces a model of Gmsh."""
+    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
+    cell, side = kinds[mesh.cells.shape[1]]
+    dim = mesh.points.shape[1]
+    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
+    model.add("solid")
+    solid = model.addDiscreteEntity(dim)
+    model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
+    model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
+    model.addPhysicalGroup(dim, [solid], DESIGN)
+    model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
+    for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
+        face = model.addDiscreteEntity(dim - 1)
+        model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
+        model.addPhysicalGroup(dim - 1, [face], group)
+        model.setPhysicalName(dim - 1, group, NAMES[group])

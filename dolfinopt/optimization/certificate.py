@@ -407,7 +407,7 @@ def assess(
     vectors = {k: arm.initial_vectors for k, arm in arms.items()}
     initial = crisp = None
     if not moves:
-        uniform = uniform_design(scene, evaluator.partition, arms, scene.design.initial)
+        uniform = uniform_design(scene, evaluator.partition, arms)
         evaluator.evaluate_densities(uniform, simulated=True)
         initial = evaluator.trajectory
     if scene.design.projection:

@@ -403,8 +403,9 @@ class Iterate:
         x_phys, arms = self.nominal.x_phys, self.evaluator.arms
         meshes = {k: arm.mesh for k, arm in arms.items()}
         for k, volume in cell_volumes(self.scene, meshes).items():
-            x = x_phys[k]
-            parts[k] = np.array([volume.sum(), volume @ x, volume @ (4.0 * x * (1.0 - x))])
+            kind = arms[k].kind
+            filled, x = kind.filled(x_phys[k]), kind.share(x_phys[k])
+            parts[k] = np.array([volume.sum(), volume @ filled, volume @ (4.0 * x * (1.0 - x))])
         total, volume, grey = self.total(parts)
         self.grayness = float(grey / total)
         return HistoryRow(

@@ -165,7 +165,7 @@ class _Run:
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
         one = evaluator.variables
-        x = np.clip(np.full(one.size, self.scene.design.initial), one.xmin, one.xmax)
+        x = np.clip(one.initial, one.xmin, one.xmax)
         self.iterate = Iterate(evaluator, x)
         self.history: list[HistoryRow] = []
         self.finished: Ending = ""

@@ -39,6 +39,7 @@ class Variables:
     Attributes:
         size: n, number of this rank's variables.
         xmin, xmax: (n,) bounds; equal where a cell stays solid or void.
+        initial: (n,) of the design to begin with, whatever the bounds.
         slices: part of the vector that belongs to each arm.
         pieces: sizes of these parts by a number that is the same order on any number of ranks.
     """
@@ -55,11 +56,12 @@ class Variables:
         self.arms = arms
         self.size = int(ends[-1])
         self.xmin = np.full(self.size, scene.design.minimum)
-        self.xmax = np.ones(self.size)
+        self.xmax, self.initial = np.ones(self.size), np.empty(self.size)
         for k, part in self.slices.items():
             mesh = arms[k].mesh
             self.xmin[part] = mesh.keep(self.xmin[part])
             self.xmax[part] = mesh.keep(self.xmax[part])
+            self.initial[part] = scene.initial(k)
 
     def split(self, x: np.ndarray) -> dict[int, np.ndarray]:
         """Return each arm's part."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,7 +110,7 @@ def arms_with_design(
     arms = build_arms(scene, partition, profile)
     if design is not None:
         return partition, arms, read_design(design, partition, arms)
-    return partition, arms, uniform_design(scene, partition, arms, scene.design.initial)
+    return partition, arms, uniform_design(scene, partition, arms)
 
 
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
@@ -279,12 +279,15 @@ class _Sheet:
     # (all cells,) largest von Mises stress along the motion, Pa, or None
     stress: np.ndarray | None = None
     dimension: int = 2  # of the cells, 2 or 3
+    # (all cells,) thickness of the wall where arms are hollow, m, or None
+    wall: np.ndarray | None = None
 
     @property
     def fields(self) -> dict[str, np.ndarray]:
         """What every cell has, by name."""
         found = {"density": self.density, "arm": self.arm}
-        return found if self.stress is None else found | {"stress": self.stress}
+        more = {"stress": self.stress, "wall": self.wall}
+        return found | {name: values for name, values in more.items() if values is not None}
 
 
 def _sheet(views: Sequence[ArmView]) -> _Sheet:
@@ -300,10 +303,16 @@ def _sheet(views: Sequence[ArmView]) -> _Sheet:
             offset -= 2.0 * np.ptp(own[:, 1])
             count += len(own)
     density = np.concatenate([view.density for view in designed(views)])
-    stresses = [view.stress for view in designed(views) if view.stress is not None]
-    whole = np.concatenate(stresses) if len(stresses) == len(cells) else None
+
+    def whole(parts: Iterator[np.ndarray | None]) -> np.ndarray | None:
+        known = [part for part in parts if part is not None]
+        return np.concatenate(known) if len(known) == len(cells) else None
+
+    stress = whole(view.stress for view in designed(views))
+    wall = whole(view.wall for view in designed(views))
     dimension = designed(views)[0].corners.shape[2]
-    return _Sheet(np.vstack(points), cells, density, np.concatenate(arm), whole, dimension)
+    arms = np.concatenate(arm)
+    return _Sheet(np.vstack(points), cells, density, arms, stress, dimension, wall)
 
 
 def _write_vtu(path: Path, sheet: _Sheet) -> None:

@@ -440,7 +440,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         scene.arms[index].cell_size or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
-        arm.contacts(x_phys > 0.5),
+        arm.contacts(arm.kind.share(x_phys) > 0.5),
     )
 
 

@@ -49,6 +49,8 @@ class ArmView:
         stress: (n_cells,) largest von Mises stress along the motion, Pa; None if not known.
         stress_instant: (n_cells,) when it is reached, s; likewise.
         filtered: (n_cells,) densities before the projection, smooth from cell to cell; likewise.
+        wall: (n_cells,) thickness of a hollow arm's wall, m, which the density stands for; None of
+            others.
     """
 
     name: str
@@ -62,6 +64,12 @@ class ArmView:
     stress: np.ndarray | None = None
     stress_instant: np.ndarray | None = None
     filtered: np.ndarray | None = None
+    wall: np.ndarray | None = None
+
+    @property
+    def solid(self) -> np.ndarray:
+        """How much of every cell is solid (n_cells,): the density, but of a wall all of it."""
+        return self.density if self.wall is None else np.ones_like(self.density)
 
 
 def gather_views(
@@ -96,7 +104,7 @@ def gather_views(
         return arm.basis.V[cells]
 
     def points(index: int, arm: Arm) -> np.ndarray:
-        return arm.substructure.operators.points[corner_nodes(arm)]
+        return arm.kind.points(x_phys[index])[corner_nodes(arm)]
 
     corners = collect(points)
     centroids = collect(lambda _, arm: arm.mesh.centroid)
@@ -140,6 +148,7 @@ def _views(
                 stress=None if known is None else known.by_cell[order],
                 stress_instant=None if known is None else known.when[order],
                 filtered=smooth[owner][order] if owner in smooth else None,
+                wall=scene.arms[owner].wall_at(densities[owner][order]),
             )
         )
     return views

@@ -150,8 +150,8 @@ def _simulated(
 def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
     """Return the columns of the densities and of the crisp design.
 
-    None of a crisp design whose solid cells do not join the interfaces, or that is so weak that
-    its simulation takes `PATIENCE` times the work of the densities'.
+    None of hollow arms, and of a crisp design whose solid cells do not join the interfaces, or
+    that is so weak that its simulation takes `PATIENCE` times the work of the densities'.
     """
     from dolfinopt.output.design import read_design
 
@@ -159,6 +159,8 @@ def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
     x_phys = read_design(folder / "design.npz", partition, arms)
     with counted() as work:
         density = _design_column(_simulated(scene, partition, arms, x_phys))
+    if scene.has_walls:  # to cut them at a thickness would make no sense
+        return density, None
     cut = {k: crisp(x, arms[k].mesh.area) for k, x in x_phys.items()}
     if not all(arms[k].substructure.joins(x > 0.0) for k, x in cut.items()):
         return density, None
@@ -458,7 +460,7 @@ class Check:
                 f"{buckling.factor:.3g} times its loads at {buckling.instant:.3f} s: make its "
                 "struts shorter or thicker (design.minimum_member)"
             )
-        if self.crisp is None:
+        if self.crisp is None and not self.density.trajectory.scene.has_walls:
             found.append(
                 "the design cut at the density that keeps the volume falls apart or nearly so: it "
                 "is left out of the table"

@@ -201,7 +201,11 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
     sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
     if isinstance(part, PlanePart):
         return free_outline(part, scene.design.minimum_gap, min([1.0, *sizes]))
-    assert isinstance(part, SolidPart)
+    if not isinstance(part, SolidPart):
+        raise InputError(
+            f"--optimize: the wall of arm {part.name!r} is what dolfinopt optimize has moved "
+            "already (arms.hollow); leave it out"
+        )
     return free_form(part, SIDES)
 
 
@@ -380,8 +384,8 @@ class FreeForm(Protocol):
         """Whether a mesh that followed is to be made anew."""
 
     @property
-    def part(self) -> Part:
-        """That it was made of."""
+    def part(self) -> Any:
+        """That it was made of, with the domain of its arm."""
 
     @property
     def current(self) -> Part:

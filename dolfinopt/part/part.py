@@ -82,10 +82,6 @@ class PartMesh(Protocol):
         """(n, d) m."""
 
     @property
-    def quality(self) -> np.ndarray:
-        """(m,) shape of the cells, 1 of a regular one."""
-
-    @property
     def cells(self) -> np.ndarray:
         """(m, d + 1) corners of the cells."""
 
@@ -110,10 +106,6 @@ class Part(Protocol):
     @property
     def name(self) -> str:
         """The arm's name."""
-
-    @property
-    def domain(self) -> Any:
-        """The arm and its design."""
 
     @property
     def volume(self) -> float:
@@ -250,7 +242,11 @@ def _made(
     design: tuple[np.ndarray, np.ndarray | None],
     curves: Curves,
 ) -> Part:
-    """Return the part of an arm: a surface in space, an outline in the plane."""
+    """Return the part of an arm: a surface in space or a wall, an outline in the plane."""
+    if mesh.wall is not None:
+        from dolfinopt.part.hollow import make_hollow_part
+
+        return make_hollow_part(mesh, design[0], curves)
     if scene.arms[index].is_solid:
         from dolfinopt.part.solid.domain import domain_in_scene
         from dolfinopt.part.solid.part import make_solid_part

@@ -113,6 +113,7 @@ def parts_figure(parts: Sequence[Part], title: str, masses: Sequence[float]) -> 
         title: above the picture.
         masses: of the parts, kg.
     """
+    from dolfinopt.part.hollow import HollowPart
     from dolfinopt.part.plane.part import PlanePart
     from dolfinopt.part.solid.part import SolidPart
 
@@ -120,7 +121,8 @@ def parts_figure(parts: Sequence[Part], title: str, masses: Sequence[float]) -> 
     if not plates:
         from dolfinopt.plots.solid_design import solid_parts_figure
 
-        return solid_parts_figure([p for p in parts if isinstance(p, SolidPart)], title, masses)
+        solids = [part for part in parts if isinstance(part, (SolidPart, HollowPart))]
+        return solid_parts_figure(solids, title, masses)
     corners = [MILLI * part.domain.corners for part in plates]
     figure, rows = _arm_rows(corners, f"{title}: part over density", "mm", FOOT)
     for axes, part, cells, mass in zip(rows, plates, corners, masses, strict=True):

@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from dolfinopt.part.hollow import HollowPart
     from dolfinopt.part.solid.part import SolidPart
 
+WALL_COLOURS = "viridis_r"
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
@@ -164,7 +166,7 @@ def material(view: ArmView, *, modes: bool = False) -> Surface:
     """
     order = AROUND[view.corners.shape[1:]]  # there and back
     fields = {"modes": view.modes[:, order]} if modes else {}
-    return surface_at(view.corners[:, order], view.density, LEVEL, fields)
+    return surface_at(view.corners[:, order], view.solid, LEVEL, fields)
 
 
 def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -190,11 +192,21 @@ def solid_design_figure(
     views: Sequence[ArmView], title: str, masses: Mapping[str, float] | None = None
 ) -> Figure:
     """Return the picture of the material of solid links; arguments as for `design_figure`."""
-    figure, panels = _box_axes([_bounds(view) for view in views], title)
+    thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
+    foot = 0.75 if thickest else 0.0
+    figure, panels = _box_axes([_bounds(view) for view in views], title, foot)
+    marks = scale_marks(thickest)
     for view, axes in zip(views, panels, strict=True):
-        _draw_boxed(axes, _bounds(view), material(view))
+        surface = material(view)
+        look: dict[str, Any] = {}
+        if view.wall is not None:
+            wall = MILLI * view.wall[surface.cells]
+            look = {"scalars": wall, "cmap": WALL_COLOURS, "clim": (0.0, marks[-1])}
+        _draw_boxed(axes, _bounds(view), surface, **look)
         mass = None if masses is None else masses.get(view.name)
         axes.set_title(caption(view, mass), loc="left", fontsize=10, parse_math=False)
+    if thickest:
+        colour_scale(figure, "thickness of the wall (mm)", WALL_COLOURS, marks)
     return figure
 
 
@@ -261,7 +273,9 @@ def solid_stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     return figure
 
 
-def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[float]) -> Figure:
+def solid_parts_figure(
+    parts: Sequence[SolidPart | HollowPart], title: str, masses: Sequence[float]
+) -> Figure:
     """Return the picture of parts below each other, to one scale.
 
     Args:
@@ -275,8 +289,7 @@ def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[
         _draw_boxed(axes, box, part.surface, edges=False)
         words = [_size_of(part.name, box), f"volume {1e6 * part.volume:.4g} cm3"]
         words += [f"mass {mass:.4g} kg"]
-        widths = {"thinnest member": part.widths.member, "narrowest gap": part.widths.gap}
-        words += [f"{name} {MILLI * w:.2g} mm" for name, w in widths.items() if w is not None]
+        words += part.width_words
         axes.set_title(", ".join(words), loc="left", fontsize=10, parse_math=False)
     return figure
 
@@ -284,11 +297,12 @@ def solid_parts_figure(parts: Sequence[SolidPart], title: str, masses: Sequence[
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
     volumes = cell_volumes(view.corners[:, AROUND[view.corners.shape[1:]]])
-    volume = float(volumes @ view.density)
-    words = [
-        _size_of(view.name, _bounds(view)),
-        f"volume {1e6 * volume:.4g} cm3 ({100.0 * volume / volumes.sum():.3g} %)",
-    ]
+    volume = float(volumes @ view.solid)
+    filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
+    if view.wall is not None:
+        thin, thick = MILLI * view.wall.min(), MILLI * view.wall.max()
+        filled = f", wall {thin:.3g} to {thick:.3g} mm"
+    words = [_size_of(view.name, _bounds(view)), f"volume {1e6 * volume:.4g} cm3{filled}"]
     if mass is not None:
         words.append(f"mass {mass:.4g} kg")
     if not len(material(view).triangles):

@@ -26,6 +26,7 @@ from dolfinopt.multibody.shape_integrals import (
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
+from dolfinopt.responses.by_design import by_design
 from dolfinopt.responses.measured import (
     NEGLECTED_DEVIATION_SHARE,
     STIFFENING_INSTANTS,
@@ -34,7 +35,7 @@ from dolfinopt.responses.measured import (
     STIFFENING_UNKNOWN_CHANGE,
 )
 from dolfinopt.responses.motion import motion_objective, worst_instants
-from dolfinopt.responses.products import By, by_densities
+from dolfinopt.responses.products import By
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -230,7 +231,7 @@ def analysis_of(
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None,
     profile: Profile,
-    by: By = by_densities,
+    by: By = by_design,
 ) -> Analysis:
     """Return what the scene's responses are computed from: the designs that the arms have."""
     designs = {k: arm.current for k, arm in arms.items()}
@@ -271,7 +272,7 @@ def gradient(
     arms: Mapping[int, Arm],
     trajectory: Trajectory | None,
     profile: Profile,
-    by: By = by_densities,
+    by: By = by_design,
 ) -> dict[int, np.ndarray]:
     """Return the objective's gradient by the physical densities of this rank's arms (collective).
 
@@ -319,7 +320,7 @@ def constraint_gradients(
     trajectory: Trajectory | None = None,
     profile: Profile | None = None,
     measured: Sequence[Measured] = (),
-    by: By = by_densities,
+    by: By = by_design,
 ) -> list[ConstraintGradient]:
     """Return the gradients of `Evaluation.constraints` (collective).
 

@@ -89,7 +89,7 @@ class VolumeFraction(Response):
         with together(analysis.partition.world):
             for k, volume in _of_cells(analysis).items():
                 one = analysis.designs[k]
-                products = Products(densities=volume, volumes=depth[k] * one.x_phys)
+                products = Products(densities=volume, volumes=depth[k] * one.share)
                 found[k] = analysis.by(one, products)
         return [
             {k: one for k, one in found.items() if rows[k] == row}
@@ -104,12 +104,12 @@ class VolumeFraction(Response):
 
     def _volumes(self, analysis: Analysis) -> np.ndarray:
         """Return the volume of the design and of its solid arms (values, 2), m3 (collective)."""
-        rows, parts = _rows(analysis), {}
+        rows, depth, parts = _rows(analysis), _depths(analysis.scene), {}
         with together(analysis.partition.world):
             for k, volume in _of_cells(analysis).items():
-                x = analysis.designs[k].x_phys
+                one = analysis.designs[k]
                 parts[k] = np.zeros((1 + max(rows.values()), 2))
-                parts[k][rows[k]] = volume @ x, volume @ np.ones_like(x)
+                parts[k][rows[k]] = volume @ one.share, depth[k] * one.kind.volume.sum()
         return sum_over_arms(analysis.partition, parts)
 
 

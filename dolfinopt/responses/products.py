@@ -5,8 +5,8 @@ of nodal fields with the changes of K and M, and a few terms beside them:
 
     dJ = sum_k l_k . dK r_k + sum_k l_k . dM r_k + dJ/dK0 . dK0 + ...
 
-What K, M and the others change by a density of a cell is one thing (`by_densities`), by the place
-of a node another (`shape_sensitivity.by_nodes`); the products are the same.
+What K, M and the others change by a density of a cell is one thing (`by_design.by_densities`), by
+the place of a node another (`shape_sensitivity.by_nodes`); the products are the same.
 """
 
 from __future__ import annotations
@@ -71,20 +71,3 @@ class Products:
 
 # From products to a gradient by variables of the design: by its cells, or by its nodes.
 By = Callable[["DesignState", Products], np.ndarray]
-
-
-def by_densities(state: DesignState, products: Products) -> np.ndarray:
-    """Return the gradient by the physical densities (n_cells,), over this rank's cells."""
-    elastic, pairs = state.elastic, products.stiffness
-    energies, masses = np.zeros((2, len(state.x_phys)))
-    if products.geometric is not None:
-        (left, V), *pairs = pairs
-        energies += products.geometric.by_young_beside(left, V)
-    for left, right in pairs:
-        energies += elastic.cell_stiffness_products(left, right)
-    for left, right in products.mass:
-        masses += elastic.cell_mass_products(left, right)
-    if products.prestress is not None:
-        energies += products.prestress.direct
-    found = state.young_slope * energies + state.density_slope * masses
-    return found if products.densities is None else found + products.densities

@@ -27,7 +27,8 @@ from dolfinopt.arms.arm import fixed_body
 from dolfinopt.multibody.end_effector import lengths
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, scaled
 from dolfinopt.parallel import Partition
-from dolfinopt.responses.products import By, by_densities
+from dolfinopt.responses.by_design import by_design
+from dolfinopt.responses.products import By
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class Analysis:
     designs: Mapping[int, DesignState]
     trajectory: Trajectory | None
     profile: Profile
-    by: By = by_densities
+    by: By = by_design
 
 
 @dataclass(frozen=True)

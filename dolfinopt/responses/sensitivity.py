@@ -26,12 +26,13 @@ from dolfinopt.multibody.shape_integrals import (
     rigid_body,
 )
 from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
+from dolfinopt.responses.by_design import by_design
 from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
-from dolfinopt.responses.products import By, Pair, Products, by_densities
+from dolfinopt.responses.products import By, Pair, Products
 from dolfinopt.responses.response import p_norm_of_lengths
 
 
-def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_densities) -> np.ndarray:
+def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.ndarray:
     """Return the derivative by the design of one arm with the equivalent static loads frozen.
 
     dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
@@ -59,7 +60,7 @@ def exact_gradient(
     state: DesignState,
     cotangents: ShapeIntegrals,
     by_columns: np.ndarray | None = None,
-    by: By = by_densities,
+    by: By = by_design,
     beside: Products | None = None,
 ) -> np.ndarray:
     """Return the derivative by the design of one arm of a function of its floating body.
@@ -230,9 +231,7 @@ def _geometric_gradient(
     return loads.gradient(state.basis.V, by_K0, static=static, by_fields=by_fields)
 
 
-def static_gradient(
-    state: DesignState, response: StaticResponse, by: By = by_densities
-) -> np.ndarray:
+def static_gradient(state: DesignState, response: StaticResponse, by: By = by_design) -> np.ndarray:
     """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads.
 
     Or the derivative by other variables of the design, see `Products`.
@@ -241,7 +240,7 @@ def static_gradient(
 
 
 def deflection_gradient(
-    state: DesignState, response: StaticResponse, exponent: float, by: By = by_densities
+    state: DesignState, response: StaticResponse, exponent: float, by: By = by_design
 ) -> np.ndarray:
     """Return d deflection / dx_phys (n_cells,), by one adjoint load a case; or by others."""
     return tip_gradient(state, response.deflection_gradient(exponent), response.loads, by)
@@ -281,7 +280,7 @@ class PeriodGradient:
 
 
 def period_gradient(
-    state: DesignState, modes: LoadedModes, by_values: np.ndarray, by: By = by_densities
+    state: DesignState, modes: LoadedModes, by_values: np.ndarray, by: By = by_design
 ) -> PeriodGradient:
     """Differentiate a function of the eigenvalues, given its derivative by them (k,).
 
@@ -297,7 +296,7 @@ def period_gradient(
 
 
 def rigid_gradient(
-    state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals, by: By = by_densities
+    state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals, by: By = by_design
 ) -> np.ndarray:
     """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,).
 

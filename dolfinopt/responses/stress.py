@@ -130,7 +130,7 @@ class CellStress(PointStress):
         self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to the design, see `PointStress`."""
-        state, x = self.state, self.state.x_phys
+        state, x = self.state, self.state.share
         by_stress = state.solid.young_modulus * by_A * self.root[:, None]
         operator = state.elastic.substructure.stress_operator
         columns = state.load_fields.stress_transposed(operator, by_stress)
@@ -149,7 +149,7 @@ def cell_stress(state: DesignState, margin: float = 0.0) -> CellStress:
     """
     fields, substructure = state.load_fields, state.elastic.substructure
     with state.elastic.profile.phase("stress"):
-        root, weights = np.sqrt(state.x_phys), state.mesh.area.copy()
+        root, weights = np.sqrt(state.share), state.mesh.area.copy()
         if margin > 0.0:
             weights[substructure.interface_distance < margin] = 0.0
         A = fields.stress(state.solid.young_modulus * substructure.stress_operator)

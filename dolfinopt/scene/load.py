@@ -46,6 +46,7 @@ from dolfinopt.scene.tables.arms import (
     SIZE_KEYS,
     SIZE_PARAMETER,
     SOLID_SHAPES,
+    WALL_KEYS,
     Arm,
 )
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
@@ -386,6 +387,8 @@ def _replaced(arm: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield PATTERN_KEYS
     if arm.get("rigid") is True or "sid" in arm:
         yield ("regions",)
+    if arm.get("hollow") is False:
+        yield WALL_KEYS
 
 
 # --- overrides -------------------------------------------------------------------------------

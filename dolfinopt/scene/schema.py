@@ -111,6 +111,20 @@ class Scene(Table):
         """Indices of the arms with design variables of their own."""
         return tuple(i for i, arm in enumerate(self.arms) if arm.designed)
 
+    @property
+    def has_walls(self) -> bool:
+        """Whether arms with a design are hollow."""
+        return any(self.arms[k].hollow for k in self.designed)
+
+    def initial(self, index: int) -> float:
+        """Return the initial design variable of every cell of arm `index`."""
+        arm = self.arms[index]
+        if not arm.hollow:
+            return self.design.initial
+        assert arm.wall is not None
+        least, most = arm.wall_limits
+        return (arm.wall - least) / (most - least)
+
     def filter_radius(self, index: int) -> float:
         """Return the radius of the cone filter of arm `index`, m.
 

@@ -43,6 +43,7 @@ from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
+from dolfinopt.scene.tables.arms import WALL_KEYS
 from dolfinopt.study.cases import Case, Outcome
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.studies import (
@@ -173,6 +174,7 @@ class Members:
              "interface_offset")
         )  # fmt: skip
         row |= {"symmetric": False, "symmetric_z": False, "extruded": False, "regions": []}
+        row |= {"hollow": False, **dict.fromkeys(WALL_KEYS)}
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
             cells = arm.cells or _bar_cells(arm.length, height, thickness, arm.is_solid)

@@ -30,7 +30,8 @@ PICTURES = ("part.png", "deviation.png", "stress.png")
 UNITS = {
     "area": "m2", "volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m",
     "tolerance": "m", "tool_radius": "m", "smallest_concave_radius": "m", "thinnest_member": "m",
-    "narrowest_gap": "m", "widths_to": "m", "filter_radius": "m",
+    "narrowest_gap": "m", "least_wall": "m", "largest_wall": "m", "min_wall": "m", "max_wall": "m",
+    "widths_to": "m", "filter_radius": "m",
 }  # fmt: skip
 
 

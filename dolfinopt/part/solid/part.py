@@ -165,12 +165,16 @@ class SolidPart:
         where = f"the isosurface at density {self.level:.3g}"
         if self.flat is not None:
             rows, where = f"{len(self.flat.shape.curves)} curves", "the outline"
-        widths = {"thinnest member": self.widths.member, "narrowest gap": self.widths.gap}
-        thin = [f"{name} {1e3 * w:.2g} mm" for name, w in widths.items() if w is not None]
         return (
             f"{1e9 * self.volume:.6g} mm3, {rows}, at most {1e3 * self.distance:.2g} mm from "
-            f"{where}, {', '.join(thin) or 'nothing thin'}"
+            f"{where}, {', '.join(self.width_words) or 'nothing thin'}"
         )
+
+    @property
+    def width_words(self) -> list[str]:
+        """What is narrowest, in words."""
+        widths = {"thinnest member": self.widths.member, "narrowest gap": self.widths.gap}
+        return [f"{name} {1e3 * w:.2g} mm" for name, w in widths.items() if w is not None]
 
     @cached_property
     def widths(self) -> Widths:

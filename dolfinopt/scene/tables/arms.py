@@ -198,6 +198,11 @@ SIMPLICES = ("triangle", "tetrahedron")
 SOLID_SHAPES = ("hexahedron", "tetrahedron")
 SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
+SectionName = Literal["box", "tube"]
+WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
+WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall")
+# Points round a hollow arm's section: with more, a factor's band would be too wide.
+MOST_AROUND = 150
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MAX_ARMS = 1000  # every arm is checked beside all others
@@ -294,6 +299,33 @@ class Arm(Table):
     extruded: bool = Field(
         default=False,
         description="keep the design of a solid arm made of cells the same over the thickness [-]",
+    )
+    hollow: bool = Field(
+        default=False,
+        description="a thin-walled link of the arm's extents: the outer surface stays, the design "
+        "is the thickness of the wall; in space, with cells = [nx, ny, nz], of which those on the "
+        "surface count [-]",
+    )
+    section: SectionName | None = Field(
+        default=None,
+        description='section of a hollow arm; default: "box"; "tube" is round, height = thickness '
+        "[-]",
+    )
+    hull: FileName | None = Field(
+        default=None,
+        description="mesh file (.msh) of a solid whose outer surface a hollow arm has in place of "
+        "a section; seen from the arm's axis it lies nowhere one behind the other [-]",
+    )
+    wall: WallThickness | None = Field(
+        default=None, description="initial thickness of the wall of a hollow arm [m]"
+    )
+    min_wall: WallThickness | None = Field(
+        default=None, description="least thickness of the wall; default: half of wall [m]"
+    )
+    max_wall: WallThickness | None = Field(
+        default=None,
+        description="largest thickness of the wall, also that of the flanges, rings over passive "
+        "at both ends; default: twice wall [m]",
     )
     design: str | None = Field(
         default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
@@ -427,6 +459,102 @@ class Arm(Table):
         return self
 
     @model_validator(mode="after")
+    def _check_hollow(self) -> Arm:
+        if not self.hollow:
+            for key in WALL_KEYS:
+                if getattr(self, key) is not None:
+                    raise Refusal("expected only with hollow = true", (key,))
+            return self
+        if not self.flexible:
+            return self
+        if self.cells is None or len(self.cells) != 3:
+            raise Refusal(
+                "expected false without cells = [nx, ny, nz]: the hull of a hollow arm is a box "
+                "or a tube",
+                ("hollow",),
+                *((("mesh",),) if self.mesh is not None else ()),
+            )
+        if self.wall is None:
+            raise Refusal(
+                "expected a number > 0 [m], the wall's initial thickness, with hollow = true",
+                ("wall",),
+                ("hollow",),
+            )
+        for key in ("extruded", "pattern", "regions", "interfaces"):
+            if getattr(self, key):
+                raise Refusal("expected none with hollow = true", (key,), ("hollow",))
+        if self.element not in (None, "incompatible"):
+            raise Refusal(
+                'expected "incompatible" with hollow = true: others lock in a wall of one layer',
+                ("element",),
+                ("hollow",),
+            )
+        if (around := self.cells_around) > MOST_AROUND:
+            raise Refusal(
+                f"expected at most {MOST_AROUND} cells round the section with hollow = true, "
+                f"2 (ny + nz), found {around}",
+                ("cells",),
+            )
+        self._check_wall()
+        return self
+
+    def _check_wall(self) -> None:
+        """Refuse limits of the wall that leave no room or no hollow."""
+        least, most = self.wall_limits
+        if self.hull is not None:
+            if self.section is not None:
+                raise Refusal("expected none with hull", ("section",), ("hull",))
+            if Path(self.hull).suffix.lower() != ".msh":
+                raise Refusal("expected a file that ends in .msh", ("hull",))
+        if self.section == "tube" and self.height != self.thickness:
+            raise Refusal(
+                f'expected thickness = {self.thickness} [m], the diameter, with section = "tube"',
+                ("height",),
+                ("thickness",),
+            )
+        half = 0.5 * min(self.height, self.thickness)
+        if most >= half:
+            raise Refusal(
+                f"expected less than half the section's smaller side, {half:.6g} [m], found "
+                f"{most:.6g}",
+                ("max_wall",) if self.max_wall is not None else ("wall",),
+                ("height",),
+                ("thickness",),
+            )
+        if least >= most:
+            raise Refusal(
+                f"expected less than max_wall = {most:.6g} [m]", ("min_wall",), ("max_wall",)
+            )
+        assert self.wall is not None
+        if not least <= self.wall <= most:
+            raise Refusal(
+                f"expected a number from min_wall = {least:.6g} to max_wall = {most:.6g} [m]",
+                ("wall",),
+                ("min_wall",),
+                ("max_wall",),
+            )
+
+    @property
+    def wall_limits(self) -> tuple[float, float]:
+        """Least and largest thickness of a hollow arm's wall, m."""
+        assert self.wall is not None
+        least = 0.5 * self.wall if self.min_wall is None else self.min_wall
+        return least, 2.0 * self.wall if self.max_wall is None else self.max_wall
+
+    def wall_at(self, x: Any) -> Any:
+        """Return the thickness of a hollow arm's wall for x in [0, 1], m; None of another arm."""
+        if not self.hollow:
+            return None
+        least, most = self.wall_limits
+        return least + (most - least) * x
+
+    @property
+    def cells_around(self) -> int:
+        """Count the cells round the section of a box of cells: 2 (ny + nz)."""
+        assert self.cells is not None
+        return 2 * sum(self.cells[1:])
+
+    @model_validator(mode="after")
     def _check_joint(self) -> Arm:
         for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
@@ -536,6 +664,8 @@ class Arm(Table):
     def n_cells(self) -> int:
         """Number of cells; of a mesh file an estimate, 0 where there is nothing to go by."""
         if self.cells is not None:
+            if self.hollow:
+                return self.cells[0] * self.cells_around
             return math.prod(self.cells)
         if (size := self.cell_size) is None:
             return 0
@@ -554,6 +684,8 @@ class Arm(Table):
         """
         element = self.element or DEFAULT_ELEMENT[self.shape]
         corners = {"triangle": 0.5, "tetrahedron": 1.0 / 6.0}.get(self.shape, 1.0)
+        if self.hollow:
+            return 2.0  # one layer of cells between two surfaces of nodes
         if element != "quadratic":
             return corners
         more = {"tetrahedron": 8.0, "hexahedron": 8.0}
@@ -617,6 +749,8 @@ class Arm(Table):
         if self.cells is None:
             return None
         halves = 2 if self.element == "quadratic" else 1  # nodes are also halfway
+        if self.hollow:
+            return 6 * (self.cells[0] - 1) * self.cells_around + self.num_outboard
         along, *across = (halves * count for count in self.cells)
         nodes = (along - 1) * math.prod(count + 1 for count in across)
         return 3 * nodes + self.num_outboard if self.is_solid else 2 * nodes + 3

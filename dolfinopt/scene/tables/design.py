@@ -214,6 +214,7 @@ class Design(Table):
             raise Refusal(
                 "expected at least one arm with a design: none is flexible", ("arms", 0, "rigid")
             )
+        self._check_hollow(scene)
         self._check_member_width(scene)
         longest = max(arm.length for arm in scene.arms)
         if self.filter_radius > longest:
@@ -224,6 +225,25 @@ class Design(Table):
                 *(("arms", i, "length") for i in range(len(scene.arms))),
             )
         self._check_volume(scene)
+
+    def _check_hollow(self, scene: Scene) -> None:
+        """Refuse what walls have no use for."""
+        hollow = [i for i in scene.designed if scene.arms[i].hollow]
+        if hollow and self.projection:
+            raise Refusal(
+                "expected false with a hollow arm: a wall may have any thickness",
+                ("design", "projection"),
+                ("arms", hollow[0], "hollow"),
+            )
+        if len(hollow) == len(scene.designed):
+            default = type(self).model_fields["initial"].default
+            if self.initial != default:
+                raise Refusal(
+                    f"expected {default}, the default, where all arms are hollow: arms.wall is the "
+                    "initial thickness",
+                    ("design", "initial"),
+                    ("arms", hollow[0], "wall"),
+                )
 
     def _check_member_width(self, scene: Scene) -> None:
         for i in scene.designed if self.controls_widths else ():

@@ -1,0 +1,240 @@
+"""Hollow links: the outer surface as a grid of points, and one layer of hexahedra in the wall.
+
+The grid has s stations along the axis x and r points round every section, in its plane, so that the
+section of the hull is a polygon. A wall of thickness t has its inner nodes at
+
+    X_inner = X_outer + t d,
+
+with a fixed direction d of every point in the plane of its section, such that t is the distance of
+the two surfaces: at the corners of a box d is the mitre. Nodes beside a box's corners slide along
+the outer surface with the thickness at the corner, so that the cells there are as short as the
+wall is thick: the flow of shear turns in them, and cells of constant shear resist that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from scipy.spatial import cKDTree
+
+from dolfinopt.mesh.measured import CORNER_CELL_RATIO, SECTION_END_CELLS, SHORT_CELL_SHARE
+from dolfinopt.mesh.sections import Member
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """The outer surface of a hollow link, and where its wall grows to.
+
+    Attributes:
+        outer: (s, r, 3) points in the arm's frame, x the same at a station, m; round the axis from
+            y towards z.
+        inward: (s, r, 3) d, the inner node's displacement by the wall's thickness; no x component.
+        slide: (s, r, 3) displacement of both nodes by the thickness at another point of the same
+            section, along the surface; 0 of most.
+        lead: (r,) that point.
+    """
+
+    outer: np.ndarray
+    inward: np.ndarray
+    slide: np.ndarray
+    lead: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Cells along and round."""
+        return self.outer.shape[0] - 1, self.outer.shape[1]
+
+    def points(self, thickness: np.ndarray | float) -> np.ndarray:
+        """Return outer and then inner nodes (2 s r, 3), given the thickness, one or (s, r), m."""
+        t = np.broadcast_to(thickness, self.outer.shape[:2])[:, :, None]
+        outer = self.outer + t[:, self.lead] * self.slide
+        return np.concatenate([outer, outer + t * self.inward]).reshape(-1, 3)
+
+    def by_thickness(self, by_points: np.ndarray) -> np.ndarray:
+        """Return the derivatives (s, r) by the thickness, given those by `points` (2 s r, 3)."""
+        outer, inner = by_points.reshape(2, *self.outer.shape)
+        found = (inner * self.inward).sum(axis=2)
+        np.add.at(found.T, self.lead, ((outer + inner) * self.slide).sum(axis=2).T)
+        return np.asarray(found)
+
+    def member(self, thickness: np.ndarray | float) -> Member:
+        """Return the mesh of a wall of this thickness, one or (s, r), m."""
+        along, around = self.shape
+        count = (along + 1) * around
+        k = np.arange(around)
+        ahead = (k + 1) % around
+        ring = np.stack([k, ahead, ahead + count, k + count], axis=1)
+        first = np.concatenate([ring, ring + around], axis=1)
+        cells = np.concatenate([first + i * around for i in range(along)])
+        return Member(self.points(thickness), cells, ring[:, ::-1], ring + along * around)
+
+
+def hull_of(outer: np.ndarray) -> Hull:
+    """Return the hull with these points (s, r, 3), whose wall grows at right angles to its sides.
+
+    In the section the thickness is the distance of parallel lines; where the hull is tapered, they
+    are as far apart as gives the surfaces that distance.
+    """
+    section = outer[:, :, 1:]
+    side = np.roll(section, -1, axis=1) - section
+    side /= np.linalg.norm(side, axis=2, keepdims=True)
+    after = np.stack([-side[:, :, 1], side[:, :, 0]], axis=2)
+    before = np.roll(after, 1, axis=1)
+    mitre = (before + after) / (1.0 + (before * after).sum(axis=2, keepdims=True))
+    # How fast the surface comes nearer to the axis, along it.
+    slope = (np.gradient(section, outer[:, 0, 0], axis=0) * mitre).sum(axis=2)
+    slope /= (mitre * mitre).sum(axis=2)
+    mitre *= np.sqrt(1.0 + slope * slope)[:, :, None]
+    return _still(outer, np.concatenate([np.zeros((*slope.shape, 1)), mitre], axis=2))
+
+
+def _still(outer: np.ndarray, inward: np.ndarray) -> Hull:
+    """Return a hull whose outer nodes stay where they are."""
+    return Hull(outer, inward, np.zeros_like(outer), np.arange(outer.shape[1]))
+
+
+def stations(length: float, along: int) -> np.ndarray:
+    """Return the stations of so many cells, m; the first and the last are cut once more.
+
+    There the rigid interface holds the section's width, see `SECTION_END_CELLS`.
+    """
+    x = np.linspace(0.0, length, along + 1)
+    ends = x[1] * np.array(SECTION_END_CELLS)
+    return np.concatenate([x[:1], ends, x[1:-1], (length - ends)[::-1], x[-1:]])
+
+
+def box_hull(
+    size: tuple[float, float, float], cells: tuple[int, int, int], largest_wall: float
+) -> Hull:
+    """Return the hull of a box of length, height (y) and thickness (z), m, with so many cells."""
+    length, height, thickness = size
+    along, ny, nz = cells
+    short = CORNER_CELL_RATIO * largest_wall
+    y, z = _side(height, ny, short), _side(thickness, nz, short)
+    half = np.concatenate(
+        [
+            np.column_stack([y, np.full(len(y), 0.5 * thickness)]),
+            np.column_stack([np.full(len(z), -0.5 * height), z]),
+        ]
+    )
+    hull = hull_of(_prism(stations(length, along), np.concatenate([half, -half])))
+    corners = np.cumsum([0, len(y), len(z), len(y)])
+    sides = (height / ny, thickness / nz) * 2
+    for k, corner in enumerate(corners):
+        # After the corner begins one side, before it ends another.
+        for at, side in ((corner + 1, sides[k]), (corner - 1, sides[k - 1])):
+            if _has_short(side, short):
+                hull.slide[:, at] = (hull.outer[:, at] - hull.outer[:, corner]) / largest_wall
+                hull.outer[:, at], hull.lead[at] = hull.outer[:, corner], corner
+    return hull
+
+
+def _has_short(side: float, short: float) -> bool:
+    """Return whether cells of this side, m, are long enough for short ones at the corners."""
+    return SHORT_CELL_SHARE * side > short
+
+
+def _side(size: float, count: int, short: float) -> np.ndarray:
+    """Return the places along a side of a box but the last, m, with short cells at both corners."""
+    places = size * np.linspace(0.5, -0.5, count + 1)
+    if _has_short(size / count, short):
+        places = np.insert(places, [1, count], [0.5 * size - short, short - 0.5 * size])
+    return places[:-1]
+
+
+def tube_hull(size: tuple[float, float, float], cells: tuple[int, int, int]) -> Hull:
+    """Return the hull of a round tube, size and cells as of a box.
+
+    A polygon with the circle's area, as its inner one has: mass and moments are right, too.
+    """
+    length, diameter, _ = size
+    along, ny, nz = cells
+    around = 2 * (ny + nz)
+    angle = 2.0 * math.pi / around
+    scale = math.sqrt(angle / math.sin(angle))
+    turns = angle * np.arange(around)
+    circle = scale * np.column_stack([np.cos(turns), np.sin(turns)])
+    outer = _prism(stations(length, along), 0.5 * diameter * circle)
+    return _still(outer, -_prism(np.zeros(len(outer)), circle))
+
+
+def _prism(x: np.ndarray, section: np.ndarray) -> np.ndarray:
+    """Return the points (s, r, 3) of a section (r, 2) at every station."""
+    points = np.empty((len(x), len(section), 3))
+    points[:, :, 0], points[:, :, 1:] = x[:, None], section
+    return points
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """The wall of a hollow arm's mesh, whose thickness x in [0, 1] of every cell decides.
+
+    t = least + x (most - least); a node's is the mean of the cells around it. Linear, so that
+    `backward` is the transpose of what `points` adds.
+
+    Attributes:
+        hull: the outer surface.
+        least, most: wall thickness for x = 0 and 1, m.
+        nodes: (n,) of the mesh's own nodes on this rank, in `Hull.points`.
+        cells: (n_cells,) of the owned cells, row by row from inboard on.
+    """
+
+    hull: Hull
+    least: float
+    most: float
+    nodes: np.ndarray
+    cells: np.ndarray
+
+    def thickness(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
+        """Return the thickness (s, r) at the points of the hull, m (collective on the arm)."""
+        along, around = self.hull.shape
+        whole = np.zeros(along * around)
+        whole[self.cells] = x
+        comm.Allreduce(MPI.IN_PLACE, whole)
+        grid = whole.reshape(along, around)
+        rows = grid + np.roll(grid, 1, axis=1)
+        total = np.zeros((along + 1, around))
+        total[:-1] += rows
+        total[1:] += rows
+        return self.least + (self.most - self.least) * total / self._around
+
+    def points(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
+        """Return the places (n, 3) of this rank's nodes, m (collective on the arm)."""
+        return self.hull.points(self.thickness(comm, x))[self.nodes]
+
+    def backward(self, by_points: np.ndarray) -> np.ndarray:
+        """Return the derivative by x (n_cells,), given that by this rank's nodes (n, 3)."""
+        along, around = self.hull.shape
+        whole = np.zeros((2 * (along + 1) * around, 3))
+        whole[self.nodes] = by_points
+        share = self.hull.by_thickness(whole) / self._around
+        rows = share[:-1] + share[1:]
+        rows = rows + np.roll(rows, -1, axis=1)
+        return (self.most - self.least) * rows.ravel()[self.cells]
+
+    @property
+    def _around(self) -> np.ndarray:
+        """Number of cells (s, 1) around the points of a station."""
+        count = np.full((self.hull.shape[0] + 1, 1), 4.0)
+        count[[0, -1]] = 2.0
+        return count
+
+
+def wall_of(
+    hull: Hull, limits: tuple[float, float], points: np.ndarray, centroid: np.ndarray
+) -> Wall:
+    """Return the wall of a mesh that `Hull.member` has been made into, its thickness `limits[1]`.
+
+    Args:
+        hull: the outer surface.
+        limits: least and largest thickness, m.
+        points: (n, 3) of the mesh's nodes on this rank, m.
+        centroid: (n_cells, 3) of its owned cells, m.
+    """
+    known = hull.member(limits[1])
+    nodes = cKDTree(known.points).query(points)[1]
+    cells = cKDTree(known.points[known.cells].mean(axis=1)).query(centroid)[1]
+    return Wall(hull, *limits, nodes, cells)

@@ -1,0 +1,161 @@
+"""Hollow arms: stiffness against theory of thin walls, gradients by Taylor tests, any ranks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from remainders import built_of, rates
+from runs import ROOT
+from solids import DENSITY, POISSON, YOUNG, solid_arm
+
+import dolfinopt as do
+from dolfinopt.responses.evaluation import constraint_gradients
+from dolfinopt.responses.sensitivity import deflection_gradient, static_response
+
+SELF, WORLD = MPI.COMM_SELF, MPI.COMM_WORLD
+G = 0.5 * YOUNG / (1.0 + POISSON)
+# Unit forces along y, z and x, and a moment about x.
+LOADS = np.eye(6)[[1, 2, 0, 3]]
+CORNER = 0.559  # squares of shear flow's way round a corner of equal walls, by conformal mapping
+
+
+def flexibility(section: str, size: tuple[float, float, float], cells) -> np.ndarray:
+    """Return deflections (y, z, x) and twist of a hollow arm under unit loads."""
+    length, height, thickness = size
+    t = min(height, thickness) / 40.0
+    arm = solid_arm(
+        SELF, length=length, height=height, thickness=thickness, cells=cells, hollow=True,
+        section=section, wall=t, min_wall=0.5 * t, max_wall=4.0 * t, passive=0.0,
+    )  # fmt: skip
+    found = static_response(arm.state(arm.uniform()).elastic, LOADS).tip
+    return found[[1, 2, 0, 3], range(4)]
+
+
+def box(size: tuple[float, float, float]) -> np.ndarray:
+    """Return the same by Timoshenko, and Bredt with both ends held from warping (Benscoter).
+
+    Round sharp corners shear flows on a shorter way than along the middle of the wall. With
+    mu = ((h - b) / (h + b))^2 and k^2 = mu G J / (E I_w) the ends take 2 mu / k tanh(k L / 2) of
+    the length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
+    """
+    L, h, b = size
+    t = min(h, b) / 40.0
+    hi, bi, hm, bm = h - 2.0 * t, b - 2.0 * t, h - t, b - t
+    A, I_z, I_y = h * b - hi * bi, (b * h**3 - bi * hi**3) / 12.0, (h * b**3 - hi * bi**3) / 12.0
+    J = 4.0 * (hm * bm) ** 2 / (2.0 * (hi + bi) / t + 4.0 * CORNER)
+    mu = ((hm - bm) / (hm + bm)) ** 2
+    held = 0.0
+    if mu:
+        corner = hm * bm * (hm - bm) / (hm + bm) / 4.0
+        k = np.sqrt(mu * G * J / (YOUNG * corner**2 * t * 2.0 * (hm + bm) / 3.0))
+        held = 2.0 * mu / k * np.tanh(0.5 * k * L)
+    bending = L**3 / (3.0 * YOUNG * np.array([I_z, I_y])) + L / (G * 2.0 * t * np.array([hm, bm]))
+    return np.array([*bending, L / (YOUNG * A), (L - held) / (G * J)])
+
+
+def tube(size: tuple[float, float, float]) -> np.ndarray:
+    """Return the same of a round tube; shear by Cowper, doi:10.1115/1.3625046."""
+    L, d, _ = size
+    t = d / 40.0
+    m = 1.0 - 2.0 * t / d
+    A, inertia = 0.25 * np.pi * d**2 * (1.0 - m**2), np.pi / 64.0 * d**4 * (1.0 - m**4)
+    both = (1.0 + m * m) ** 2
+    shape = 6.0 * (1.0 + POISSON) * both
+    shape /= (7.0 + 6.0 * POISSON) * both + (20.0 + 12.0 * POISSON) * m * m
+    bending = L**3 / (3.0 * YOUNG * inertia) + L / (G * shape * A)
+    return np.array([bending, bending, L / (YOUNG * A), L / (2.0 * G * inertia)])
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    "section, size, cells",
+    [
+        ("box", (1.5, 0.16, 0.08), (24, 6, 4)),
+        ("box", (1.5, 0.1, 0.1), (24, 4, 4)),
+        ("box", (0.7, 0.16, 0.08), (20, 6, 4)),  # the held ends take 1.8 % of the twist
+        ("tube", (1.5, 0.12, 0.12), (24, 6, 6)),
+    ],
+)
+def test_stiffness_of_thin_walls(section, size, cells):
+    """Bending, shear, extension and torsion with walls of a fortieth, within 1 %.
+
+    Wide flanges of shorter boxes lag behind the theory of beams (shear lag).
+    """
+    theory = {"box": box, "tube": tube}[section](size)
+    assert flexibility(section, size, cells) == pytest.approx(theory, rel=0.01)
+
+
+# -- gradients: the whole program, the wall of every cell free ------------------------------------
+
+KEYS = ("wall=0.002", "min_wall=0.001", "max_wall=0.005", "hollow=true")
+COARSE = (
+    *(f"arms.{link}.{key}" for link in ("link1", "link2") for key in KEYS),
+    "arms.link1.cells=[5,2,1]", "arms.link2.cells=[5,2,2]", "arms.link2.section=tube",
+    "arms.link2.height=0.02", "arms.link2.passive=0", "simulation.tolerance=1e-4",
+    "objective.gradient=exact", "design.filter_radius=0.05", "design.initial=0.5",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ("objective.kind=esl", "constraints.mass=2.0", "constraints.tip_deflection=1e-3"),
+        pytest.param(
+            ("objective.kind=mass", "constraints.deviation=0.01", "constraints.stress=1e8",
+             "constraints.first_frequency=100"),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["esl", "mass"],
+)  # fmt: skip
+def test_gradients_by_the_wall(changes):
+    """Remainders of objective and limits are of second order along a random direction."""
+    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", (*COARSE, *changes))
+    built = built_of(scene, SELF)
+    rng = np.random.default_rng(1)
+    sizes = {k: arm.mesh.num_cells for k, arm in built.arms.items()}
+    x = {k: 0.4 + 0.2 * rng.random(n) for k, n in sizes.items()}
+    along = {k: rng.standard_normal(n) for k, n in sizes.items()}
+    evaluation, trajectory = built.evaluate(x)
+    held = np.array(evaluation.smooth_limits)
+    found = [built.gradient(trajectory)]
+    found += [row.cells for row in constraint_gradients(*built.place, trajectory, built.profile)]
+    slopes = [sum(float(row[k] @ along[k]) for k in row) for row in found]
+
+    def values(h: float) -> np.ndarray:
+        one, _ = built.evaluate({k: x[k] + h * along[k] for k in x})
+        smooth = (1.0 + np.array(one.constraints)) * np.array(one.smooth_limits) / held
+        return np.append(one.objective, smooth)
+
+    known = {h: values(h) for h in (0.0, 5e-3, 1e-2)}
+    for k, slope in enumerate(slopes):
+        assert rates(lambda h, k=k: known[h][k], slope, (1e-2, 5e-3)) == pytest.approx(2.0, abs=0.1)
+
+
+# -- one design on any ranks ---------------------------------------------------------------------
+
+
+def test_the_same_on_any_ranks():
+    """Deflection, mass and gradient of an arm of all ranks are those of one rank alone."""
+    found = []
+    for comm in (SELF, WORLD):
+        arm = solid_arm(comm, cells=(12, 3, 2), hollow=True, wall=0.001, max_wall=0.003)
+        y = arm.mesh.centroid[:, 1]
+        state = arm.state(arm.physical(0.5 + 8.0 * y))
+        response = static_response(state.elastic, LOADS[:2])
+        gradient = arm.backward(deflection_gradient(state, response, 4.0))
+        parts = np.array([gradient.sum(), gradient @ y, DENSITY * state.mesh.area.sum()])
+        found.append([response.deflection(4.0), *comm.allreduce(parts)])
+    assert found[1] == pytest.approx(found[0], rel=1e-8)
+
+
+def test_a_state_stays_right_when_another_is_made():
+    """Nodes of an older design are its own, and so is what it solves for later."""
+    arm = solid_arm(SELF, cells=(8, 3, 2), hollow=True, wall=0.001, max_wall=0.003)
+    thin = arm.state(arm.uniform(0.1))
+    thick = arm.state(arm.uniform(0.9))
+    first, other = (static_response(one.elastic, LOADS[:1]).tip[1, 0] for one in (thin, thick))
+    again = static_response(arm.state(arm.uniform(0.1)).elastic, LOADS[:1]).tip[1, 0]
+    assert first == pytest.approx(again, rel=1e-12)
+    assert first > 1.5 * other
