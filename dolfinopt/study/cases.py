@@ -177,7 +177,8 @@ class Outcomes:
 def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:
     """Return what a scene computes with: its values and its files' content, `but` some tables."""
     data = with_digests(scene.to_dict())
-    return {table: value for table, value in data.items() if table != "name" and table not in but}
+    without = {"name", "part", *but}
+    return {table: value for table, value in data.items() if table not in without}
 
 
 def _digest(content: Any) -> str:

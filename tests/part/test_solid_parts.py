@@ -421,7 +421,6 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
 
 def test_options_of_outlines_are_refused_for_solids(tmp_path):
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
-    for option, words in (("--optimize", "--optimize"), ("--curves=arcs", "varies over the thick")):
-        with pytest.raises(InputError, match=words):
-            run("part", folder, option)
+    with pytest.raises(InputError, match="varies over the thick"):
+        run("part", folder, "--curves=arcs")
     assert not (folder / "part").exists()
