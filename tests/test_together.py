@@ -13,7 +13,7 @@ from remainders import build
 from runs import TWO_ARM, environment, overrides
 
 import dolfinopt as do
-from dolfinopt.arms import arm, design_state
+from dolfinopt.arms import arm, design_state, kinds
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
@@ -240,7 +240,7 @@ PLACES = [
     (building, LONE, mesh, "_arm_mesh"),
     (building, LONE, IncompatibleElement, "operators"),
     (building, LONE, arm, "Substructure"),
-    (evaluating, LONE, arm, "interpolate"),
+    (evaluating, LONE, kinds, "interpolate"),
     (evaluating, LONE, design_state, "shape_integrals"),
     (evaluating, LONE, static, "static_response", STATIC),
     (evaluating, LONE, static, "static_response", TIP),
@@ -338,7 +338,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
         (mesh, "_arm_mesh"),
         (elements, "_full"),
         (elasticity, "AffineMatrix"),
-        (arm, "interpolate"),
+        (kinds, "interpolate"),
     ],
 )
 def test_a_shared_arm(owner, name, monkeypatch):
