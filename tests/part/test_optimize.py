@@ -167,6 +167,7 @@ def test_interrupted_search_keeps_the_best(made):
     assert found.best.iterations == 2 and found.best.value < found.before
 
 
+@pytest.mark.slow
 def test_best_start_is_kept_and_the_others_told(made):
     _, scene, parts, alone, _ = made
     found = optimize_parts(scene, parts, STEPS, lambda _: None, starts=1)

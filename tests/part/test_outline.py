@@ -188,6 +188,7 @@ def tapered(path):
     return path
 
 
+@pytest.mark.slow
 def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
     path = tapered(tmp_path / "arm.step")
 
