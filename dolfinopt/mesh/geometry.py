@@ -1,7 +1,7 @@
 """Geometry files -> a Gmsh model of one arm with the groups this program knows, on the root.
 
-Reads .geo (parametric or not), .msh and .step. The model leaves here with the physical groups of
-`groups.py`, made of first-order cells of one kind that have passed `checks.py`.
+Reads .geo (parametric or not), .msh and .step. The model leaves here with the physical groups, made
+of first-order cells of one kind that have passed `checks.py`.
 """
 
 from __future__ import annotations
@@ -732,8 +732,8 @@ class Tetrahedra:
         return {
             self.kind: len(self.cells),
             "volume": float(self.volumes.sum()),
-            "least_quality": float(self.quality.min()),
-            "mean_quality": float(self.quality.mean()),
+            "least_quality": float((quality := self.quality).min()),
+            "mean_quality": float(quality.mean()),
         }
 
     def write(self, path: Path) -> None:
@@ -863,12 +863,10 @@ class InterfaceMesh(Protocol):
         """(m, c) nodes of triangles, tetrahedra or hexahedra."""
 
     @property
-    def inboard(self) -> np.ndarray:
-        """(k, f) nodes of the inboard interface's facets."""
+    def inboard(self) -> np.ndarray: ...  # (k, f) nodes of the interfaces' facets
 
     @property
-    def outboard(self) -> np.ndarray:
-        """(k, f) nodes of the outboard interface's facets."""
+    def outboard(self) -> np.ndarray: ...
 
 
 def msh_bytes(mesh: InterfaceMesh) -> bytes:

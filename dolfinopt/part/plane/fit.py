@@ -1,12 +1,8 @@
-"""A cubic B-spline of given knots along points, by least squares.
+"""Cubic B-splines along many points, by least squares: as few control points as a tolerance takes.
 
-Its ends are fixed, and its directions there where they are given; points take the parameter of the
-nearest place on the curve.
-
-Cubic B-splines through many points: as few control points as a tolerance takes.
-
-Knots are inserted in the spans that leave the tolerance, and removed again where the curve holds
-without them.
+Ends are fixed, and directions there where they are given; points take the parameter of the nearest
+place on the curve. Knots are inserted in the spans that leave the tolerance, and removed again
+where the curve holds without them.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
-"""Search for a number at which something has the wanted size, also where that leaps.
+"""Where the material of a part ends: a polygon at the level of the density that keeps the volume.
 
-Polygons as a tool leaves them: corners rounded, necks cut, pinholes closed.
-
-The density as a smooth field on a raster, and the polygons above a level of it.
-
-Where the material of a part ends: the level of the density that holds the material's volume.
-
-What stays solid, the interfaces and the arm's own outline are kept; islands are dropped, and every
-hole, gap and concave corner is as wide as the tool.
+The density is a smooth field on a raster. What stays solid, the interfaces and the arm's own
+outline are kept; islands are dropped, and every hole, gap and concave corner is as wide as the
+tool. The level is searched for, also where the volume leaps.
 """
 
 from __future__ import annotations

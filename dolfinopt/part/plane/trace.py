@@ -1,12 +1,8 @@
-"""The polygon of an outline in runs: along curves of the arm, and free ones between them.
+"""From the polygon of an outline to its curves, which enclose the area of the design.
 
-The curves along the runs of an outline, and the joints where they meet.
-
-Symmetric arms: pieces of the upper half, and their mirror images about y = 0.
-
-Move the free curves of a shape so that it encloses a given area.
-
-From the polygon of an outline to its curves: the arm's own where it has them, else splines.
+The polygon is cut into runs: along curves of the arm, which are taken over exactly, and free ones
+between them, which become splines, or lines and arcs. Symmetric arms are drawn by their upper half
+and mirrored about y = 0. At last the free curves are moved until they enclose the given area.
 """
 
 from __future__ import annotations

@@ -1,15 +1,10 @@
 """The surface of a solid's design: where its density passes the level that keeps its volume.
 
 Densities of cells are averaged to their nodes, by the cells' volumes. The cells are cut at the
-level; where the density is above it the solid's own faces stay, interfaces among them.
-
-Smoothing of a solid's surface without shrinkage, a correction of its volume, crossings.
-
-Smoothed is where material ends within the arm, by VTK's windowed sinc: Taubin, Zhang & Golub,
-Optimal surface smoothing as filter design, ECCV 1996, doi:10.1007/BFb0015544. Points on the arm's
-own faces, interfaces among them, do not move.
-
-The level of a solid's density that keeps its volume, and what above it joins both interfaces.
+level; where the density is above it the solid's own faces stay, interfaces among them. What joins
+both interfaces above the level is kept, smoothed where material ends within the arm, and moved a
+little to its volume; crossings are found. Source of the smoothing: Taubin, Zhang & Golub, Optimal
+surface smoothing as filter design, ECCV 1996, doi:10.1007/BFb0015544.
 """
 
 from __future__ import annotations
