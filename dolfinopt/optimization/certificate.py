@@ -420,10 +420,8 @@ def assess(
 
 
 def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
-    """Return the evaluation of the design cut at 1/2, its contacts opened; None if it falls apart.
-
-    On all ranks alike.
-    """
+    """Return the evaluation of the design cut at 1/2, contacts opened; None if it falls apart."""
+    # The same on all ranks.
     arms, trajectory = evaluator.arms, evaluator.trajectory
     with together(evaluator.partition.world):
         found = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}

@@ -211,11 +211,9 @@ def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float
 
 
 def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
-    """Return directions of largest entry 1: random, smooth, and boxes at both ends of the chain.
-
-    They are functions of the place, the same on any partition. First and last are among the arms
-    with a design of their own.
-    """
+    """Return directions of largest entry 1: random, smooth, and boxes at both ends of the chain."""
+    # They are functions of the place, the same on any partition. First and last are among the arms
+    # with a design of their own.
     designed = scene.designed
 
     def along(k: int) -> np.ndarray:

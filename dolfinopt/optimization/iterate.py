@@ -243,10 +243,8 @@ class Iterate:
         designs: list[EvaluatedDesign],
         sharper: bool = False,
     ) -> None:
-        """Take a design that was tried, and look where the search stands (collective).
-
-        With a sharper projection than the last one's it is compared with nothing.
-        """
+        """Take a design that was tried, and look where the search stands (collective)."""
+        # With a sharper projection than the last one's it is compared with nothing.
         self.x, self.state, self.iteration = new, after, self.iteration + 1
         self.continuation.age += 1
         accepted = self.evaluator.accepted(designs)
@@ -319,10 +317,8 @@ class Iterate:
             self.continuation.thresholds = dict(self.best.thresholds)
 
     def _proposed(self, move: float, price: float | None) -> tuple[np.ndarray, MMAState]:
-        """Return MMA's next design, and what it remembers then (collective).
-
-        Strict steps are those with a price, the merit's, and with the convexity that was learnt.
-        """
+        """Return MMA's next design, and what it remembers then (collective)."""
+        # Strict steps are those with a price, the merit's, and with the convexity that was learnt.
         strict, problem = price is not None, self.problem
         with self.evaluator.profile.phase("mma"):
             return mma_step(

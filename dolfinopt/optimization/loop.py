@@ -145,18 +145,7 @@ def run(
 
 
 class _Run:
-    """One optimisation under way.
-
-    Attributes:
-        iterate: the design, and the steps to the next one.
-        history: rows so far (root only).
-        finished: why the iterations have ended, "" while they go on.
-        selection: of the coordinates, where the scene leaves it to "auto".
-        initial_deviation: (n_times, 2) of the initial design, evenly over the horizon, m (root
-            only).
-        memory: what was saved last.
-        further: what is known of further iterations with the exact gradient.
-    """
+    """One optimisation under way."""
 
     def __init__(
         self, evaluator: Evaluator, recorder: Recorder | None, report: Report | None
@@ -167,12 +156,13 @@ class _Run:
         one = evaluator.variables
         x = np.clip(one.initial, one.xmin, one.xmax)
         self.iterate = Iterate(evaluator, x)
-        self.history: list[HistoryRow] = []
-        self.finished: Ending = ""
-        self.selection: OrderSelection | None = None
+        self.history: list[HistoryRow] = []  # rows so far (root only)
+        self.finished: Ending = ""  # why the iterations have ended, "" while they go on
+        self.selection: OrderSelection | None = None  # of coordinates, where order is "auto"
+        # (n_times, 2) of the initial design, evenly over the horizon, m (root only)
         self.initial_deviation = np.empty((0, 2))
-        self.memory: Memory | None = None
-        self.further: FurtherMemory | None = None
+        self.memory: Memory | None = None  # what was saved last
+        self.further: FurtherMemory | None = None  # of iterations with the exact gradient
         self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
@@ -217,12 +207,10 @@ class _Run:
         return bool(self.finished)
 
     def _stiffens(self) -> bool:
-        """Look again whether geometric stiffening counts, and say whether to go on (collective).
-
-        "auto" decided for the initial design. Where the final one calls for it, it is evaluated
-        anew, and the iterations that are left go on with it; if its motion can then not be
-        simulated, what was found without stays, and the summary says what it misses.
-        """
+        """Look again whether geometric stiffening counts, and say whether to go on (collective)."""
+        # "auto" decided for the initial design. Where the final one calls for it, it is evaluated
+        # anew, and the iterations that are left go on with it; if its motion can then not be
+        # simulated, what was found without stays, and the summary says what it misses.
         if not needs(self.scene, "motion"):
             return False
         with together(self.partition.world):
@@ -240,11 +228,9 @@ class _Run:
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
     def _land(self) -> None:
-        """Take short steps where the iterations ended just beyond a limit (collective).
-
-        The checkpoint does not know of them: a run that is resumed with more iterations goes on as
-        if it had not ended.
-        """
+        """Take short steps where the iterations ended just beyond a limit (collective)."""
+        # The checkpoint does not know of them: a run that is resumed with more iterations goes on
+        # as if it had not ended.
         one = self.iterate
         if self.finished != "limit" or not one.curved:
             return
@@ -313,10 +299,8 @@ class _Run:
         return self.evaluator.continuation.smoothed(x)
 
     def _further(self, problem: Problem, count: int) -> Iterator[Attempt]:
-        """Go on with the exact gradient, see `FurtherRun.iterations` (collective).
-
-        Iterations of an interrupted run are not repeated.
-        """
+        """Go on with the exact gradient, see `FurtherRun.iterations` (collective)."""
+        # Iterations of an interrupted run are not repeated.
         one, memory = self.iterate, self.memory
         done = None if memory is None else memory.further
         run = FurtherRun(self.evaluator, one.x, one.iteration, done)
@@ -328,11 +312,8 @@ class _Run:
             yield attempt
 
     def _conflicts(self, sought: bool) -> str:
-        """Return what holds back the limits that x does not meet (collective).
-
-        Args:
-            sought: whether the violation was lessened as far as steps could.
-        """
+        """Return what holds back the limits that x does not meet (collective)."""
+        # `sought` says whether the violation was lessened as far as steps could.
         one, v = self.iterate, self.evaluator.variables
         if not sought and one.problem.excess > 0.0:
             return "let the optimisation go on (optimizer.max_iterations)"

@@ -233,11 +233,9 @@ def _fault(given: _Given) -> str:
 
 
 def _agree(given: _Given, comm: MPI.Comm | None) -> tuple[Array, Array]:
-    """Return rank 0's f (m,) and the largest |gradient| of f0, f_i (1 + m,) over all ranks.
-
-    A fault of one rank is raised on all, so that none waits for the others. Likewise the
-    constraints are taken from one rank: they steer the iteration, which must not branch.
-    """
+    """Return rank 0's f (m,) and the largest |gradient| of f0, f_i (1 + m,) over all ranks."""
+    # A fault of one rank is raised on all, so that none waits for the others. Likewise the
+    # constraints are taken from one rank: they steer the iteration, which must not branch.
     fault = _fault(given)
     largest = np.zeros(1 + given.f.size)
     if not fault:
@@ -302,25 +300,21 @@ def _block(given: _Given, columns: slice, active: npt.NDArray[np.bool_], scale: 
 
 @dataclass(frozen=True, eq=False)
 class _DualPoint:
-    """Hold the dual function at some multipliers: its value, gradient (m,), minus Hessian (m, m).
-
-    `steps` holds the minimisers s of the Lagrangian, block by block.
-    """
+    """The dual function at some multipliers: value, gradient (m,), minus Hessian (m, m)."""
 
     multipliers: Array
-    steps: list[Array]
+    steps: list[Array]  # the minimisers s of the Lagrangian, block by block
     value: float
     gradient: Array
     curvature: Array
 
 
 class _Dual:
-    """Evaluate the concave dual function of the subproblem.
+    """Evaluate the concave dual function of the subproblem."""
 
-    W(l) = sum_j min_s (G_j s + H_j s^2) / (1 - s^2) + l.f + sum_i min_y (c y + y^2/2 - l_i y)
-    with G_j = G_0j + sum_i l_i G_ij and H_j likewise. The inner minimum is at
-    s = -G / (H + sqrt(H^2 - G^2)), cut off at the bounds of s.
-    """
+    # W(l) = sum_j min_s (G_j s + H_j s^2) / (1 - s^2) + l.f + sum_i min_y (c y + y^2/2 - l_i y)
+    # with G_j = G_0j + sum_i l_i G_ij and H_j likewise. The inner minimum is at
+    # s = -G / (H + sqrt(H^2 - G^2)), cut off at the bounds of s.
 
     def __init__(self, given: _Given, f: Array, largest: Array, comm: MPI.Comm | None):
         active = largest > 0.0
@@ -376,11 +370,9 @@ class _Dual:
 
 
 def _sum(parts: Mapping[int, Array], comm: MPI.Comm | None) -> Array:
-    """Add the pieces' arrays in the order of their numbers, to the same bits on every rank.
-
-    The sums steer the iteration: an allreduce is neither bound to give every rank the same
-    rounding nor to give one rank the rounding of two.
-    """
+    """Add the pieces' arrays in the order of their numbers, to the same bits on every rank."""
+    # The sums steer the iteration: an allreduce is neither bound to give every rank the same
+    # rounding nor to give one rank the rounding of two.
     everywhere = dict(parts)
     if comm is not None and comm.size > 1:
         for other in comm.allgather(everywhere):
@@ -393,16 +385,12 @@ def _sum(parts: Mapping[int, Array], comm: MPI.Comm | None) -> Array:
 
 
 def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
-    """Maximise the dual over multipliers >= 0 by Newton steps within a trust region.
-
-    The dual is concave and once continuously differentiable; its curvature jumps where variables
-    meet their bounds. A step is accepted if the dual still rises at its end, hence rose all the
-    way, or if it falls there no more than half as steeply as it rose at the beginning and is not
-    lower. The derivatives are known down to rounding, the values are not.
-
-    Raises:
-        ConvergenceError: the constraints are not met to `COMPLEMENTARITY_REST`.
-    """
+    """Maximise the dual over multipliers >= 0 by Newton steps within a trust region."""
+    # The dual is concave and once continuously differentiable; its curvature jumps where variables
+    # meet their bounds. A step is accepted if the dual still rises at its end, hence rose all the
+    # way, or if it falls there no more than half as steeply as it rose at the beginning and is not
+    # lower. The derivatives are known down to rounding, the values are not.
+    # Raises ConvergenceError where the constraints are not met to `COMPLEMENTARITY_REST`.
     point = dual.at(multipliers)
     radius = np.full(multipliers.size, FIRST_DUAL_RADIUS)
     evaluations, kinked = 1, False
@@ -453,12 +441,10 @@ def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
 
 
 def _newton_step(point: _DualPoint, radius: Array, penalty: Array) -> Array:
-    """Return the Newton step z in units of (multiplier + MULTIPLIER_FLOOR), limited by the radius.
-
-    A radius r lets a multiplier grow or shrink by the factor 1 + r. The price of violation has a
-    kink where the multiplier reaches the penalty: the step ends there at the latest, and the next
-    one starts with the curvature of the side it goes to.
-    """
+    """Return the Newton step z in units of multiplier + MULTIPLIER_FLOOR, within the radius."""
+    # A radius r lets a multiplier grow or shrink by the factor 1 + r. The price of violation has a
+    # kink where the multiplier reaches the penalty: the step ends there at the latest, and the next
+    # one starts with the curvature of the side it goes to.
     old = point.multipliers
     unit = old + MULTIPLIER_FLOOR
     violated = (old > penalty) | ((old == penalty) & (point.gradient > 0.0))
@@ -480,12 +466,10 @@ def _stepped(old: Array, z: Array, penalty: Array) -> Array:
 
 
 def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Array) -> Array:
-    """Maximise gradient.z - z.curvature.z / 2 over lower <= z <= upper, which contains 0.
-
-    Primal active sets: go to the maximum over the free components, stop at the first bound, and
-    release a bound the maximum has turned away from. The value never falls, so that the iterate
-    is an ascent direction even if the number of rounds runs out.
-    """
+    """Maximise gradient.z - z.curvature.z / 2 over lower <= z <= upper, which contains 0."""
+    # Primal active sets: go to the maximum over the free components, stop at the first bound, and
+    # release a bound the maximum has turned away from. The value never falls, so that the iterate
+    # is an ascent direction even if the number of rounds runs out.
     m = gradient.size
     # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
     # is flat; the relative part is for equivalent constraints.

@@ -333,11 +333,9 @@ class Descent:
         return ending
 
     def _without_struts(self) -> State | None:
-        """Return the state without struts that weigh more than they bring; None: all do.
-
-        What they bring is told by the Lagrangian: of each by itself, then of those that promise
-        most together, as long as every further one gains.
-        """
+        """Return the state without struts that weigh more than they bring; None: all do."""
+        # What they bring is told by the Lagrangian: of each by itself, then of those that promise
+        # most together, as long as every further one gains.
         state, price = self.state, self.problem.prices(self.state)
         gain = GAIN * abs(state.values[0])
         promised: list[tuple[float, int, int, Strut]] = []

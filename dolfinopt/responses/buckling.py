@@ -302,17 +302,12 @@ class Buckling(Response):
 
 @dataclass(frozen=True, eq=False)
 class _ArmGradient:
-    """Derivatives of the p-norm by one design.
+    """Derivatives of the p-norm by one design."""
 
-    Attributes:
-        by_loads: see `bodies_by_loads`.
-        by_columns: (n_nodes, d, m) by `LoadFields.columns`; None where nothing counts.
-        beside: by the design itself.
-    """
-
-    by_loads: Sequence[ByLoads] = ()
+    by_loads: Sequence[ByLoads] = ()  # see `bodies_by_loads`
+    # (n_nodes, d, m) by `LoadFields.columns`; None where nothing counts
     by_columns: np.ndarray | None = None
-    beside: Products | None = None
+    beside: Products | None = None  # by the design itself
 
 
 def _gradient_of_arm(

@@ -112,19 +112,12 @@ ROTATION = "_rotation"  # how the names of those values end
 
 @dataclass(frozen=True)
 class _Moved:
-    """One value of `Stiffness`: how far a load moves an arm's interface.
+    """One value of `Stiffness`: how far a load moves an arm's interface."""
 
-    Attributes:
-        name: of the arm and the case.
-        case: the load.
-        turns: whether it is the rotation, rad, or else the displacement, m.
-        limit: in this unit.
-    """
-
-    name: str
-    case: StiffnessCase
-    turns: bool
-    limit: float
+    name: str  # of the arm and the case
+    case: StiffnessCase  # the load
+    turns: bool  # whether it is the rotation, rad, or else the displacement, m
+    limit: float  # in this unit
 
     def vector(self, state: DesignState) -> tuple[np.ndarray, np.ndarray]:
         """Return the displacement or rotation, and the load on all outboard interfaces (b, 1)."""

@@ -443,19 +443,12 @@ def _screened(
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """Instants of one arm along one motion.
+    """Instants of one arm along one motion."""
 
-    Attributes:
-        loads: of all instants.
-        instants: (k,) of them.
-        values: (k,) largest stress of the arm there, Pa.
-        count: of the instants among which they were chosen.
-    """
-
-    loads: ArmLoads
-    instants: np.ndarray
-    values: np.ndarray
-    count: int
+    loads: ArmLoads  # of all instants
+    instants: np.ndarray  # (k,) of them
+    values: np.ndarray  # (k,) largest stress of the arm there, Pa
+    count: int  # of the instants among which they were chosen
 
     @property
     def a(self) -> np.ndarray:
@@ -470,20 +463,14 @@ class _Chosen:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What is known of one design; numbers are the same on all ranks.
+    """What is known of one design; numbers are the same on all ranks."""
 
-    Attributes:
-        trajectory: of it, on the root.
-        cells, chosen: of this rank's arms.
-        largest, smooth: Pa.
-        total, weight: sums whose ratio to the power 1 / p is smooth / largest.
-    """
-
-    trajectory: Trajectory | None
-    cells: Mapping[int, PointStress]
-    chosen: Mapping[int, Sequence[_Chosen]]
-    largest: float
-    smooth: float
+    trajectory: Trajectory | None  # of it, on the root
+    cells: Mapping[int, PointStress]  # of this rank's arms
+    chosen: Mapping[int, Sequence[_Chosen]]  # of this rank's arms
+    largest: float  # Pa
+    smooth: float  # Pa
+    # (total / weight)^(1/p) is smooth / largest
     total: float
     weight: float
 
@@ -495,16 +482,12 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _ArmGradient:
-    """Derivatives of the p-mean by one design.
+    """Derivatives of the p-mean by one design."""
 
-    Attributes:
-        by_loads: by the loads' coefficients, of every one of `chosen`; of all of the arm's cells.
-        chosen: which.
-        by_A, by_logs, by_weights: see `PointStress.through`.
-    """
-
+    # by the loads' coefficients, of every one of `chosen`; of all of the arm's cells
     by_loads: Sequence[np.ndarray]
-    chosen: Sequence[_Chosen]
+    chosen: Sequence[_Chosen]  # which
+    # see `PointStress.through`
     by_A: np.ndarray
     by_logs: np.ndarray
     by_weights: np.ndarray
@@ -716,19 +699,12 @@ def every(count: int, most: int = COARSE_INSTANTS) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Condensed:
-    """|A_e a_n| is |B_e y_n| but for `rest`.
+    """|A_e a_n| is |B_e y_n| but for `rest`."""
 
-    Attributes:
-        B: (3, n_points, r).
-        y: (n, r).
-        rest: (n,) at most what is left out.
-        norms: (r,) max_e |B_e,k|.
-    """
-
-    B: np.ndarray
-    y: np.ndarray
-    rest: np.ndarray
-    norms: np.ndarray
+    B: np.ndarray  # (3, n_points, r)
+    y: np.ndarray  # (n, r)
+    rest: np.ndarray  # (n,) at most what is left out
+    norms: np.ndarray  # (r,) max_e |B_e,k|
 
     def lengths(self, comm: MPI.Comm, instants: np.ndarray) -> np.ndarray:
         """Return the largest length over all points at these instants (collective)."""

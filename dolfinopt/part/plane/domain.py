@@ -368,10 +368,8 @@ def _shape(region: Box, mirror: float) -> list[Edge]:
 
 
 def _without_kept(mesh: ArmMesh, kept: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Return a field with that of the nearest other cell where cells are kept.
-
-    Shapes that are exact take their place; the steps of their cells must not show beside them.
-    """
+    """Return a field with that of the nearest other cell where cells are kept."""
+    # Shapes that are exact take their place; the steps of their cells must not show beside them.
     if not kept.any() or kept.all():
         return field
     nearest = cKDTree(mesh.centroid[~kept]).query(mesh.centroid[kept])[1]

@@ -60,10 +60,8 @@ def solve(
 
 
 def _basis(knots: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and slopes (n_points, n) of all cubic B-splines at t (n_points,).
-
-    By the recursion of Cox and de Boor.
-    """
+    """Return values and slopes (n_points, n) of all cubic B-splines at t (n_points,)."""
+    # The recursion of Cox and de Boor.
     n = len(knots) - DEGREE - 1
     span = np.searchsorted(knots[DEGREE + 1 : n], t, side="right") + DEGREE
     near = [knots[span + k] for k in range(1 - DEGREE, DEGREE + 1)]  # three to each side
@@ -98,15 +96,9 @@ def _roughness(n: int) -> np.ndarray:
 
 
 def _least_squares(target: Target, values: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Return the control points (n, 2) of least squares under the conditions at the ends.
-
-    An end with a direction leaves one unknown of its second control point: the distance.
-
-    Args:
-        target: points and conditions.
-        values: (n_points, n) of the B-splines at the points.
-        knots: of the spline.
-    """
+    """Return the control points (n, 2) of least squares under the conditions at the ends."""
+    # An end with a direction leaves one unknown of its second control point: the distance.
+    # `values` (n_points, n) are those of the B-splines at the points.
     n, points = values.shape[1], target.points
     # So little that it counts only where a span has no points: third differences.
     gram = values.T @ values + 1e-9 * len(points) / n * _roughness(n)
@@ -144,10 +136,8 @@ def _handles(
     answers: np.ndarray,
     least: float,
 ) -> np.ndarray:
-    """Return the distances of second control points along their tangents, not below `least`.
-
-    A curve must not turn back at its end.
-    """
+    """Return the distances of second control points along their tangents, not below `least`."""
+    # A curve must not turn back at its end.
     count = len(ends)
     matrix, side = np.zeros((count, count)), np.zeros(count)
     for i, (place, tangent) in enumerate(ends):
@@ -235,13 +225,8 @@ def _insert(inner: np.ndarray, t: np.ndarray, off: np.ndarray, tolerance: float)
 def _thinned(
     target: Target, tolerance: float, curve: Spline, t: np.ndarray, off: np.ndarray
 ) -> Spline:
-    """Return a spline without the knots that the tolerance does not take.
-
-    Args:
-        target: of the curve.
-        tolerance: within which it is, m.
-        curve, t, off: the curve, and the points' parameters and distances on it.
-    """
+    """Return a spline without the knots that the tolerance does not take."""
+    # `t`, `off`: parameters of the points on the curve, and their distances from it.
     while True:  # many at once
         chosen = _apart(_removals(curve, t, off) / tolerance)
         while len(chosen):

@@ -382,8 +382,8 @@ class FreeOutline:
         return self._least_along(room)
 
     def _least_along(self, value: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return the least value (count,) of shapely's points of the curves beside each control
-        point: where a hole ends between two of them it may come closer than both."""
+        """Return the least value (count,) over points of the curves beside each control point."""
+        # Where a hole ends between two of them it may come closer than both.
         import shapely
 
         at = np.vstack([run.frame[0] for run in self.runs])
@@ -551,14 +551,8 @@ def _with_fillets(loop: tuple[Piece, ...]) -> tuple[Piece, ...]:
 
 
 def _free_rings(shape: Shape, tool: float, chord: float, fixed: int) -> list[np.ndarray]:
-    """Return the corners (n, 2) of the free holes, clockwise, concave corners as wide as the tool.
-
-    Args:
-        shape: of the part.
-        tool: radius, m.
-        chord: distance of polygons from curves, m.
-        fixed: loops with pieces that stay, which come first.
-    """
+    """Return the corners (n, 2) of free holes, clockwise, concave corners as wide as the tool."""
+    # Loops with pieces that stay come first; `fixed` is their number.
     import shapely
 
     polygons = shape.polygons(chord)

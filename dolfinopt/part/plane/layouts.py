@@ -96,14 +96,9 @@ def _truss(part: PlanePart, slope: float) -> PlanePart:
 def _windows(
     arm: Geometry, stays: Geometry, flange: float, slope: float, symmetric: bool
 ) -> Geometry:
-    """Return the holes of a truss with sharp corners.
-
-    Args:
-        arm, stays: where material may be, and where it must be.
-        flange: width along all edges of the arm, bores and ends included, m.
-        slope: length of a bay over its height.
-        symmetric: about y = 0.
-    """
+    """Return the holes of a truss with sharp corners."""
+    # Material may be in `arm` and must be in `stays`; a flange (m) runs along all edges, bores and
+    # ends included; the slope is the length of a bay over its height.
     import shapely
 
     inside = arm.buffer(-flange, join_style="mitre").difference(stays)

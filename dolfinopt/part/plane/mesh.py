@@ -269,18 +269,12 @@ def _nearest_sides(samples: Sequence[np.ndarray], shape: Shape) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Outline:
-    """Straight sides along the curves of a shape.
+    """Straight sides along the curves of a shape."""
 
-    Attributes:
-        loops: corners (n, 2) of every loop, m.
-        sizes: (k,) wanted sides of cells at all corners, m.
-        piece, span: (k,), (k, 2) of the sides that begin there, see `BodyMesh`.
-    """
-
-    loops: list[np.ndarray]
-    sizes: np.ndarray
-    piece: np.ndarray
-    span: np.ndarray
+    loops: list[np.ndarray]  # corners (n, 2) of every loop, m
+    sizes: np.ndarray  # (k,) wanted sides of cells at all corners, m
+    piece: np.ndarray  # (k,) of the sides that begin there, see `BodyMesh`
+    span: np.ndarray  # (k, 2) likewise
 
     @property
     def is_simple(self) -> bool:

@@ -317,20 +317,13 @@ class Outline:
 
 @dataclass(frozen=True, eq=False)
 class _Given:
-    """What all levels have in common, as shapely's geometries.
+    """What all levels have in common, as shapely's geometries."""
 
-    Attributes:
-        arm: where material may be.
-        stays: where it must be.
-        links: along which the design hangs together.
-        inboard, outboard: lines of the interfaces.
-    """
-
-    arm: Geometry
-    stays: Geometry
-    links: Geometry
-    inboard: Geometry
-    outboard: Geometry
+    arm: Geometry  # where material may be
+    stays: Geometry  # where it must be
+    links: Geometry  # along which the design hangs together
+    inboard: Geometry  # lines of the interface
+    outboard: Geometry  # lines of the interface
 
 
 def _rounding(tool: float, chord: float) -> float:
@@ -429,14 +422,8 @@ def _given(domain: Domain, chord: float) -> _Given:
 def _material(
     given: _Given, raster: Raster, level: float, offset: float, straight: float
 ) -> Geometry:
-    """Return what is solid at a level, before a tool has been there.
-
-    Args:
-        given, raster: of the arm.
-        level: of the field.
-        offset: by which its outline is moved outwards, m.
-        straight: distance from the outline of corners that are left out, m.
-    """
+    """Return what is solid at a level, before a tool has been there."""
+    # The outline is moved outwards by `offset`, without corners nearer to it than `straight` (m).
     import shapely
 
     above = shapely.simplify(raster.above(level), straight)
@@ -512,13 +499,8 @@ def _at_level(
     domain: Domain,
     raster: Raster,
 ) -> Outline:
-    """Return the outline of the level at which it has the volume's area.
-
-    Args:
-        at: the outline by the level.
-        rough: its excess by the level, without all that takes time.
-        domain, raster: of the arm.
-    """
+    """Return the outline of the level at which it has the volume's area."""
+    # `at` gives the outline by the level, `rough` its excess without all that takes time.
     low, high = float(raster.values.min()), float(raster.values.max())
     order = np.argsort(-domain.field)
     filled = np.cumsum(domain.area[order])

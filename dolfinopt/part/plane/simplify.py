@@ -40,18 +40,12 @@ BEND = np.radians(1.0)  # turn of lines whose corner is where they cross
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """A straight or round side of the outline, material to its left.
+    """A straight or round side of the outline, material to its left."""
 
-    Attributes:
-        point, along: (2,) a point of a free line, m, and its unit direction.
-        ends: (2, 2) about where it begins and ends, m.
-        run: on a curve of the arm; None of free lines.
-    """
-
-    point: np.ndarray
-    along: np.ndarray
-    ends: np.ndarray
-    run: Run | None = None
+    point: np.ndarray  # (2,) on a free line, m
+    along: np.ndarray  # (2,) its unit direction
+    ends: np.ndarray  # (2, 2) about where it begins and ends, m
+    run: Run | None = None  # on a curve of the arm; None of free lines
 
     @property
     def length(self) -> float:
@@ -346,10 +340,8 @@ def _loop(sides: list[_Side], distance: float, outline: Outline) -> list[Piece] 
 
 
 def _crossed(sides: list[_Side], least: float) -> list[_Side]:
-    """Return sides each of which meets the next one, without those that are too short.
-
-    Between two concave corners a side must be long enough for two fillets of the least radius.
-    """
+    """Return sides each of which meets the next one, without those that are too short."""
+    # Between two concave corners a side must be long enough for two fillets of the least radius.
     sides = list(sides)
     while True:
         n = len(sides)
@@ -470,15 +462,9 @@ def _corner(
     distance: float,
     least: float,
 ) -> _Corner:
-    """Return the corner of two sides: a fillet as large as there is room for, at least the tool's.
-
-    Args:
-        before, after: the sides.
-        point: where they meet, m.
-        room: `_room` of both.
-        distance: of the fillet from the point, at most, m, if it is larger than the least.
-        least: radius of concave fillets, m.
-    """
+    """Return the corner of two sides: a fillet as large as there is room for."""
+    # They meet at `point`; `room` is `_room` of both. The fillet is at most `distance` away from
+    # the point if it is larger than the least; concave ones have at least the radius `least` (m).
     turn = _turn(before, after, point)
     if (before.run is not None and after.run is not None) or abs(turn) < NO_TURN:
         return _Corner(point, point, None)

@@ -627,13 +627,8 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
 
 
 def _follow(outline: Outline, tolerance: float, finer: float = 1.0) -> Shape:
-    """Return the curves of an outline before their area is corrected.
-
-    Args:
-        outline: whose polygon they follow.
-        tolerance: m.
-        finer: share of the usual distance between the points that splines are fitted to.
-    """
+    """Return the curves of an outline before their area is corrected."""
+    # Splines are fitted to points at `finer` times the usual distance.
     spacing = min(outline.domain.cell / POINTS, max(0.4 * outline.tool_radius, 2.0 * tolerance))
     spacing *= finer
     reach = REACH * outline.domain.cell

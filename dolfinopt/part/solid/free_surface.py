@@ -392,16 +392,9 @@ def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:
 def _held(
     mesh: Tetrahedra, facets: np.ndarray, normal: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which nodes (n,) stay, and across which axes (n, 3) those on flat faces do.
-
-    Nodes of one face across an axis may slide in it; those of edges, of other faces and of
-    interfaces stay.
-
-    Args:
-        mesh: of the part.
-        facets: (k, 3) on the arm's own faces.
-        normal: (k, 3) of them.
-    """
+    """Return which nodes (n,) stay, and across which axes (n, 3) those on flat faces do."""
+    # Nodes of one face across an axis may slide in it; those of edges, of other faces and of
+    # interfaces stay. `facets` (k, 3) are those on the arm's own faces, with a normal (k, 3) each.
     count = len(mesh.points)
     axis = np.abs(normal).argmax(axis=1)
     straight = np.abs(normal).max(axis=1) > 1.0 - FLAT
@@ -422,10 +415,8 @@ def _carried(
     facets: np.ndarray,
     own: np.ndarray,
 ) -> sp.csr_matrix:
-    """Return the weights (n, m) of mesh nodes in the moves of a surface's points.
-
-    Those of the nearest facet; on the arm's own faces of the nearest one there.
-    """
+    """Return the weights (n, m) of mesh nodes in the moves of a surface's points."""
+    # Those of the nearest facet; on the arm's own faces of the nearest one there.
     on_own = distance_to_faces(surface, domain.own) < near
     weights = sp.lil_matrix((len(surface), len(points)))
     for some, among in ((on_own, facets[own]), (~on_own, facets)):

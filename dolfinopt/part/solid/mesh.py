@@ -141,11 +141,9 @@ def extruded(face: BodyMesh, thickness: float, layers: int) -> PlateMesh:
 
 
 def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
-    """Return a mesh whose points within the arm are moved a little, so that it has the volume.
-
-    Flat facets cut off what is round. Points of cells that the move would spoil stay where they
-    are, and the others make up for them.
-    """
+    """Return a mesh whose points within the arm are moved a little, so that it has the volume."""
+    # Flat facets cut off what is round. Points of cells that the move would spoil stay where they
+    # are, and the others make up for them.
     wanted = part.volume
     if abs(mesh.volumes.sum() - wanted) <= APART * wanted:
         return mesh

@@ -370,17 +370,10 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
 
 
 def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
-    """Return the smoothed surface with a volume, less smooth where it would cross itself.
-
-    The isosurface does not cross itself. Points of triangles that do go back towards it by halves,
-    those beside them with them, and all the way at last; the others make up for the volume.
-
-    Args:
-        surface: the isosurface.
-        smooth: the same, smoothed.
-        free: (n,) True of points that move.
-        volume: that is wanted, m3.
-    """
+    """Return the smoothed surface with a volume, less smooth where it would cross itself."""
+    # The isosurface does not cross itself. Points of triangles that do go back towards it by
+    # halves, those beside them with them, and all the way at last; the others make up for the
+    # volume. `free` (n,) is True of points that move.
     share = np.ones(len(surface.points))
     move = smooth.points - surface.points
     for _ in range(ROUNDS):

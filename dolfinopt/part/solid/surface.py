@@ -263,12 +263,11 @@ def outside(solid: Any) -> tuple[Surface, dict[str, np.ndarray]]:
 
 
 def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> Surface:
-    """Return a surface whose triangles turn their backs on points (m, 3) of the cells they bound.
-
-    VTK's own are not all counterclockwise seen from outside in every version. Triangles that share
-    an edge run along it in opposite directions; which way they turn is what most of them say,
-    by the volume to their point: that of a warped cell may be on the wrong side of one of them.
-    """
+    """Return a surface whose triangles turn away from points (m, 3) within the cells they bound."""
+    # VTK's own are not all counterclockwise seen from outside in every version. Triangles that
+    # share an edge run along it in opposite directions; which way they turn is what most of them
+    # say, by the volume to their point: that of a warped cell may be on the wrong side of one of
+    # them.
     import scipy.sparse as sp
     from scipy.sparse.csgraph import connected_components
 
@@ -453,10 +452,8 @@ def _by_size(radii: np.ndarray) -> list[tuple[float, np.ndarray]]:
 
 
 def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Tell which segments pass through their triangles (n, 3, 3), off all edges and ends.
-
-    Möller & Trumbore (1997), doi:10.1080/10867651.1997.10487468.
-    """
+    """Tell which segments pass through their triangles (n, 3, 3), off all edges and ends."""
+    # Möller & Trumbore (1997), doi:10.1080/10867651.1997.10487468.
     along = end - start
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     to = start - corners[:, 0]
@@ -489,19 +486,14 @@ MARKS = ("own", "inboard", "outboard")
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """The density of a solid arm at nodes.
+    """The density of a solid arm at nodes."""
 
-    Attributes:
-        points: (n, 3) m.
-        nodes: (m, 4 or 8) of cells.
-        values: (n,) with the highest one at interfaces: material along them that the design leaves
-            void, since interfaces are rigid.
-        marks: (n,) 1.0 of nodes on `SolidDomain`'s faces and in what stays solid, by name.
-    """
-
-    points: np.ndarray
-    nodes: np.ndarray
+    points: np.ndarray  # (n, 3) m
+    nodes: np.ndarray  # (m, 4 or 8) of cells
+    # (n,) with the highest one at interfaces: material along them that the design leaves void,
+    # since interfaces are rigid
     values: np.ndarray
+    # (n,) 1.0 of nodes on `SolidDomain`'s faces and in what stays solid, by name
     marks: dict[str, np.ndarray]
 
     def above(self, level: float) -> Any:
