@@ -25,6 +25,7 @@ from dolfinopt.reduction.measured import (
     LOBPCG_TOLERANCE,
     LOST_MODE_SHARE,
     RAMP_SHARE,
+    WARM_STEPS,
     WIDE_SPECTRUM_RATIO,
 )
 from dolfinopt.solver import has_options, obeying_options
@@ -320,8 +321,8 @@ def interior_pencil(arm: ElasticArm) -> Pencil:
 def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> Pairs:
     """Return the `count` smallest eigenvalues of K phi = lambda M phi and their vectors.
 
-    By SLEPc's Krylov-Schur on K^-1 M with the factorisation at hand, from the modes of a nearby
-    problem where there are some; where no factor is at hand by `lobpcg`.
+    With the factorisation at hand from the modes of a nearby problem by `modes_from`, otherwise or
+    where that gives up by SLEPc's Krylov-Schur on K^-1 M; where no factor is at hand by `lobpcg`.
 
     Args:
         pencil: K and M, symmetric positive definite.
@@ -339,9 +340,11 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
         pairs = None
         if pencil.operators is not None and not has_options(OPTIONS):
             pairs = lowest_without_factor(arm, pencil.operators, count, start)
+        elif start is not None and start.shape[1] > 0 and not has_options(OPTIONS):
+            pairs = modes_from(pencil, count, start)
         if pairs is None or _is_dense(pairs, count):
             with closing(_Eigenproblem(pencil)) as problem:
-                pairs = problem.lowest(count, start)
+                pairs = problem.lowest(count)
     arm.profile.counts.eigenproblems += 1
     if len(pairs[0]) < count:
         raise ConvergenceError(
@@ -377,7 +380,7 @@ def largest_eigenpairs(
     """
     arm = pencil.arm
     with arm.profile.phase("eigenproblem"), closing(_Largest(pencil, product)) as problem:
-        for space, restarts in _searches(count, warm=False):
+        for space, restarts in _searches(count):
             pairs = problem.search(count, space, restarts, tolerance, start)
             if len(pairs[0]) == count:
                 break
@@ -436,6 +439,50 @@ class _Largest:
         return values[order], vectors[:, order]
 
 
+def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
+    """Return the lowest modes by Lanczos' method from the sum of nearby ones, None if it gives up.
+
+    K^-1 M in the inner product of M, with full orthogonalisation. Residuals are looked at after
+    every step, so that none is made in vain: eigenvalues of slender bodies grow with the fourth
+    power of their number, and each step takes two digits more than the one before.
+
+    Args:
+        pencil: K and M.
+        count: number of eigenpairs.
+        start: (rows, k) vectors of a nearby problem.
+
+    Returns:
+        Eigenvalues (count,), rad2/s2, and vectors (rows, count); None as well where the nearby
+        modes hold one that the search passed over.
+    """
+    most = WARM_STEPS + 4 * count
+    Q, MQ = np.empty((most, len(start))), np.empty((most, len(start)))
+    T = np.zeros((most, most))
+    w = _initial(pencil, start)
+    Mw = pencil.mass(w)
+    length = np.sqrt(float(pencil.total(w @ Mw)))
+    for m in range(most):
+        if not length > 0.0:  # neither of zero nor of nan
+            return None
+        np.divide(w, length, out=Q[m])
+        np.divide(Mw, length, out=MQ[m])
+        w = pencil.inverse(MQ[m])
+        for _ in range(2):
+            overlap = pencil.total(MQ[: m + 1] @ w)
+            w -= overlap @ Q[: m + 1]
+            T[: m + 1, m] += overlap
+        Mw = pencil.mass(w)
+        length = np.sqrt(max(float(pencil.total(w @ Mw)), 0.0))
+        if m + 1 < count:
+            continue
+        theta, y = np.linalg.eigh(T[: m + 1, : m + 1], UPLO="U")
+        theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
+        if (length * np.abs(y[-1]) <= EIGEN_TOLERANCE * theta).all():
+            pairs = 1.0 / theta, (y.T @ Q[: m + 1]).T
+            return None if _passes_over(pencil, pairs, start) else pairs
+    return None
+
+
 def _is_dense(pairs: Pairs, count: int) -> bool:
     """Return whether a search may have passed over modes: some are missing, or nearly equal."""
     values = pairs[0]
@@ -487,13 +534,12 @@ def orthonormal(pencil: Pencil, vectors: np.ndarray) -> np.ndarray:
     return vectors @ np.linalg.inv(np.linalg.cholesky(gram)).T
 
 
-def _searches(count: int, warm: bool) -> tuple[tuple[int, int], ...]:
+def _searches(count: int) -> tuple[tuple[int, int], ...]:
     """Return vectors and restarts of the searches to try in turn for `count` eigenpairs."""
-    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 from cold and
-    # 5 with an initial guess take the fewest solves. Bundles of modes equal to 1e-7, as equal
-    # windows of nearly no material have, need more vectors, not more restarts.
-    extra = 5 if warm else 4
-    return (max(count + extra, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100)
+    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
+    # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material have,
+    # need more vectors, not more restarts.
+    return (max(count + 4, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100)
 
 
 class _Eigenproblem:
@@ -515,13 +561,11 @@ class _Eigenproblem:
         for mat in self._made:
             mat.destroy()
 
-    def lowest(self, count: int, start: np.ndarray | None) -> Pairs:
+    def lowest(self, count: int) -> Pairs:
         """Return up to `count` pairs; see `lowest_eigenpairs`."""
-        start = None if start is None or start.shape[1] == 0 else start
-        pairs = self.found(_searches(count, start is not None), count, start)
-        # From cold nothing tells how many modes have one frequency: it costs one search more.
-        dense = start is None or _is_dense(pairs, count) or _passes_over(self.pencil, pairs, start)
-        if dense and len(pairs[0]) == count:
+        pairs = self.found(_searches(count), count, _ramp(self.pencil, self.pencil.rows))
+        # Nothing tells from cold how many modes have one frequency: it costs one search more.
+        if len(pairs[0]) == count:
             pairs = self.without_gaps(*pairs)
         if len(pairs[0]) == count and pairs[0][-1] > WIDE_SPECTRUM_RATIO * pairs[0][0]:
             pairs = pairs[0], orthonormal(self.pencil, pairs[1])
@@ -531,12 +575,12 @@ class _Eigenproblem:
         self,
         searches: Sequence[tuple[int, int]],
         count: int,
-        start: np.ndarray | None,
+        first: np.ndarray,
         beside: np.ndarray | None = None,
     ) -> Pairs:
         """Return what the first search that finds all finds, or the last one; see `search`."""
         for space, restarts in searches:
-            pairs = self.search(count, space, restarts, start, beside)
+            pairs = self.search(count, space, restarts, first, beside)
             if len(pairs[0]) == count:
                 break
         return pairs
@@ -546,14 +590,14 @@ class _Eigenproblem:
         count: int,
         space: int,
         restarts: int,
-        start: np.ndarray | None,
+        first: np.ndarray,
         beside: np.ndarray | None,
     ) -> Pairs:
         """Return what a subspace of `space` vectors finds: up to `count` values and vectors.
 
         Args:
             count, space, restarts: as they say.
-            start: see `lowest_eigenpairs`.
+            first: (rows,) the first vector of the subspace.
             beside: (rows, k) vectors to which the new ones are M-orthogonal.
         """
         eps = SLEPc.EPS().create(self.pencil.arm.comm)
@@ -570,8 +614,6 @@ class _Eigenproblem:
         ksp = _as_ksp(self.stiffness, self.pencil.inverse)
         transform.setKSP(ksp)
         vector = self.stiffness.createVecLeft()
-        rows = vector.getLocalSize()
-        first = _ramp(self.pencil, rows) if start is None else _initial(self.pencil, start)
         given = [_filled(vector, first)]
         eps.setInitialSpace(given)
         if beside is not None:
@@ -606,8 +648,7 @@ class _Eigenproblem:
         for _ in range(len(values)):
             if self.stiffness.getSize()[0] == len(values):
                 break  # all there are
-            wider = _searches(1, warm=False)[1:]
-            more, vector = self.found(wider, 1, noise[0][:, None] - 0.5, vectors)
+            more, vector = self.found(_searches(1)[1:], 1, noise[0] - 0.5, vectors)
             if len(more) == 0:
                 raise ConvergenceError(
                     f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
