@@ -12,7 +12,7 @@ from mpi4py import MPI
 from parts import write_run
 from runs import ROOT, run, shell
 from scipy.ndimage import gaussian_filter
-from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
+from solids import HEIGHT, LENGTH, THICKNESS, rasterised, solid_scene
 
 import dolfinopt as do
 import dolfinopt.part.solid.mesh as solid_mesh_module
@@ -24,7 +24,7 @@ from dolfinopt.part.files.step import solid_text
 from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
-from dolfinopt.part.solid.part import make_solid_part, rasterised
+from dolfinopt.part.solid.part import make_solid_part, measured_widths
 from dolfinopt.part.solid.surface import (
     Surface,
     crossings,
@@ -39,6 +39,7 @@ from dolfinopt.part.solid.surface import (
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 CELLS = (40, 6, 4)
+CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 LOW = np.array([0.0, -0.5 * HEIGHT, -0.5 * THICKNESS])
 HIGH = np.array([LENGTH, 0.5 * HEIGHT, 0.5 * THICKNESS])
 
@@ -281,6 +282,37 @@ def test_bores_are_interfaces_of_parts(tmp_path):
         assert distance_to_faces(found.points[np.unique(facets)], faces).max() < 1e-9
     with pytest.raises(InputError, match="several outboard interfaces"):
         solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
+
+
+@pytest.mark.parametrize("cell", [0.006, 0.016])
+def test_widths_of_a_box_with_walls(domain_with, cell):
+    """Walls of 6 mm, and a cavity of 88 x 68 mm, of fine cells and of larger ones than the wall."""
+    size = np.array([0.5, 0.1, 0.08])
+    outer, inner = (trimesh.creation.box(size - 2.0 * wall) for wall in (0.0, 0.006))
+    inner.invert()
+    both = trimesh.util.concatenate([outer, inner])
+    surface = Surface(np.asarray(both.vertices), np.asarray(both.faces))
+    domain = replace(domain_with(windows), corners=cell * CUBE[None])
+    found = measured_widths(domain, surface)
+    assert found.member == pytest.approx(0.006, rel=2e-5) and found.gap is None
+    wide = measured_widths(replace(domain, minimum_gap=0.06), surface)
+    assert 0.93 * 0.068 <= wide.gap <= 0.068  # what ends in a square
+
+
+def test_the_width_of_a_tail_in_space(domain_with):
+    """A pyramid's stump from 12 mm to 3 mm square over 60 mm, on a block: that of the ball which
+    touches its sides and its end."""
+    tail = trimesh.convex.convex_hull(
+        [[x, y * w, z * w] for x, w in ((0.1, 0.006), (0.16, 0.0015))
+         for y in (-1, 1) for z in (-1, 1)])  # fmt: skip
+    block = trimesh.creation.box(bounds=[[0.0, -0.03, -0.03], [0.1, 0.03, 0.03]])
+    # Faces that lie on one another do not count: the distance of the boundary is next to them.
+    body = trimesh.boolean.union([block, tail.apply_translation([-1e-4, 0.0, 0.0])])
+    surface = Surface(np.asarray(body.vertices), np.asarray(body.faces))
+    slant = np.arctan(0.0045 / 0.06)
+    end = 0.003 * np.cos(slant) / (1.0 - np.sin(slant))
+    found = measured_widths(replace(domain_with(windows), corners=0.005 * CUBE[None]), surface)
+    assert found.member == pytest.approx(end, abs=2.0 * found.to * np.sin(slant))
 
 
 def test_narrow_members_are_told(domain_with):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.members import WIDE, narrowest, voxel_size, widest
+from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.files.drawings import dxf_text
@@ -29,17 +29,21 @@ from dolfinopt.part.solid.surface import (
     Surface,
     at_volume,
     crossings,
+    distance_to_faces,
     outside,
     smooth_surface,
     with_volume,
 )
+from dolfinopt.part.widths import Boundary, narrowest_place
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.part.stress import CornerStress
 
 
-OPEN = 2.0  # cells around the arm that count as void
+SPACINGS, MOST_POINTS = 5.0, 100_000  # points of the surface in a cell's length; in all, about
+# Steps of the sequence that fills a square most evenly: powers of the root of g^3 = g + 1.
+EVENLY = 0.7548776662466927, 0.5698402909980532
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Widths:
     """What is narrowest in a part.
 
     Attributes:
-        member: width of its thinnest member, m; None where nothing is thin.
+        member: width of its thinnest member, m.
         gap: of its narrowest gap, hole or cavity, m; None without one.
         to: accuracy of both, m.
     """
@@ -59,54 +63,33 @@ class Widths:
 
 def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
     """Return the narrowest member and gap of the part of a solid arm."""
-    h = voxel_size(domain.cell, np.ptp(surface.points, axis=0))
-    solid = rasterised(surface, h, int(np.ceil(OPEN * domain.cell / h)))
-    inner = _cropped(solid)
-    member, _ = narrowest(inner, h) or widest(inner, h)
+    points, outward, spacing = _places(surface, domain.cell / SPACINGS)
+
+    def distance(places: np.ndarray) -> np.ndarray:
+        return distance_to_faces(places, surface.corners)
+
+    inside = Boundary(points, outward, spacing, distance)
+    turned = replace(inside, outward=-outward)
     asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
-    gap = narrowest(~solid, h, WIDE * asked)
-    return Widths(member, None if gap is None else gap[0], h)
+    member, gap = narrowest_place(inside), narrowest_place(turned, WIDE * asked)
+    return Widths(*(None if one is None else one.size for one in (member, gap)), spacing)
 
 
-def rasterised(surface: Surface, h: float, margin: int) -> np.ndarray:
-    """Return which voxels (nx, ny, nz) of side h have their centres in a closed surface.
-
-    Args:
-        surface: m.
-        h: m.
-        margin: number of void voxels around it.
-    """
-    import pyvista
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
-
-    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
-    inner = np.maximum(np.ceil((high - low) / h - 1e-9), 1.0)
-    first = 0.5 * (low + high) - 0.5 * h * (inner - 1.0) - margin * h
-    counts = inner.astype(int) + 2 * margin
-    stencil: Any = vtkPolyDataToImageStencil()
-    stencil.SetInputData(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
-    stencil.SetOutputOrigin(*first)
-    stencil.SetOutputSpacing(h, h, h)
-    stencil.SetOutputWholeExtent(0, counts[0] - 1, 0, counts[1] - 1, 0, counts[2] - 1)
-    image: Any = vtkImageStencilToImage()
-    image.SetInputConnection(stencil.GetOutputPort())
-    image.SetInsideValue(1)
-    image.SetOutsideValue(0)
-    image.SetOutputScalarTypeToUnsignedChar()
-    image.Update()
-    flat = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
-    return np.asarray(flat.reshape(counts[::-1]).transpose(2, 1, 0) > 0)
-
-
-def _cropped(solid: np.ndarray) -> np.ndarray:
-    """Return the box of all that is solid with a layer of void around it."""
-    found = solid
-    for axis in range(3):
-        others = tuple(k for k in range(3) if k != axis)
-        place = np.flatnonzero(solid.any(axis=others))
-        found = np.take(found, np.arange(place[0], place[-1] + 1), axis=axis)
-    return np.pad(found, 1)
+def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return points on a surface, one in a triangle or more, outward normals and their spacing."""
+    a, b, c = surface.corners.swapaxes(0, 1)
+    normal = 0.5 * np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    spacing = max(spacing, float(np.sqrt(area.sum() / MOST_POINTS)))
+    counts = np.maximum(np.ceil(area / spacing**2).astype(int), 1) * (area > 0.0)
+    which = np.repeat(np.arange(len(area)), counts)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+    second, third = ((1.0 / 3.0 + number * step) % 1.0 for step in EVENLY)
+    beyond = second + third > 1.0
+    second, third = (np.where(beyond, 1.0 - one, one) for one in (second, third))
+    weights = np.stack([1.0 - second - third, second, third], axis=1)
+    points = np.einsum("nk,nka->na", weights, surface.corners[which])
+    return points, normal[which] / area[which, None], spacing
 
 
 SAME_VOLUME = 1e-4  # relative, of the part to the design
