@@ -1,9 +1,10 @@
 """How wide the members of a part are, and the gaps between them, in the plane and in space.
 
 Every place of the boundary has the largest ball that touches it there from within and has no
-other boundary inside: r = min |p - q|^2 / (2 n.(p - q)) over all q, n the outward normal at p. Points
-p, q tell where that is small; how wide it is, the distance from the boundary along n does, which
-grows to r and falls again where a member's other side comes nearer. Next to an edge it does not.
+other boundary inside: r = min |p - q|^2 / (2 n.(p - q)) over all q, n the outward normal at p.
+Points p, q tell where that is small; how wide it is, the distance from the boundary along n does,
+which grows to r and falls again where a member's other side comes nearer. Next to an edge it does
+not.
 Source: Ma, Bae & Choi (2012), doi:10.1007/s00371-011-0594-7.
 """
 
@@ -19,8 +20,8 @@ SHRINKINGS = 60  # of balls, at most; a few will do
 INSIDE = 1e-6  # of a radius: what is in a ball by no more does not count
 ROOM = 0.6  # of a width: radius from which balls shrink
 FINEST = 0.5  # of the spacing: radius below which a ball is an edge's
-# Depth, in radii, at which the other side is near, and how far it then is at most: of a wall 0.3, of
-# a wedge of 38 degrees 0.45, next to an edge 1. By points radii are known less well.
+# Depth, in radii, at which the other side is near, and how far it then is at most: of a wall 0.3,
+# of a wedge of 38 degrees 0.45, next to an edge 1. By points radii are known less well.
 BEYOND, NEAR, ROUGHLY_NEAR = 1.7, 0.45, 0.7
 FEW = 200  # balls that are looked at together, the smallest first
 REACH, STEPS, ZOOMS = 1.25, 17, 5  # of a radius by points; to the exact one

@@ -17,10 +17,10 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.files.drawings import dxf_text
 from dolfinopt.part.files.step import solid_text
-from dolfinopt.part.files.triangles import MM, extruded_facets, three_mf_bytes, triangle_bytes
+from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.part import PlanePart, make_part
+from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.domain import SolidDomain
 from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
 from dolfinopt.part.solid.stress import corner_stress, is_regular
@@ -28,8 +28,10 @@ from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
     at_volume,
+    check_surface,
     crossings,
     distance_to_faces,
+    open_edges,
     outside,
     smooth_surface,
     with_volume,
@@ -51,9 +53,9 @@ class Widths:
     """What is narrowest in a part.
 
     Attributes:
-        member: width of its thinnest member, m.
+        member: width of its thinnest member, m; None where nothing is thin.
         gap: of its narrowest gap, hole or cavity, m; None without one.
-        to: accuracy of both, m.
+        to: what is thinner than that is not seen, m.
     """
 
     member: float | None
@@ -71,8 +73,9 @@ def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
     inside = Boundary(points, outward, spacing, distance)
     turned = replace(inside, outward=-outward)
     asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
-    member, gap = narrowest_place(inside), narrowest_place(turned, WIDE * asked)
-    return Widths(*(None if one is None else one.size for one in (member, gap)), spacing)
+    found = narrowest_place(inside), narrowest_place(turned, WIDE * asked)
+    member, gap = (None if one is None else one.size for one in found)
+    return Widths(member, gap, spacing)
 
 
 def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -186,11 +189,7 @@ class SolidPart:
     @property
     def closed(self) -> bool:
         """Whether every edge has two triangles, which run along it in opposite directions."""
-        corners = self.surface.triangles
-        edges = np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-        count = len(self.surface.points)
-        there, back = (np.sort(edges @ row) for row in ([count, 1], [1, count]))
-        return bool((np.diff(there) > 0).all() and np.array_equal(there, back))
+        return not len(open_edges(self.surface))
 
     @property
     def warnings(self) -> list[str]:
@@ -208,13 +207,6 @@ class SolidPart:
             found.append(
                 f"arm {one.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
-            )
-        if not self.closed:
-            found.append(f"arm {one.name!r}: its surface is not closed; repair it")
-        if self.crossings:
-            found.append(
-                f"arm {one.name!r}: its surface crosses itself in {self.crossings} pairs of "
-                "triangles; repair it"
             )
         return found + self._narrow()
 
@@ -323,7 +315,7 @@ def plate_part(domain: SolidDomain, flat: PlanePart) -> SolidPart:
 
 def _prism(shape: Shape, thickness: float, tolerance: float) -> Surface:
     """Return the surface of a shape extruded to both sides of z = 0, chords within a tolerance."""
-    corners = extruded_facets(shape.polygons(tolerance), thickness).reshape(-1, 3)
+    corners = shape_facets(shape, thickness, tolerance).reshape(-1, 3)
     points, which = np.unique(corners, axis=0, return_inverse=True)
     return Surface(points - np.array([0.0, 0.0, 0.5 * thickness]), which.reshape(-1, 3))
 
@@ -349,6 +341,7 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
             f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
             'longer, or with design.projection = "robust"'
         )
+    check_surface(domain.name, found)
     return SolidPart(domain, found, level, distance, pieces, lost)
 
 
