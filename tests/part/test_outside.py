@@ -12,8 +12,9 @@ import pytest
 import scipy.sparse as sp
 from mpi4py import MPI
 from parts import folder_with, frame, write_run
+from petsc4py import PETSc
 from runs import ROOT, run
-from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 import dolfinopt as do
 from dolfinopt.arms.arm import build_arms
@@ -134,12 +135,12 @@ def outside(mesh, material, length, thickness=1.0):
 
     T = rigid_tip(basis, length)
     K, M = ((T.T @ form.assemble(basis) @ T).tocsc() for form in (stiffness, mass))
-    factor, rigid = splu(K, permc_spec="MMD_AT_PLUS_A"), 3 * (d - 1)
+    solve, rigid = solver(K), 3 * (d - 1)
     force = np.zeros(K.shape[0])
     force[1 - rigid] = 1.0
-    moves = factor.solve(force)
-    solve = LinearOperator(K.shape, factor.solve)
-    [square] = eigsh(K, 1, M, sigma=0.0, OPinv=solve, return_eigenvectors=False)
+    moves = solve(force)
+    inverse = LinearOperator(K.shape, solve)
+    [square] = eigsh(K, 1, M, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
     frequency = np.sqrt(square) / (2.0 * np.pi)
     if d == 3:
         return Figures(moves[1 - rigid], frequency, np.nan)
@@ -151,6 +152,25 @@ def outside(mesh, material, length, thickness=1.0):
     edge = np.unique(mesh.facets[:, mesh.boundary_facets()])
     there = edge[np.abs(mesh.p[0, edge] - 0.5 * length) < 0.5 * length - AWAY]
     return Figures(moves[1 - rigid], frequency, mises[there].max())
+
+
+def solver(K):
+    """Return a function that solves with a matrix: by MUMPS, which both programs have in common."""
+    rows = K.tocsr()
+    matrix = PETSc.Mat().createAIJ(rows.shape, csr=(rows.indptr, rows.indices, rows.data))
+    ksp = PETSc.KSP().create(PETSc.COMM_SELF)
+    ksp.setType("preonly")
+    ksp.getPC().setType("lu")
+    ksp.getPC().setFactorSolverType("mumps")
+    ksp.setOperators(matrix)
+
+    def solve(b):
+        x, right = matrix.createVecs()
+        right.array = b
+        ksp.solve(right, x)
+        return x.array.copy()
+
+    return solve
 
 
 def rigid_tip(basis, length):
@@ -210,27 +230,18 @@ def windows(x, y, z):
 
 @pytest.mark.slow
 def test_a_plate_in_space_as_another_program_sees_it(tmp_path):
-    """Tetrahedra in the solid of the STEP file."""
-    scene = do.load_scene(
-        ROOT / "demos" / "spatial_arm.toml",
-        ["arms.link1.cells=[40,6,1]", "arms.link2.rigid=true"],
-    )
+    """Tetrahedra in the solid of the STEP file.
+
+    Measured: 0.77 and 0.24 %, and on meshes 0.7 times as coarse on both sides 0.61 and 0.18 %.
+    """
+    changes = ["arms.link1.cells=[40,6,1]", "arms.link2.rigid=true"]
+    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes)
     folder = write_run(tmp_path / "run", scene, windows)
     run("part", folder, "--no-check", "--no-plots")
-    [part] = make_parts(scene, folder).values()
-    figures = []
-    for coarser in (1.0, 0.7):
-        state = state_of(folder, "link1", part.mesh(coarser))
-        tip = static_response(state.elastic, np.eye(6)[1:2]).tip[1, 0]
-        figures.append((tip, state.first_frequency))
-    k = [arm.name for arm in scene.arms].index("link1")
-    arm = scene.arms[k]
-    there = [
-        outside(
-            meshed(folder / "part" / "link1.step", 16, side, plane=False),
-            scene.material_of(k),
-            arm.length,
-        )
-        for side in (0.008, 0.005)
-    ]
-    print(figures, there)
+    [(k, part)] = make_parts(scene, folder).items()
+    state = state_of(folder, "link1", part.mesh())
+    compliance = static_response(state.elastic, np.eye(6)[1:2]).tip[1, 0]
+    solid = meshed(folder / "part" / "link1.step", 16, 0.012, plane=False)
+    other = outside(solid, scene.material_of(k), scene.arms[k].length)
+    assert compliance == pytest.approx(other.compliance, rel=0.01)
+    assert state.first_frequency == pytest.approx(other.frequency, rel=0.01)
