@@ -14,7 +14,7 @@ from mpi4py import MPI
 from parts import folder_with, frame, write_run
 from petsc4py import PETSc
 from runs import ROOT, run
-from scipy.sparse.linalg import LinearOperator, eigsh
+from scipy.linalg import eigh
 
 import dolfinopt as do
 from dolfinopt.arms.arm import build_arms
@@ -139,9 +139,7 @@ def outside(mesh, material, length, thickness=1.0):
     force = np.zeros(K.shape[0])
     force[1 - rigid] = 1.0
     moves = solve(force)
-    inverse = LinearOperator(K.shape, solve)
-    [square] = eigsh(K, 1, M, sigma=0.0, OPinv=inverse, return_eigenvectors=False)
-    frequency = np.sqrt(square) / (2.0 * np.pi)
+    frequency = first_frequency(K, M, solve)
     if d == 3:
         return Figures(moves[1 - rigid], frequency, np.nan)
     # Stress is linear in the cells: by least squares at their corners, the outline's among them.
@@ -152,6 +150,16 @@ def outside(mesh, material, length, thickness=1.0):
     edge = np.unique(mesh.facets[:, mesh.boundary_facets()])
     there = edge[np.abs(mesh.p[0, edge] - 0.5 * length) < 0.5 * length - AWAY]
     return Figures(moves[1 - rigid], frequency, mises[there].max())
+
+
+def first_frequency(K, M, solve):
+    """Return it in Hz by subspace iteration: each leaves (f1 / f5)^4 < 1 % of the error."""
+    X = np.random.default_rng(0).standard_normal((K.shape[0], 4))
+    for _ in range(6):
+        X = np.column_stack([solve(M @ x) for x in X.T])
+        squares, mixed = eigh(X.T @ K @ X, X.T @ M @ X)
+        X = X @ mixed
+    return np.sqrt(squares[0]) / (2.0 * np.pi)
 
 
 def solver(K):
