@@ -82,6 +82,7 @@ def meshed(file, around, largest, plane=True):
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setString("Geometry.OCCTargetUnit", "MM")  # Open CASCADE keeps the last one
         gmsh.model.occ.importShapes(str(file))
         gmsh.model.occ.synchronize()
         if plane:
@@ -166,11 +167,13 @@ def solver(K):
     """Return a function that solves with a matrix: by MUMPS, which both programs have in common."""
     rows = K.tocsr()
     matrix = PETSc.Mat().createAIJ(rows.shape, csr=(rows.indptr, rows.indices, rows.data))
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     ksp = PETSc.KSP().create(PETSc.COMM_SELF)
     ksp.setType("preonly")
-    ksp.getPC().setType("lu")
+    ksp.getPC().setType("cholesky")
     ksp.getPC().setFactorSolverType("mumps")
     ksp.setOperators(matrix)
+    ksp.setErrorIfNotConverged(True)
 
     def solve(b):
         x, right = matrix.createVecs()

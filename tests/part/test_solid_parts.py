@@ -318,7 +318,7 @@ def test_bores_are_interfaces_of_parts(tmp_path):
         solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
 
 
-@pytest.mark.parametrize("cell", [0.016, 0.024])
+@pytest.mark.parametrize("cell", [0.014, 0.016])
 def test_widths_of_a_box_with_walls(domain_with, cell):
     """Walls of 6 mm, and a cavity of 88 x 68 mm, in cells larger than the wall."""
     size = np.array([0.5, 0.1, 0.08])
