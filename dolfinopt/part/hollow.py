@@ -24,7 +24,7 @@ from dolfinopt.mesh.sections import Member
 from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.solid.stress import APART, SHARP
-from dolfinopt.part.solid.surface import Surface
+from dolfinopt.part.solid.surface import Surface, check_surface
 from dolfinopt.part.stress import CornerStress, mean_at_corners
 from dolfinopt.scene.tables.arms import WALL_KEYS
 
@@ -200,9 +200,10 @@ def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULT
         )
     assert mesh.wall is not None
     wall = mesh.wall
-    return HollowPart(
-        mesh.name, wall.hull, wall.thickness(mesh.comm, x_phys), (wall.least, wall.most)
-    )
+    thickness = wall.thickness(mesh.comm, x_phys)
+    found = HollowPart(mesh.name, wall.hull, thickness, (wall.least, wall.most))
+    check_surface(mesh.name, found.surface)
+    return found
 
 
 def _halved(grid: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.part.solid.surface import Surface
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, load_scene
 
@@ -87,3 +88,34 @@ def elastic_link(name: str, mesh: ArmMesh) -> ElasticArm:
     substructure = Substructure(mesh, ELEMENTS[name].operators(mesh, 1.0, POISSON), Profile())
     ones = np.ones(mesh.num_cells)
     return substructure.at(YOUNG * ones, DENSITY * ones)
+
+
+def rasterised(surface: Surface, h: float, margin: int) -> np.ndarray:
+    """Return which voxels (nx, ny, nz) of side h have their centres in a closed surface.
+
+    Args:
+        surface: m.
+        h: m.
+        margin: number of void voxels around it.
+    """
+    import pyvista
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
+
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    inner = np.maximum(np.ceil((high - low) / h - 1e-9), 1.0)
+    first = 0.5 * (low + high) - 0.5 * h * (inner - 1.0) - margin * h
+    counts = inner.astype(int) + 2 * margin
+    stencil: Any = vtkPolyDataToImageStencil()
+    stencil.SetInputData(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
+    stencil.SetOutputOrigin(*first)
+    stencil.SetOutputSpacing(h, h, h)
+    stencil.SetOutputWholeExtent(0, counts[0] - 1, 0, counts[1] - 1, 0, counts[2] - 1)
+    image: Any = vtkImageStencilToImage()
+    image.SetInputConnection(stencil.GetOutputPort())
+    image.SetInsideValue(1)
+    image.SetOutsideValue(0)
+    image.SetOutputScalarTypeToUnsignedChar()
+    image.Update()
+    flat = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
+    return np.asarray(flat.reshape(counts[::-1]).transpose(2, 1, 0) > 0)

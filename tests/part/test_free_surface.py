@@ -79,6 +79,16 @@ def test_nodes_stay_on_the_faces_of_the_arm(form):
         assert moved.made.volume == pytest.approx(moved.size, rel=2e-3)
 
 
+def test_a_surface_that_would_cross_itself_gives_way_to_that_of_the_mesh(form, monkeypatch):
+    state, (_, s) = form[4], moves_of(form)
+    moved = state.outlines[1].moved(s)
+    if not isinstance(moved, FreeSurface):
+        pytest.skip("plates are made of outlines")
+    monkeypatch.setattr("dolfinopt.part.solid.free_surface.crossings", lambda _: np.ones((1, 2)))
+    assert moved.made.watertight
+    assert moved.made.volume == pytest.approx(moved.size, rel=1e-12)
+
+
 @pytest.mark.slow
 def test_gradient_of_the_machine(form):
     """Remainders are of second order: compliance and volume of a moving arm."""

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from parts import write_run
 from runs import ROOT, run, shell
 from scipy.ndimage import gaussian_filter
-from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
+from solids import HEIGHT, LENGTH, THICKNESS, rasterised, solid_scene
 
 import dolfinopt as do
 import dolfinopt.part.solid.mesh as solid_mesh_module
@@ -22,11 +22,14 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.part.files.step import solid_text
 from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.part.plane.curves import Arc, Piece, Shape
+from dolfinopt.part.plane.part import shape_facets
 from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
-from dolfinopt.part.solid.part import make_solid_part, rasterised
+from dolfinopt.part.solid.part import make_solid_part, measured_widths
 from dolfinopt.part.solid.surface import (
     Surface,
+    check_surface,
     crossings,
     cut,
     distance_to_faces,
@@ -39,6 +42,7 @@ from dolfinopt.part.solid.surface import (
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 CELLS = (40, 6, 4)
+CUBE = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 LOW = np.array([0.0, -0.5 * HEIGHT, -0.5 * THICKNESS])
 HIGH = np.array([LENGTH, 0.5 * HEIGHT, 0.5 * THICKNESS])
 
@@ -195,9 +199,8 @@ def test_surfaces_do_not_cross_themselves(monkeypatch):
     assert part.watertight and part.crossings == 0
     assert part.volume == pytest.approx(domain.volume, rel=1e-4)
     monkeypatch.setattr(solid_part_module, "ROUNDS", 1)  # as if nothing were taken back
-    crossed = make_solid_part(domain)
-    assert crossed.closed and crossed.crossings > 0 and not crossed.watertight
-    assert any(f"crosses itself in {crossed.crossings} pairs" in one for one in crossed.warnings)
+    with pytest.raises(InputError, match=r"arm 'arm1': the surface of its part crosses itself in"):
+        make_solid_part(domain)
 
 
 def test_crossings_of_known_bodies():
@@ -216,6 +219,38 @@ def test_crossings_of_known_bodies():
     assert count([0.1, 0.1, 0.1], 0.1) == 0  # within the other one
     assert count([0.2, 0.2, 0.2]) > 0
     assert count([-0.01, 0.2, 0.2], 0.02) == 3  # a small one through a large face: edges along x
+
+
+def test_surfaces_that_cross_themselves_or_are_open_are_refused(domain_with):
+    """A point of one flange pulled through the other one; a triangle left out: arm and place."""
+    part = make_solid_part(domain_with(windows))
+    surface = part.surface
+    check_surface("arm", surface)
+    far = np.linalg.norm(surface.points - [0.15, 0.0131, 0.0], axis=1)
+    points = surface.points.copy()
+    points[np.argmin(far), 1] = -0.03
+    words = r"'arm': .* crosses itself in \d+ places, the first at \(1[45]\d\."
+    with pytest.raises(InputError, match=words):
+        check_surface("arm", replace(surface, points=points))
+    left = replace(surface, triangles=surface.triangles[1:])
+    with pytest.raises(InputError, match=r"'arm': the surface of its part is open at 3 edges"):
+        check_surface("arm", left)
+
+
+def test_facets_of_plates_have_the_volume_of_their_curves():
+    """Rings of arcs: chords within 1 mm of a circle of 20 mm are 0.03 of its area off."""
+
+    def circle(radius, turn):
+        quarter = 0.5 * np.pi * turn
+        arcs = [Arc(np.zeros(2), radius, k * quarter, quarter) for k in range(4)]
+        return tuple(Piece(arc, free=True) for arc in arcs)
+
+    shape = Shape((circle(0.02, 1), circle(0.004, -1)))
+    assert shape.area == pytest.approx(np.pi * (0.02**2 - 0.004**2), rel=1e-12)
+    surface = shape_facets(shape, 0.01, 1e-3)
+    a, b, c = surface.swapaxes(0, 1)
+    volume = (a * np.cross(b, c)).sum() / 6.0
+    assert volume == pytest.approx(0.01 * shape.area, rel=1e-4)
 
 
 def test_extruded_design_has_the_curves_of_a_plate(domain_with):
@@ -281,6 +316,37 @@ def test_bores_are_interfaces_of_parts(tmp_path):
         assert distance_to_faces(found.points[np.unique(facets)], faces).max() < 1e-9
     with pytest.raises(InputError, match="several outboard interfaces"):
         solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
+
+
+@pytest.mark.parametrize("cell", [0.014, 0.016])
+def test_widths_of_a_box_with_walls(domain_with, cell):
+    """Walls of 6 mm, and a cavity of 88 x 68 mm, in cells larger than the wall."""
+    size = np.array([0.5, 0.1, 0.08])
+    outer, inner = (trimesh.creation.box(size - 2.0 * wall) for wall in (0.0, 0.006))
+    inner.invert()
+    both = trimesh.util.concatenate([outer, inner])
+    surface = Surface(np.asarray(both.vertices), np.asarray(both.faces))
+    domain = replace(domain_with(windows), corners=cell * CUBE[None])
+    found = measured_widths(domain, surface)
+    assert found.member == pytest.approx(0.006, rel=2e-5) and found.gap is None
+    wide = measured_widths(replace(domain, minimum_gap=0.06), surface)
+    assert 0.93 * 0.068 <= wide.gap <= 0.068  # what ends in a square
+
+
+def test_the_width_of_a_tail_in_space(domain_with):
+    """A pyramid's stump from 12 mm to 3 mm square over 60 mm, on a block: that of the ball which
+    touches its sides and its end."""
+    tail = trimesh.convex.convex_hull(
+        [[x, y * w, z * w] for x, w in ((0.1, 0.006), (0.16, 0.0015))
+         for y in (-1, 1) for z in (-1, 1)])  # fmt: skip
+    block = trimesh.creation.box(bounds=[[0.0, -0.03, -0.03], [0.1, 0.03, 0.03]])
+    # Faces that lie on one another do not count: the distance of the boundary is next to them.
+    body = trimesh.boolean.union([block, tail.apply_translation([-1e-4, 0.0, 0.0])])
+    surface = Surface(np.asarray(body.vertices), np.asarray(body.faces))
+    slant = np.arctan(0.0045 / 0.06)
+    end = 0.003 * np.cos(slant) / (1.0 - np.sin(slant))
+    found = measured_widths(replace(domain_with(windows), corners=0.005 * CUBE[None]), surface)
+    assert found.member == pytest.approx(end, abs=2.0 * found.to * np.sin(slant))
 
 
 def test_narrow_members_are_told(domain_with):

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.density.members import narrowest
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.outline import polygons_of
+from dolfinopt.part.widths import Boundary, narrowest_place
 
 if TYPE_CHECKING:
     from shapely import Polygon
@@ -18,7 +18,7 @@ QUADRANT = 48  # sides of a quarter of the tool's circle: 0.01 % of its radius o
 DEEP = 0.1  # depth of what the tool leaves that is told, tolerances
 ENOUGH = 0.98  # share of the tool's radius that passes for it
 HALVINGS = 7  # of the radius that does reach a place
-PIXELS, MOST_PIXELS = 10.0, 1_500_000  # in a cell's length; of a raster
+SPACINGS, MOST_POINTS = 10.0, 100_000  # points of the outline in a cell's length; in all
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,7 @@ def _left(polygon: Any, radius: float, deep: float) -> list[Any]:
 
 
 def thinnest_member(shape: Shape, cell: float) -> float | None:
-    """Return the width of the thinnest member, or dead end, m; None where nothing is thin.
-
-    By opening a raster of the shape with discs, see `density.members.narrowest`; the width is that
-    of the largest disc in the polygon there.
+    """Return the width of the thinnest member, or dead end, m; see `widths.narrowest_place`.
 
     Args:
         shape: of the part.
@@ -96,15 +93,30 @@ def thinnest_member(shape: Shape, cell: float) -> float | None:
     import shapely
 
     polygon: Any = polygon_of(shape, 0.02 * cell)
-    x0, y0, x1, y1 = polygon.bounds
-    h = max(cell / PIXELS, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_PIXELS)))
-    x, y = (np.arange(a - 1.5 * h, b + 2.0 * h, h) for a, b in ((x0, x1), (y0, y1)))
-    shapely.prepare(polygon)
-    inside = shapely.contains_xy(polygon, *np.meshgrid(x, y, indexing="ij"))
-    found = narrowest(inside, h)
-    if found is None:
-        return None
-    place = np.array([x[found[1][0]], y[found[1][1]]])
-    # The raster knows the place; around it the distance from the outline tells the width.
-    around = place + h * np.mgrid[-1:1:9j, -1:1:9j].reshape(2, -1).T
-    return float(2.0 * shapely.distance(shapely.points(around), polygon.boundary).max())
+    shapely.prepare(boundary := polygon.boundary)
+    spacing = max(cell / SPACINGS, boundary.length / MOST_POINTS)
+    rings = [
+        np.asarray(ring.coords)
+        for one in polygons_of(shapely.orient_polygons(polygon))
+        for ring in (one.exterior, *one.interiors)
+    ]
+    pieces = [_between(ring, spacing) for ring in rings]
+    points, outward = (np.concatenate(some) for some in zip(*pieces, strict=True))
+
+    def distance(places: np.ndarray) -> np.ndarray:
+        return np.asarray(shapely.distance(shapely.points(places), boundary))
+
+    found = narrowest_place(Boundary(points, outward, spacing, distance))
+    return None if found is None else found.size
+
+
+def _between(ring: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points within the sides of a ring with material to its left, and outward normals."""
+    side = np.diff(ring, axis=0)
+    length = np.linalg.norm(side, axis=1)
+    counts = np.maximum(np.ceil(length / spacing).astype(int), 1) * (length > 0.0)
+    which = np.repeat(np.arange(len(side)), counts)
+    place = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+    points = ring[which] + ((place + 0.5) / counts[which])[:, None] * side[which]
+    x, y = (side[which] / length[which, None]).T
+    return points, np.column_stack([y, -x])

@@ -110,6 +110,9 @@ class FreeSurface:
         """The part with this surface: its own points follow the facets of the mesh."""
         moves = self.frame.carried @ (self.mesh.points - self.frame.places)
         surface = replace(self.part.surface, points=self.part.surface.points + moves)
+        if len(crossings(surface)):  # the mesh's own does not, see `is_valid`
+            used, triangles = np.unique(self.mesh.boundary, return_inverse=True)
+            surface = Surface(self.mesh.points[used], triangles.reshape(-1, 3))
         far = float(np.linalg.norm(moves, axis=1).max())
         return replace(self.part, surface=surface, distance=self.part.distance + far)
 

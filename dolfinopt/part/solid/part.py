@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.members import WIDE, narrowest, voxel_size, widest
+from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra
 from dolfinopt.part.files.drawings import dxf_text
 from dolfinopt.part.files.step import solid_text
-from dolfinopt.part.files.triangles import MM, extruded_facets, three_mf_bytes, triangle_bytes
+from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.part import PlanePart, make_part
+from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.domain import SolidDomain
 from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
 from dolfinopt.part.solid.stress import corner_stress, is_regular
@@ -28,18 +28,24 @@ from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
     at_volume,
+    check_surface,
     crossings,
+    distance_to_faces,
+    open_edges,
     outside,
     smooth_surface,
     with_volume,
 )
+from dolfinopt.part.widths import Boundary, narrowest_place
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.part.stress import CornerStress
 
 
-OPEN = 2.0  # cells around the arm that count as void
+SPACINGS, MOST_POINTS = 5.0, 100_000  # points of the surface in a cell's length; in all, about
+# Steps of the sequence that fills a square most evenly: powers of the root of g^3 = g + 1.
+EVENLY = 0.7548776662466927, 0.5698402909980532
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,7 @@ class Widths:
     Attributes:
         member: width of its thinnest member, m; None where nothing is thin.
         gap: of its narrowest gap, hole or cavity, m; None without one.
-        to: accuracy of both, m.
+        to: what is thinner than that is not seen, m.
     """
 
     member: float | None
@@ -59,54 +65,34 @@ class Widths:
 
 def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
     """Return the narrowest member and gap of the part of a solid arm."""
-    h = voxel_size(domain.cell, np.ptp(surface.points, axis=0))
-    solid = rasterised(surface, h, int(np.ceil(OPEN * domain.cell / h)))
-    inner = _cropped(solid)
-    member, _ = narrowest(inner, h) or widest(inner, h)
+    points, outward, spacing = _places(surface, domain.cell / SPACINGS)
+
+    def distance(places: np.ndarray) -> np.ndarray:
+        return distance_to_faces(places, surface.corners)
+
+    inside = Boundary(points, outward, spacing, distance)
+    turned = replace(inside, outward=-outward)
     asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
-    gap = narrowest(~solid, h, WIDE * asked)
-    return Widths(member, None if gap is None else gap[0], h)
+    found = narrowest_place(inside), narrowest_place(turned, WIDE * asked)
+    member, gap = (None if one is None else one.size for one in found)
+    return Widths(member, gap, spacing)
 
 
-def rasterised(surface: Surface, h: float, margin: int) -> np.ndarray:
-    """Return which voxels (nx, ny, nz) of side h have their centres in a closed surface.
-
-    Args:
-        surface: m.
-        h: m.
-        margin: number of void voxels around it.
-    """
-    import pyvista
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
-
-    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
-    inner = np.maximum(np.ceil((high - low) / h - 1e-9), 1.0)
-    first = 0.5 * (low + high) - 0.5 * h * (inner - 1.0) - margin * h
-    counts = inner.astype(int) + 2 * margin
-    stencil: Any = vtkPolyDataToImageStencil()
-    stencil.SetInputData(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
-    stencil.SetOutputOrigin(*first)
-    stencil.SetOutputSpacing(h, h, h)
-    stencil.SetOutputWholeExtent(0, counts[0] - 1, 0, counts[1] - 1, 0, counts[2] - 1)
-    image: Any = vtkImageStencilToImage()
-    image.SetInputConnection(stencil.GetOutputPort())
-    image.SetInsideValue(1)
-    image.SetOutsideValue(0)
-    image.SetOutputScalarTypeToUnsignedChar()
-    image.Update()
-    flat = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
-    return np.asarray(flat.reshape(counts[::-1]).transpose(2, 1, 0) > 0)
-
-
-def _cropped(solid: np.ndarray) -> np.ndarray:
-    """Return the box of all that is solid with a layer of void around it."""
-    found = solid
-    for axis in range(3):
-        others = tuple(k for k in range(3) if k != axis)
-        place = np.flatnonzero(solid.any(axis=others))
-        found = np.take(found, np.arange(place[0], place[-1] + 1), axis=axis)
-    return np.pad(found, 1)
+def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return points on a surface, one in a triangle or more, outward normals and their spacing."""
+    a, b, c = surface.corners.swapaxes(0, 1)
+    normal = 0.5 * np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    spacing = max(spacing, float(np.sqrt(area.sum() / MOST_POINTS)))
+    counts = np.maximum(np.ceil(area / spacing**2).astype(int), 1) * (area > 0.0)
+    which = np.repeat(np.arange(len(area)), counts)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+    second, third = ((1.0 / 3.0 + number * step) % 1.0 for step in EVENLY)
+    beyond = second + third > 1.0
+    second, third = (np.where(beyond, 1.0 - one, one) for one in (second, third))
+    weights = np.stack([1.0 - second - third, second, third], axis=1)
+    points = np.einsum("nk,nka->na", weights, surface.corners[which])
+    return points, normal[which] / area[which, None], spacing
 
 
 SAME_VOLUME = 1e-4  # relative, of the part to the design
@@ -203,11 +189,7 @@ class SolidPart:
     @property
     def closed(self) -> bool:
         """Whether every edge has two triangles, which run along it in opposite directions."""
-        corners = self.surface.triangles
-        edges = np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-        count = len(self.surface.points)
-        there, back = (np.sort(edges @ row) for row in ([count, 1], [1, count]))
-        return bool((np.diff(there) > 0).all() and np.array_equal(there, back))
+        return not len(open_edges(self.surface))
 
     @property
     def warnings(self) -> list[str]:
@@ -225,13 +207,6 @@ class SolidPart:
             found.append(
                 f"arm {one.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
-            )
-        if not self.closed:
-            found.append(f"arm {one.name!r}: its surface is not closed; repair it")
-        if self.crossings:
-            found.append(
-                f"arm {one.name!r}: its surface crosses itself in {self.crossings} pairs of "
-                "triangles; repair it"
             )
         return found + self._narrow()
 
@@ -340,7 +315,7 @@ def plate_part(domain: SolidDomain, flat: PlanePart) -> SolidPart:
 
 def _prism(shape: Shape, thickness: float, tolerance: float) -> Surface:
     """Return the surface of a shape extruded to both sides of z = 0, chords within a tolerance."""
-    corners = extruded_facets(shape.polygons(tolerance), thickness).reshape(-1, 3)
+    corners = shape_facets(shape, thickness, tolerance).reshape(-1, 3)
     points, which = np.unique(corners, axis=0, return_inverse=True)
     return Surface(points - np.array([0.0, 0.0, 0.5 * thickness]), which.reshape(-1, 3))
 
@@ -366,6 +341,7 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
             f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
             'longer, or with design.projection = "robust"'
         )
+    check_surface(domain.name, found)
     return SolidPart(domain, found, level, distance, pieces, lost)
 
 

@@ -445,6 +445,39 @@ def crossings(surface: Surface) -> np.ndarray:
     return np.concatenate(found) if found else np.empty((0, 2), dtype=int)
 
 
+def open_edges(surface: Surface) -> np.ndarray:
+    """Return edges (n, 2) that no other triangle runs along in the opposite direction, but one."""
+    triangles, count = surface.triangles, len(surface.points)
+    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    there, back = (edges @ row for row in ([count, 1], [1, count]))
+    _, which, times = np.unique(there, return_inverse=True, return_counts=True)
+    return edges[~np.isin(back, there) | (times[which] > 1)]
+
+
+def check_surface(name: str, surface: Surface) -> None:
+    """Raise InputError, with arm and place, unless a surface is closed and crosses itself nowhere.
+
+    Args:
+        name: of the arm.
+        surface: of its part.
+    """
+    edges = open_edges(surface)
+    if len(edges):
+        where, what = surface.points[edges[0]], f"is open at {len(edges)} edges"
+    else:
+        crossed = crossings(surface)
+        if not len(crossed):
+            return
+        where = surface.corners[crossed[0, 0]]
+        what = f"crosses itself in {len(crossed)} places"
+    x, y, z = 1e3 * where.mean(axis=0)
+    raise InputError(
+        f"arm {name!r}: the surface of its part {what}, the first at ({x:.1f}, {y:.1f}, {z:.1f}) "
+        "mm; optimise with larger members (design.filter_radius) or with design.projection = "
+        '"robust"'
+    )
+
+
 def _by_size(radii: np.ndarray) -> list[tuple[float, np.ndarray]]:
     """Return groups of triangles with radii between r and 2 r, and r."""
     classes = np.floor(np.log2(np.maximum(radii, 1e-6 * radii.max())))
