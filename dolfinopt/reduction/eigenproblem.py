@@ -198,13 +198,18 @@ def lowest_without_factor(
     """
     rows, size = operators.rows, count + GUARD_VECTORS
     known = np.empty((rows, 0)) if start is None else start[:, :size]
-    first = 0 if arm.comm.size == 1 else arm.comm.exscan(rows) or 0
-    columns = 12.9898 + np.arange(size - known.shape[1])
-    noise = np.sin(np.outer(np.arange(first + 1.0, first + rows + 1.0), columns))
-    noise = np.modf(np.abs(noise) * 43758.5453)[0] - 0.5
+    noise = _noise(arm.comm, rows, size - known.shape[1])
     smooth = operators.precondition(operators.precondition(noise))
     found = lobpcg(operators, np.hstack([known, smooth]), count, LOBPCG_TOLERANCE)
     return None if found is None else found[:2]
+
+
+def _noise(comm: MPI.Comm, rows: int, count: int) -> np.ndarray:
+    """Return independent vectors (rows, count) that are the same on any number of ranks."""
+    first = 0 if comm.size == 1 else comm.exscan(rows) or 0
+    places = np.arange(first + 1.0, first + rows + 1.0)
+    waves = np.sin(np.outer(places, 12.9898 + np.arange(count)))
+    return np.modf(np.abs(waves) * 43758.5453)[0] - 0.5
 
 
 def lobpcg(
@@ -644,11 +649,12 @@ class _Eigenproblem:
         Raises:
             ConvergenceError: that search does not converge.
         """
-        noise = np.modf(np.abs(np.sin(12.9898 * np.arange(1.0, len(vectors) + 1.0))) * 43758.5453)
-        for _ in range(len(values)):
+        # Another vector each time: one that has been used holds no more than rounding of the same
+        # frequency's other modes.
+        for first in _noise(self.pencil.arm.comm, len(vectors), len(values)).T:
             if self.stiffness.getSize()[0] == len(values):
                 break  # all there are
-            more, vector = self.found(_searches(1)[1:], 1, noise[0] - 0.5, vectors)
+            more, vector = self.found(_searches(1)[1:], 1, first, vectors)
             if len(more) == 0:
                 raise ConvergenceError(
                     f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
