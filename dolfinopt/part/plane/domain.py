@@ -503,7 +503,7 @@ def domain_of(
         length=entry.length,
         thickness=entry.thickness,
         symmetric=like.symmetric,
-        minimum_member=scene.design.minimum_member,
+        minimum_member=scene.part.minimum_member or scene.design.minimum_member,
     )
 
 

@@ -130,7 +130,7 @@ class PlanePart:
         if self.thinnest is not None and self.thinnest < 0.9 * one.minimum_member:
             found.append(
                 f"arm {one.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, below "
-                f"design.minimum_member = {1e3 * one.minimum_member:.3g} mm"
+                f"the smallest that the scene asks for, {1e3 * one.minimum_member:.3g} mm"
             )
         return found
 

@@ -122,7 +122,7 @@ def domain_in_scene(
         solid_domain(mesh, x_phys, field),
         crisp=field is None and bool(design.projection),
         filter_radius=design.radius,
-        minimum_member=design.minimum_member,
+        minimum_member=scene.part.minimum_member or scene.design.minimum_member,
         minimum_gap=design.minimum_gap,
         flat=_flat_domain(scene, index, mesh, x_phys, field),
     )

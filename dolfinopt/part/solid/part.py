@@ -215,8 +215,8 @@ class SolidPart:
         one = self.domain
         found: dict[str, list[str]] = {}
         for name, width, asked, key in (
-            ("thinnest member", self.widths.member, one.minimum_member, "design.minimum_member"),
-            ("narrowest gap", self.widths.gap, one.minimum_gap, "design.minimum_gap"),
+            ("thinnest member", self.widths.member, one.minimum_member, "minimum_member"),
+            ("narrowest gap", self.widths.gap, one.minimum_gap, "minimum_gap"),
         ):
             limit = f"{key}, {1e3 * asked:.3g} mm"
             if asked == 0.0:

@@ -28,6 +28,10 @@ class Part(Table):
         description="largest distance of the curves from the outline; default: 0.1 mm or a tenth "
         "of a cell, the smaller [m]",
     )
+    minimum_member: Length | None = Field(
+        default=None,
+        description="smallest width of members of a part; default: design.minimum_member [m]",
+    )
     curves: Literal["splines", "arcs"] = Field(
         default="splines", description="free curves: splines, or lines and arcs alone [-]"
     )
