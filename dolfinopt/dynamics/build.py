@@ -11,7 +11,12 @@ from scipy.interpolate import make_interp_spline
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.measured import SAME_INSTANT_SHARE, TABLE_BREAKPOINTS_LIMIT
+from dolfinopt.dynamics.measured import (
+    KEPT_INSTANTS_LIMIT,
+    MOTIONS_KEPT,
+    SAME_INSTANT_SHARE,
+    TABLE_BREAKPOINTS_LIMIT,
+)
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.machine import family_of, rotor_inertia
@@ -28,7 +33,7 @@ from dolfinopt.multibody.motion import (
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
-from dolfinopt.scene.duration import stamp
+from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Arm, Scene
 
 
@@ -55,8 +60,23 @@ def rests_of(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 
 def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
-    """Return the scene's motion as a function of instants (n,), s."""
-    return partial(family_of(scene).motion, scene=scene)
+    """Return the scene's motion as a function of instants (n,), s.
+
+    What was asked for last is kept: from design to design the instants are mostly the same, and
+    making the motion anew takes 3 % of an iteration.
+    """
+    return partial(_motion_at, scene, file_stamp(scene.motion))
+
+
+def _motion_at(scene: Scene, stamp: int, t: np.ndarray) -> RigidMotion:
+    if len(t) > KEPT_INSTANTS_LIMIT:
+        return family_of(scene).motion(t, scene)
+    return _kept_motion(scene, stamp, np.asarray(t, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=MOTIONS_KEPT)
+def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
+    return family_of(scene).motion(np.frombuffer(instants), scene)
 
 
 def build_system(

@@ -157,6 +157,9 @@ ADJOINT_CONTRACTION_LIMIT = 0.3  # above it more coordinates are treated densely
 # -- build, simulation -----------------------------------------------------------------------
 
 TABLE_BREAKPOINTS_LIMIT = 50  # rows of a table of forces that begin steps: more are a curve
+# Desired motions kept, and instants of one: an iteration asks for eight, with up to 3 000 instants.
+MOTIONS_KEPT = 16
+KEPT_INSTANTS_LIMIT = 20_000
 SAME_INSTANT_SHARE = 1e-6  # of the horizon, within which two instants are one
 JOINT_LIMIT_ROUNDING = 1e-6  # relative, of a joint's limit, which files round
 DRIVES_CHUNK = 512  # instants whose matrices are made at once for the drives' derivatives
