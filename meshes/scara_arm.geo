@@ -103,15 +103,20 @@ If (quads)
   Recombine Surface {upper(), lower()};
 EndIf
 
+// The interfaces are what bounds the arm within a box around a bore: its curves and no ray.
 e = 1e-3 * bore(1);
-For i In {0 : 1}
-  r = bore(i) + e;
-  curves() = Curve In BoundingBox {i * length - r, -r, -e, i * length + r, r, e};
-  If (i == 0)
-    Physical Curve("inboard", 1) = curves();
-  Else
-    Physical Curve("outboard", 2) = curves();
+bounds() = Abs(CombinedBoundary {Surface {upper(), lower()}; });
+inboard() = {};
+outboard() = {};
+For k In {0 : #bounds() - 1}
+  box() = BoundingBox Curve {bounds(k)};
+  If (box(0) > -bore(0) - e && box(3) < bore(0) + e)
+    inboard() += {bounds(k)};
+  ElseIf (box(0) > length - bore(1) - e && box(3) < length + bore(1) + e)
+    outboard() += {bounds(k)};
   EndIf
 EndFor
+Physical Curve("inboard", 1) = inboard();
+Physical Curve("outboard", 2) = outboard();
 Physical Surface("design", 3) = {design(), lower({0 : 6})};
 Physical Surface("passive", 4) = {solid(), lower({7 : 12})};

@@ -492,7 +492,6 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
     Raises:
         InputError: its free curves are lines and arcs.
     """
-    import shapely
 
     free = [piece.curve for piece in part.shape.pieces if piece.free]
     if free and not any(isinstance(curve, Spline) for curve in free):  # those of fillets are arcs
@@ -501,7 +500,7 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
     domain, shape = part.domain, part.shape
     chord, cell = CHORD * domain.cell, domain.cell
     arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
-    stays = shapely.union_all([domain.solid.area_inside(chord)])
+    stays = domain.solid.area_inside(chord).intersection(arm)  # without bores
     loops: list[tuple[Piece | int, ...]] = []
     runs: list[Run] = []
     fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]

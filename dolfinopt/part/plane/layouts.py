@@ -39,6 +39,7 @@ BAYS = ((4.0, 2.4), (2.8, 1.7), (2.0, 2.0), (5.6, 3.4), (1.4, 1.2))
 STEEPER = 0.85  # of every further five trusses
 STRUT = 0.6  # width of struts over that of the flanges
 FILLET = 0.8  # radius of a truss's concave corners, cells
+FEWEST = 2  # bays of the first truss; every further one of a short arm has one more
 SMALLEST_HOLE = 4.0  # area of a hole that is worth its outline, squared cells
 AREA = 1e-3  # relative: of a truss
 CLOSE = 0.1  # distance of its curves from straight struts, cells: they will move anyway
@@ -60,19 +61,23 @@ def trusses_of(parts: Mapping[int, PlanePart], number: int) -> dict[int, PlanePa
     """
     cycle, index = divmod(number, len(BAYS))
     slopes = STEEPER**cycle * np.geomspace(*BAYS[index], len(parts))
-    return {k: _truss(parts[k], slope) for k, slope in zip(sorted(parts), slopes, strict=True)}
+    return {
+        k: _truss(parts[k], slope, FEWEST + number)
+        for k, slope in zip(sorted(parts), slopes, strict=True)
+    }
 
 
-def _truss(part: PlanePart, slope: float) -> PlanePart:
+def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     import shapely
 
     domain, drawn = part.domain, part.outline
     arm = domain.outline.area_inside(drawn.chord).difference(domain.void.area_inside(drawn.chord))
-    stays = shapely.union_all([domain.solid.area_inside(drawn.chord)]).intersection(arm)
+    stays = domain.solid.area_inside(drawn.chord).intersection(arm)
+    arm, span = _between_bores(arm, stays, domain.cell)
     fillet = max(FILLET * domain.cell, drawn.tool_radius)
 
     def polygon(flange: float) -> Polygon:
-        holes = _windows(arm, stays, flange, slope, domain.symmetric)
+        holes = _windows(arm, stays, span, flange, slope, fewest, domain.symmetric)
         rounded = holes.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
         least = SMALLEST_HOLE * domain.cell**2
         kept = [one for one in polygons_of(rounded) if one.area > least]
@@ -93,12 +98,42 @@ def _truss(part: PlanePart, slope: float) -> PlanePart:
     return replace(part, outline=found, shape=shape)
 
 
+def _between_bores(
+    arm: Geometry, stays: Geometry, cell: float
+) -> tuple[Geometry, tuple[float, float]]:
+    """Return an arm without what lies beyond bores at its ends, and from where to where bays go."""
+    # Flanges run straight from a bore's ring to the arm's own edges where the bays begin.
+    import shapely
+
+    left, _, right, _ = arm.bounds
+    middle, rings = 0.5 * (left + right), [one.bounds for one in polygons_of(stays)]
+    ahead = [box for box in rings if box[2] < middle]
+    behind = [box for box in rings if box[0] > middle]
+    first = max((b for _, _, b, _ in ahead), default=left)
+    last = min((a for a, _, _, _ in behind), default=right)
+    low = left if not ahead or min(a for a, _, _, _ in ahead) < left + cell else first
+    high = right if not behind or max(b for _, _, b, _ in behind) > right - cell else last
+    if (low, high) == (left, right):
+        return arm, (left, right)
+    kept = shapely.union_all(
+        [stays, arm.intersection(shapely.box(low, arm.bounds[1], high, arm.bounds[3]))]
+    )
+    return arm.intersection(kept.convex_hull), (low, high)
+
+
 def _windows(
-    arm: Geometry, stays: Geometry, flange: float, slope: float, symmetric: bool
+    arm: Geometry,
+    stays: Geometry,
+    span: tuple[float, float],
+    flange: float,
+    slope: float,
+    fewest: int,
+    symmetric: bool,
 ) -> Geometry:
     """Return the holes of a truss with sharp corners."""
     # Material may be in `arm` and must be in `stays`; a flange (m) runs along all edges, bores and
-    # ends included; the slope is the length of a bay over its height.
+    # ends included; bays go from one end of the span to the other; the slope is the length of a
+    # bay over its height.
     import shapely
 
     inside = arm.buffer(-flange, join_style="mitre").difference(stays)
@@ -106,7 +141,8 @@ def _windows(
     if not parts:
         return shapely.Polygon()
     left, low, right, high = max(parts, key=lambda one: one.area).bounds
-    bays = max(2, round((right - left) / (slope * (high - low))))
+    left, right = max(left, span[0]), min(right, span[1])
+    bays = max(fewest, round((right - left) / (slope * (high - low))))
     x = np.linspace(left, right, bays + 1)
     # To the middle of the flanges, whose place is that of the edge beside each node.
     reach = [_extent(inside, at, low, high) for at in np.clip(x, left + 1e-9, right - 1e-9)]
