@@ -36,7 +36,9 @@ from dolfinopt.part.plane.trace import (
 SPACING = 0.2  # of points along the outline, cells
 SHARES = (0.9, 0.6, 0.4, 0.25, 0.15, 0.08)  # of the distance, one attempt after the other
 LEVELS = (1.0, 0.5, 0.2, 0.08)  # shares of the distance for lines to choose from
-RADII = 12  # of a fillet to choose from
+SPREAD = np.linspace(0.0, 1.0, 10)[:, None]  # of a fillet's radii to choose from, logarithmic
+GROWN = 1.1  # radius of a fillet that may be needed where sides move, over its least
+GAP = 8.0  # between lines that follow each other, cells
 CURVED = 0.02  # price of a corner that is the whole distance off, in corners
 PARALLEL = 0.3  # of the distance, by which sides turn to be parallel
 STEPS, SAME_AREA = 8, 1e-7  # of the area's correction; relative
@@ -120,21 +122,25 @@ def simple_shape(outline: Outline, distance: float, area: float) -> Shape | None
     tree, owner = cKDTree(np.vstack(runs)), np.repeat(np.arange(len(runs)), [*map(len, runs)])
     attempt = np.zeros(len(places), dtype=int)
     sides: dict[tuple[int, int], list[_Side]] = {}
+    stays: dict[tuple[int, int], bool] = {}
     changed = np.arange(len(places))
     while len(changed):
         for n in changed:  # a free run that failed follows the outline more closely
             i, k = places[n]
             sides[i, k] = []
             while not sides[i, k]:
-                if attempt[n] == len(SHARES):
+                if attempt[n] == 2 * len(SHARES):
                     return None
-                sides[i, k] = _free_sides(rings[i], k, SHARES[attempt[n]] * distance, outline)
+                share = SHARES[attempt[n] // 2]
+                sides[i, k] = _free_sides(rings[i], k, share * distance, outline)
+                stays[i, k] = attempt[n] % 2 == 1
                 attempt[n] += 1
         chains = [
             [side for k, run in enumerate(ring) for side in sides.get((i, k)) or [_own(run)]]
             for i, ring in enumerate(rings)
         ]
-        chains = _parallel(chains, PARALLEL * distance, FACING * outline.domain.cell)
+        turns = {id(side) for key, some in sides.items() if not stays[key] for side in some}
+        chains = _parallel(chains, PARALLEL * distance, FACING * outline.domain.cell, turns)
         shape = _with_area(chains, outline, area)
         if shape is None:
             return None
@@ -394,87 +400,104 @@ def _fewest(
     # between their middles, and begins on either line where the one before has ended.
     if through := [one for one in first if one.last >= len(points) - 1]:
         return through[:1]
+    most = GAP / SPACING
     known = {(one.first, one.last) for one in (*first, *last)}
     between = [s for s in _stretches(points, distance) if (s.first, s.last) not in known]
     lines = sorted([*first, *between, *last], key=lambda one: one.middle)
-    reached: dict[int, list[tuple[float, float, tuple[_Stretch, ...]]]] = {
-        id(one): [(0.0, one.begin, (one,))] for one in first
-    }
-    best: tuple[float, tuple[_Stretch, ...]] = (np.inf, ())
+    reached: dict[int, list[_Path]] = {id(a): [_Path(0.0, a.begin, (a,))] for a in first}
     for k, a in enumerate(lines):
-        if id(a) not in reached:
-            continue
-        for b in lines[k + 1 :]:
-            if b.first <= a.first or b.last <= a.last:
-                continue
-            near = points[max(a.middle, 0) : b.middle + 1]
-            fillet = _fillet(a.side, b.side, near, distance, least)
-            if fillet is None:
-                continue
-            end = a.position(fillet.start)
-            before = min(
-                (one for one in reached[id(a)] if one[1] <= end),
-                default=None,
-                key=lambda one: one[0],
-            )
-            if before is None:
-                continue
-            next_ = replace(b, side=replace(b.side, radii=fillet.radii))
-            path = before[0] + fillet.price, b.position(fillet.end), (*before[2], next_)
-            reached.setdefault(id(b), []).append(path)
-    for one in last:
-        for price, place, path in reached.get(id(one), ()):
-            if place <= one.end and price < best[0]:
-                best = price, path
-    return list(best[1])
+        paths = _better(reached.get(id(a), []))
+        for b in lines[k + 1 :] if paths else ():
+            if a.first < b.first and a.last < b.last and b.first - a.last < most:
+                near = points[max(a.middle, 0) : b.middle + 1]
+                if (fillets := _fillets(a.side, b.side, near, distance, least)) is not None:
+                    found = [ahead for path in paths for ahead in _ahead(path, a, b, fillets)]
+                    reached.setdefault(id(b), []).extend(found)
+    ends = [path for one in last for path in reached.get(id(one), ()) if path.place <= one.end]
+    return list(min(ends, key=lambda path: path.price).lines) if ends else []
 
 
 @dataclass(frozen=True, eq=False)
-class _Fillet:
-    """An arc between two lines along points."""
+class _Path:
+    """Lines one after the other, and how far the last is taken by the fillet at its beginning."""
 
-    start: np.ndarray  # (2,) of the least one, m
-    end: np.ndarray
-    radii: tuple[float, float]  # least and best, m
-    price: float  # the fewer, the better; the closer, the better
+    price: float  # the fewer curves, the better; then the closer
+    place: float  # m
+    lines: tuple[_Stretch, ...]
 
 
-def _fillet(
+def _better(paths: list[_Path]) -> list[_Path]:
+    """Return the paths of which no other one is cheaper and takes less."""
+    found: list[_Path] = []
+    for path in sorted(paths, key=lambda path: (path.price, path.place)):
+        if not found or path.place < found[-1].place - 1e-12:
+            found.append(path)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Fillets:
+    """Arcs between two lines along points."""
+
+    corner: np.ndarray  # (2,) m
+    tangent: float  # of half the turn
+    radii: np.ndarray  # (n,) m, increasing
+    off: np.ndarray  # (n,) largest distance from the points, over the one that is allowed
+
+
+def _ahead(path: _Path, a: _Stretch, b: _Stretch, fillets: _Fillets) -> list[_Path]:
+    """Return what becomes of a path that goes on from a line to the next one."""
+    room = a.position(fillets.corner) - path.place
+    radii, off = fillets.radii, fillets.off
+    fits = np.flatnonzero(off <= 1.0)
+    best = float(radii[np.argmin(off)])
+    chosen = [(float(radii[fits[0]]), best, 2.0), (best, best, 2.0)]
+    touching = room / fillets.tangent  # no line is left between two arcs
+    k = int(np.searchsorted(radii, touching))
+    on_axis = a.begin == 0.0
+    if (len(path.lines) > 1 or on_axis) and 0 < k < len(radii) and off[k - 1 : k + 1].max() <= 1.0:
+        chosen.append((touching, touching, 1.0))
+    found = []
+    for radius, wanted, curves in chosen:
+        reach = radius * fillets.tangent
+        if reach <= room * (1.0 + 1e-12):
+            price = path.price + curves + CURVED * np.interp(wanted, radii, off) ** 2
+            side = replace(b.side, radii=(radius, max(wanted, GROWN * radius)))
+            lines = (*path.lines, replace(b, side=side))
+            found.append(_Path(float(price), b.position(fillets.corner) + reach, lines))
+    return found
+
+
+def _fillets(
     a: _Side, b: _Side, points: np.ndarray, distance: float, least: float
-) -> _Fillet | None:
-    """Return the fillets with which two lines stay within a distance of points, None without."""
+) -> _Fillets | None:
+    """Return fillets with which two lines stay within a distance of points; None without one."""
     turn = float(np.arctan2(_cross(a.along, b.along), a.along @ b.along))
     if not NO_TURN < abs(turn) < SHARPEST:
         return None
-    place = a.point + _cross(b.point - a.point, b.along) / np.sin(turn) * a.along
-    tangent, sign = np.tan(0.5 * abs(turn)), np.sign(turn)
-    ahead, behind = (place - points[0]) @ a.along, (points[-1] - place) @ b.along
-    most = min(ahead, behind) / tangent
+    corner = a.point + _cross(b.point - a.point, b.along) / np.sin(turn) * a.along
+    tangent = float(np.tan(0.5 * abs(turn)))
+    along_a, along_b = (points - corner) @ a.along, (points - corner) @ b.along
+    most = min(-along_a[0], along_b[-1]) / tangent
     if most <= (low := least if turn < 0.0 else 0.1 * most):
         return None
-    radii = np.geomspace(low, most, RADII)[:, None]
-    along_a, along_b = (points - place) @ a.along, (points - place) @ b.along
-    side = -sign * _right(a.along)
-    centre = place - radii * tangent * a.along + radii * side
-    off = np.abs(np.linalg.norm(points - centre[:, None], axis=2) - radii)
-    for along_, one, sense in ((along_a, a, -1.0), (along_b, b, 1.0)):
-        on = sense * along_ >= radii * tangent
-        off = np.where(on, np.abs(_cross(points - place, one.along)), off)
-    worst = off.max(axis=1)
-    if not (fits := np.flatnonzero(worst <= distance)).size:
-        return None
-    small, best = float(radii[fits[0], 0]), int(np.argmin(worst))
-    reach = small * tangent
-    price = 1.0 + CURVED * (worst[best] / distance) ** 2
-    start, end = place - reach * a.along, place + reach * b.along
-    return _Fillet(start, end, (small, float(radii[best, 0])), float(price))
+    radii = low * (most / low) ** SPREAD
+    centre = corner - radii * (tangent * a.along + np.sign(turn) * _right(a.along))
+    off = np.abs(np.hypot(*(points.T[:, None] - centre.T[:, :, None])) - radii)
+    off_a, off_b = (np.abs(_cross(points - corner, one.along)) for one in (a, b))
+    off = np.where(along_a <= -radii * tangent, off_a, off)
+    worst = np.where(along_b >= radii * tangent, off_b, off).max(axis=1) / distance
+    return _Fillets(corner, tangent, radii[:, 0], worst) if worst.min() <= 1.0 else None
 
 
-def _parallel(chains: list[list[_Side]], distance: float, width: float) -> list[list[_Side]]:
+def _parallel(
+    chains: list[list[_Side]], distance: float, width: float, turns: set[int]
+) -> list[list[_Side]]:
     """Return the sides with those parallel that face each other over material and nearly are."""
     places = [(i, k) for i, chain in enumerate(chains) for k in range(len(chain))]
     sides = [chains[i][k] for i, k in places]
-    free = [n for n, one in enumerate(sides) if one.run is None and one.length > 0.0]
+    # Those whose ids are not in `turns` stay, as those of the arm's own curves.
+    free = [n for n, one in enumerate(sides) if id(one) in turns and one.length > 0.0]
     found = [list(chain) for chain in chains]
     done: set[int] = set()
     for n in sorted(free, key=lambda n: -sides[n].length):
@@ -493,9 +516,9 @@ def _parallel(chains: list[list[_Side]], distance: float, width: float) -> list[
         other = sides[best[1]]
         # Of two free ones the mean, the longer counting more; the arm's own stays.
         d = one.length * one.along - other.length * other.along
-        d = -other.along if other.run is not None else d / np.linalg.norm(d)
+        d = -other.along if best[1] not in free else d / np.linalg.norm(d)
         for number, along_ in ((n, d), (best[1], -d)):
-            if sides[number].run is None:
+            if number in free:
                 i, k = places[number]
                 found[i][k] = replace(sides[number], along=along_)
                 done.add(number)
@@ -559,7 +582,10 @@ def _loop(sides: list[_Side], outline: Outline) -> list[Piece] | None:
         return None
     radii = [side.radii or (outline.rounding, outline.rounding) for side in sides]
     turns = [_turn(sides[k - 1], sides[k], points[k]) for k in range(n)]
-    need = [r[0] * np.tan(min(0.5 * abs(turn), 1.5)) for r, turn in zip(radii, turns, strict=True)]
+    need = [
+        0.0 if turn > 0.0 and side.radii is None else r[0] * np.tan(min(0.5 * abs(turn), 1.5))
+        for side, r, turn in zip(sides, radii, turns, strict=True)
+    ]
     corners = []
     for k in range(n):  # what both fillets of a side do not need they share
         reach = np.inf
