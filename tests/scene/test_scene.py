@@ -414,6 +414,7 @@ BAD_VALUES = [
     ("design.limits_on", ["dilated", True], '"nominal" | "eroded"'),
     ("design.sharpness interpolation.penalty", [0.9], "a number >= 1"),
     ("design.minimum_member design.minimum_gap", [-1e-9], "a number >= 0 and <= 10000"),
+    ("part.minimum_member", [-1e-9], "a number >= 1e-06 and <= 10000"),
     ("design.erosion", [0.5], "a number >= 0.001 and <= 0.499"),
     ("optimizer.max_iterations optimizer.exact_iterations", [-1, 400.0], "an integer >= 0"),
     ("optimizer.kkt_tolerance", [-1e-9], "a number >= 0 and <= 1000000"),

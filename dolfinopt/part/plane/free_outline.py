@@ -55,6 +55,8 @@ EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 WIDENED, WIDENINGS = 0.06, 12  # cells by which thin members grow at a time, and how often
 ROUNDER, ROUNDED, ROUNDINGS = 1.03, 1e-3, 60  # radius asked for; move that ends it, over the tool's
+CROWDED = 0.4  # distance of control points over the median one, from which on they are spaced anew
+PEAKS = 4  # places for every control point where curvature is looked at
 BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
 
@@ -121,6 +123,25 @@ class Run:
         along = along / np.maximum(np.linalg.norm(along, axis=1), 1e-300)[:, None]
         return at, np.stack([along[:, 1], -along[:, 0]], axis=1)
 
+    @property
+    def is_crowded(self) -> bool:
+        """Whether two control points are far closer to each other than most are."""
+        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        inner = steps if self.closed else steps[2:-2]  # a clamped end has them closer by itself
+        return bool(inner.min(initial=np.inf) < CROWDED * np.median(steps))
+
+    @property
+    def even(self) -> Run:
+        """The run with as many control points, evenly spaced."""
+        n = len(self.points)
+        t = np.linspace(0.0, 1.0, 4 * n)
+        line = np.vstack(
+            [*(piece.curve.at(t)[:-1] for piece in self.pieces), self.pieces[-1].curve.end]
+        )
+        if self.closed:
+            return Run(fitted_closed(line[:-1], _length(line) / n, False), True)
+        return Run(_fitted_open(line, _length(line) / (n - DEGREE)), False)
+
     def sharper(self, radius: float) -> np.ndarray:
         """Return how far (n,) control points would move outwards, m, to round concave corners.
 
@@ -128,22 +149,27 @@ class Run:
         right there, h being their spacing. 0 where control points stay.
         """
         n = len(self.points)
+        fine = np.arange(n * PEAKS) / (n * PEAKS)  # curvature may peak between control points
         if self.closed:
-            t = ((np.arange(n) - 1) % n) / n
-            d, dd = (_periodic(n, t, order) @ self.points for order in (1, 2))
+            beside = (np.rint(fine * n).astype(int) + 1) % n
+            d, dd = (_periodic(n, fine, order) @ self.points for order in (1, 2))
             ends = np.roll(self.points, 1, axis=0), np.roll(self.points, -1, axis=0)
         else:
             knots = _curves_of(n, False)[0][0]
             curve = Spline(knots, self.points)
             t = np.clip([knots[k + 1 : k + 4].mean() for k in range(n)], 0.0, 1.0)
-            d, dd = curve.derivative(t), curve.derivative(t, 2)
+            fine = np.append(fine, 1.0)
+            beside = np.searchsorted(0.5 * (t[1:] + t[:-1]), fine)
+            d, dd = curve.derivative(fine), curve.derivative(fine, 2)
             padded = np.vstack([self.points[:1], self.points, self.points[-1:]])
             ends = padded[:-2], padded[2:]
         speed = np.maximum(np.linalg.norm(d, axis=1), 1e-300)
-        bend = -(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3
+        bend = np.zeros(n)
+        np.maximum.at(bend, beside, -(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3)
         spacing = sum(0.5 * np.linalg.norm(self.points - end, axis=1) for end in ends)
         s = 0.25 * spacing**2 * np.maximum(bend - 1.0 / radius, 0.0)
-        if not self.closed:
+        if not self.closed:  # the curvature at the end is that of the third point off the tangent
+            s[2], s[-3] = s[:3].max(), s[-3:].max()
             s[[0, 1, -2, -1]] = 0.0
         return np.asarray(s)
 
@@ -411,9 +437,22 @@ class FreeOutline:
                 s[block][[0, 1, -2, -1]] = 0.0
         return self.moved(self._symmetric(s))
 
+    def _even(self) -> FreeOutline:
+        """Return the outline with control points that have crowded evenly spaced again."""
+        # Curves between crowded ones turn sharply, whatever their moves.
+        crowded = [run.is_crowded for run in self.runs]
+        if not any(crowded):
+            return self
+        runs = [run.even if is_so else run for run, is_so in zip(self.runs, crowded, strict=True)]
+        if self.partner is not None:
+            points = np.vstack([run.points for run in runs])
+            points = 0.5 * (points + points[self.partner] * MIRROR)
+            runs = [replace(r, points=points[b]) for r, b in zip(runs, self.blocks, strict=True)]
+        return replace(self, runs=tuple(runs))
+
     def rounded(self) -> FreeOutline:
         """Return the outline with concave corners as wide as the tool, by more material there."""
-        made, tool = self, ROUNDER * self.part.outline.tool_radius / self.scale
+        made, tool = self._even(), ROUNDER * self.part.outline.tool_radius / self.scale
         for _ in range(ROUNDINGS if tool > 0.0 and self.runs else 0):
             s = np.concatenate([run.sharper(tool) for run in made.runs])
             if s.max() < ROUNDED * tool:

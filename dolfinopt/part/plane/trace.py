@@ -102,11 +102,14 @@ def _runs(
     on = _owners(points, lines, 3.0 * outline.chord)
     on = _without_dents(points, on, lines, DENT * tol)
     on = _without_specks(points, on, tol)
-    edges = [*edges, *_fillets(points, on, outline, len(edges))]
+    count = len(edges)
+    edges = [*edges, *_fillets(points, on, outline, count)]
+    if edges[count - 1].label == AXIS:
+        on = _without_stubs(points, on, count, tol)
     reach = REACH * outline.domain.cell
     if outline.tool_radius > 0.0:  # its roundings are none
         reach = min(reach, 0.4 * outline.tool_radius)
-    corner = _corners(points, on, reach)
+    corner = _corners(points, on, reach, tol)
     cuts = np.flatnonzero((on != np.roll(on, 1)) | corner)
     n = len(points)
     if len(cuts) == 0:
@@ -162,6 +165,20 @@ def _fillets(points: np.ndarray, on: np.ndarray, outline: Outline, first: int) -
     return found
 
 
+def _without_stubs(points: np.ndarray, on: np.ndarray, first: int, size: float) -> np.ndarray:
+    """Give free blocks shorter than `size` between the axis and an arc of the tool to the arc."""
+    # Arcs have the numbers from `first` on, the axis the one before. A curve so short could not be
+    # meshed beside its mirror image.
+    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    blocks = _blocks(on)
+    for k, block in enumerate(blocks):
+        beside = sorted((on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]))
+        is_stub = on[block[0]] == -1 and beside[0] == first - 1 and beside[1] >= first
+        if is_stub and step[block].sum() < size:
+            on[block] = beside[1]
+    return on
+
+
 def _blocks(on: np.ndarray) -> list[np.ndarray]:
     """Return the sides of a closed polygon in blocks of one owner, cyclic."""
     starts = np.flatnonzero(on != np.roll(on, 1))
@@ -197,8 +214,11 @@ def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarr
     return on
 
 
-def _corners(points: np.ndarray, on: np.ndarray, reach: float) -> np.ndarray:
-    """Return (n,) True where a free polygon has a corner: it turns by `CORNER` within 2 `reach`."""
+def _corners(points: np.ndarray, on: np.ndarray, reach: float, apart: float) -> np.ndarray:
+    """Return (n,) True where a free polygon has a corner: it turns by `CORNER` within 2 `reach`.
+
+    None is nearer than `apart` to where it comes to another curve.
+    """
     step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     total = step.sum()
     here = np.cumsum(step) - step
@@ -211,6 +231,9 @@ def _corners(points: np.ndarray, on: np.ndarray, reach: float) -> np.ndarray:
     turn = np.abs(_turn(points - at(-reach), at(reach) - points))
     found = np.zeros(len(points), dtype=bool)
     free = (on == -1) & (np.roll(on, 1) == -1)
+    for joint in here[on != np.roll(on, 1)]:
+        away = np.abs(here - joint)
+        free &= np.minimum(away, total - away) > apart
     for k in np.argsort(-turn):
         if turn[k] < CORNER:
             break
