@@ -7,15 +7,18 @@ import json
 import numpy as np
 import pytest
 import runs
+from cutter import deepest_left
 from parts import folder_with, frame, write_run
 from runs import refusal, run
 
+from dolfinopt import load_scene
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.part.optimize import Problem, optimize_parts
-from dolfinopt.part.part import make_parts
+from dolfinopt.part.part import Curves, make_parts
 from dolfinopt.part.plane.curves import MIRROR, Arc, Spline, direction
 from dolfinopt.part.plane.free_outline import free_outline
+from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.responses.constraints import EXCESS
 
 pytestmark = pytest.mark.serial
@@ -226,3 +229,61 @@ def test_flanges_that_would_buckle_are_kept(tmp_path):
     assert 1.7 * (1.0 - EXCESS) <= limits["buckling"] < 1.75
     assert limits["deviation"] < 0.3
     assert found[0.01][0] < 0.99 * mass
+
+
+SCARA = str(runs.ROOT / "demos" / "scara.toml")
+COARSE = ("arms.mesh_size=0.004", "design.filter_radius=0.008")
+
+
+def braced(length, inboard, outboard):
+    """Return the density of a tapered frame with a diagonal in each of two bays, half heights."""
+
+    def density(x, y):
+        edge = inboard - (inboard - outboard) * x / length
+        near = np.minimum(x, length - x) < 1.1 * inboard
+        webs = np.abs((4.0 * x / length) % 2.0 - 1.0 - np.abs(y) / edge) < 0.14
+        frame = near | (np.abs(y) > edge - 0.014) | webs
+        rings = (np.hypot(x, y) < inboard) | (np.hypot(x - length, y) < outboard)
+        return ((x > 0.0) & (x < length) & frame) | rings
+
+    return density
+
+
+@pytest.fixture(scope="module")
+def scara(tmp_path_factory):
+    """The scene of a SCARA robot with drawn designs, and their parts."""
+    folder = tmp_path_factory.mktemp("scara") / "run"
+    scene = load_scene(SCARA, COARSE)
+    write_run(folder, scene, braced(0.325, 0.05, 0.0375), braced(0.275, 0.0375, 0.028125))
+    scene = scene_of(folder)
+    return scene, make_parts(scene, folder, Curves(scene.part.tool_radius))
+
+
+@pytest.mark.slow
+def test_cutter_and_smallest_member_of_a_scara_robot(scara):
+    """Every concave corner takes the 6 mm cutter, and no member is thinner than 4 mm."""
+    scene, parts = scara
+    found = optimize_parts(scene, parts, STEPS, lambda line: None)
+    assert found.best.value < 0.99 * found.before
+    assert all(limit.met for limit in found.best.limits)
+    size = 1e-4
+    for part in found.parts.values():
+        assert part.shape.concave_radius >= scene.part.tool_radius
+        assert part.thinnest >= scene.part.minimum_member
+        for radius, within in ((0.003, False), (0.002, True)):
+            deep, _ = deepest_left(part.shape, radius, size, within)
+            assert deep <= 1.5 * size  # the raster's own
+
+
+def test_trusses_between_bores_have_their_material_there(scara):
+    """Straight flanges from ring to ring: nothing lies beyond the bores."""
+    scene, parts = scara
+    first, second = (trusses_of(parts, number) for number in (0, 1))
+    for k, part in parts.items():
+        shape, arm = first[k].shape, part.domain
+        assert shape.area == pytest.approx(arm.volume, rel=0.02)
+        ends = np.concatenate([piece.curve.at(np.linspace(0.0, 1.0, 9)) for piece in shape.pieces])
+        ring = 0.4 * 0.5 * arm.height + scene.arms[k].passive
+        assert ends[:, 0].min() > -1.1 * ring
+        assert free_outline(first[k]).is_valid
+        assert len(second[k].shape.loops) > len(shape.loops)  # one bay more

@@ -56,6 +56,9 @@ LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be 
 WIDENED, WIDENINGS = 0.06, 12  # cells by which thin members grow at a time, and how often
 ROUNDER, ROUNDED, ROUNDINGS = 1.03, 1e-3, 60  # radius asked for; move that ends it, over the tool's
 CROWDED = 0.4  # distance of control points over the median one, from which on they are spaced anew
+LEAST_LEFT = 0.6  # of a hole's area, when its corners are rounded
+STEEP = 0.2  # most that curvature counts above the tool's in one rounding, times the spacing
+EVENLY = 20  # roundings after which control points are looked at for crowds
 PEAKS = 4  # places for every control point where curvature is looked at
 BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
@@ -124,6 +127,12 @@ class Run:
         return at, np.stack([along[:, 1], -along[:, 0]], axis=1)
 
     @property
+    def size(self) -> float:
+        """Area, m2, within the control points of a whole loop; of others infinite."""
+        x, y = self.points.T
+        return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) if self.closed else np.inf
+
+    @property
     def is_crowded(self) -> bool:
         """Whether two control points are far closer to each other than most are."""
         steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
@@ -167,10 +176,11 @@ class Run:
         bend = np.zeros(n)
         np.maximum.at(bend, beside, -(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3)
         spacing = sum(0.5 * np.linalg.norm(self.points - end, axis=1) for end in ends)
-        s = 0.25 * spacing**2 * np.maximum(bend - 1.0 / radius, 0.0)
-        if not self.closed:  # the curvature at the end is that of the third point off the tangent
-            s[2], s[-3] = s[:3].max(), s[-3:].max()
+        s = 0.25 * spacing**2 * np.clip(bend - 1.0 / radius, 0.0, STEEP / spacing)
+        if not self.closed:
             s[[0, 1, -2, -1]] = 0.0
+            # What turns beside a held end cannot be mended by the one control point that moves.
+            s[[2, -3]] = np.minimum(s[[2, -3]], s[[3, -4]])
         return np.asarray(s)
 
     def filter(self, reach: float) -> np.ndarray:
@@ -452,13 +462,19 @@ class FreeOutline:
 
     def rounded(self) -> FreeOutline:
         """Return the outline with concave corners as wide as the tool, by more material there."""
-        made, tool = self._even(), ROUNDER * self.part.outline.tool_radius / self.scale
-        for _ in range(ROUNDINGS if tool > 0.0 and self.runs else 0):
+        made, tool = self, ROUNDER * self.part.outline.tool_radius / self.scale
+        for number in range(ROUNDINGS if tool > 0.0 and self.runs else 0):
+            made = made if number % EVENLY else made._even()
             s = np.concatenate([run.sharper(tool) for run in made.runs])
             if s.max() < ROUNDED * tool:
                 break
             made = made.moved(self._symmetric(s))
-        return made
+        # A hole about as wide as the tool would close: it stays, and is told as a tight place.
+        runs = [
+            after if after.size >= LEAST_LEFT * before.size else before
+            for before, after in zip(self.runs, made.runs, strict=True)
+        ]
+        return replace(made, runs=tuple(runs))
 
     def scaled(self, part: PlanePart, factors: np.ndarray) -> FreeOutline:
         """Return the outline of a part that repeats this one's design, stretched by (2,) factors.

@@ -42,7 +42,8 @@ FILLET = 0.8  # radius of a truss's concave corners, cells
 FEWEST = 2  # bays of the first truss; every further one of a short arm has one more
 SMALLEST_HOLE = 4.0  # area of a hole that is worth its outline, squared cells
 AREA = 1e-3  # relative: of a truss
-CLOSE = 0.1  # distance of its curves from straight struts, cells: they will move anyway
+# Distances of its curves from straight struts, cells, tried in turn: they will move anyway.
+CLOSE = 0.1, 0.05, 0.2
 SLENDER = 1.6  # width of struts that may go, over the least width of members
 WIDER = 1.3, 1.8, 2.5  # width that joins two holes over the distance between them, tried in turn
 CUSP = 4.0  # radius to which cusps where struts have ended are cut back, cells
@@ -91,10 +92,14 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
         raise ConvergenceError(f"arm {domain.name!r}: no room for a truss of the part's area")
     flange = brentq(missing, thin, thick, xtol=AREA * domain.cell)
     found = replace(drawn, polygon=polygon(flange), islands=0, islands_area=0.0, filled=0)
-    try:
-        shape = make_shape(found, max(part.tolerance, CLOSE * domain.cell))
-    except InputError as error:
-        raise ConvergenceError(str(error)) from None
+    for close in CLOSE:
+        try:
+            shape = make_shape(found, max(part.tolerance, close * domain.cell))
+            break
+        except InputError as error:
+            problem = ConvergenceError(str(error))
+    else:
+        raise problem
     return replace(part, outline=found, shape=shape)
 
 
@@ -145,7 +150,9 @@ def _windows(
     bays = max(fewest, round((right - left) / (slope * (high - low))))
     x = np.linspace(left, right, bays + 1)
     # To the middle of the flanges, whose place is that of the edge beside each node.
-    reach = [_extent(inside, at, low, high) for at in np.clip(x, left + 1e-9, right - 1e-9)]
+    # A region around a bore ends in two tips: a little further on both are met.
+    near = 1e-2 * (right - left)
+    reach = [_extent(inside, at, low, high) for at in np.clip(x, left + near, right - near)]
     ends = [[b + 0.5 * flange, a - 0.5 * flange] for a, b in reach]
     lines = [shapely.LineString([(x[k], ends[k][k % 2]) for k in range(bays + 1)])]
     if symmetric:

@@ -35,6 +35,7 @@ from dolfinopt.part.plane.outline import Outline
 CORNER = np.radians(60.0)  # turn within `REACH` to either side that makes a corner of a free run
 SMOOTH = np.radians(15.0)  # difference of directions up to which a joint is smooth
 REACH = 0.15  # over which directions are measured, cells
+STUB = 0.5  # of it, length of free runs at least
 TURN = np.radians(8.0)  # of a polyline at a corner that counts among its points
 DENT = 0.2  # depth of a free run in the arm's own edge that is not followed, tolerances
 AXIS, FILLET = "axis", "fillet"
@@ -109,7 +110,7 @@ def _runs(
     reach = REACH * outline.domain.cell
     if outline.tool_radius > 0.0:  # its roundings are none
         reach = min(reach, 0.4 * outline.tool_radius)
-    corner = _corners(points, on, reach, tol)
+    corner = _corners(points, on, reach, max(tol, STUB * reach))
     cuts = np.flatnonzero((on != np.roll(on, 1)) | corner)
     n = len(points)
     if len(cuts) == 0:
