@@ -45,7 +45,7 @@ SPACING = 1.2  # of control points, cells of the design
 REACH = 2.0  # length r over which moves are smooth, cells
 LEAST_POINTS = 8  # control points of a closed run; an open one has 3 more than it has spans
 SAMPLES = 8  # points for every control point that a run is fitted to
-STIFF = 1e-4  # of second differences of control points, where they are fitted
+STIFF = 1.0  # of second differences of control points, where they are fitted: stairs of cells fade
 WORN = 0.15  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
 CHORD = 0.005  # distance of polygons from the curves, cells
 NEAREST = 200  # places around each that may be the other side of a member or a gap
@@ -57,6 +57,7 @@ WIDENED, WIDENINGS = 0.06, 12  # cells by which thin members grow at a time, and
 ROUNDER, ROUNDED, ROUNDINGS = 1.03, 1e-3, 60  # radius asked for; move that ends it, over the tool's
 CROWDED = 0.4  # distance of control points over the median one, from which on they are spaced anew
 LEAST_LEFT = 0.6  # of a hole's area, when its corners are rounded
+AREA_STEPS = 3  # Newton's, for the area of the part that an outline was fitted to
 STEEP = 0.2  # most that curvature counts above the tool's in one rounding, times the spacing
 EVENLY = 20  # roundings after which control points are looked at for crowds
 PEAKS = 4  # places for every control point where curvature is looked at
@@ -447,6 +448,15 @@ class FreeOutline:
                 s[block][[0, 1, -2, -1]] = 0.0
         return self.moved(self._symmetric(s))
 
+    def _as_large(self, area: float) -> FreeOutline:
+        """Return the outline moved outwards by one length, so that it encloses an area, m2."""
+        made = self
+        moves = np.concatenate([run.filter(0.0).any(axis=1) for run in self.runs] or [np.empty(0)])
+        for _ in range(AREA_STEPS if moves.any() else 0):
+            by_s = made.size_by_s() @ moves
+            made = made.moved(moves * ((area - made.size) / by_s))
+        return made
+
     def _even(self) -> FreeOutline:
         """Return the outline with control points that have crowded evenly spaced again."""
         # Curves between crowded ones turn sharply, whatever their moves.
@@ -585,7 +595,8 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
         runs, partner = mirrored(runs)
     member = max(domain.minimum_member / scale, LEAST_MEMBER * cell)
     least = member, max(2.0 * tool / scale, minimum_gap / scale, LEAST_GAP * cell)
-    made = FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner, scale).rounded()
+    made = FreeOutline(part, tuple(loops), tuple(runs), arm, stays, least, partner, scale)
+    made = made._as_large(shape.area).rounded()
     for _ in range(WIDENINGS if runs else 0):
         if made.widths()[0].min() >= least[0]:
             break
