@@ -5,21 +5,20 @@ import shapely
 from scipy.ndimage import distance_transform_edt, label
 
 
-def deepest_left(shape, radius, size, within=False):
-    """Return how deep, m, the corners and gaps are that a disc does not reach, and their number.
+def deepest_left(shape, radius, size):
+    """Return how deep, m, the corners and gaps are that a disc does not reach from without.
 
     Args:
         shape: of the part.
         radius: of the disc, m.
         size: of the raster's squares, m; what is found is right to about one and a half of them.
-        within: whether the disc moves in the part, and leaves thin members, or around it.
     """
     outer, *holes = shape.polygons(0.02 * size)
     polygon = shapely.Polygon(outer, holes)
     x0, y0, x1, y1 = polygon.bounds
     x, y = (np.arange(a - 2.0 * radius, b + 2.0 * radius, size) for a, b in ((x0, x1), (y0, y1)))
     shapely.prepare(polygon)
-    void = shapely.contains_xy(polygon, *np.meshgrid(x, y, indexing="ij")) == within
+    void = ~shapely.contains_xy(polygon, *np.meshgrid(x, y, indexing="ij"))
     # Half a square either way: a raster must not leave anything of its own.
     centres = size * distance_transform_edt(void) >= radius - 0.5 * size
     reached = size * distance_transform_edt(~centres) <= radius + 0.5 * size
