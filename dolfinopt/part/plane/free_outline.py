@@ -45,7 +45,8 @@ SPACING = 1.2  # of control points, cells of the design
 REACH = 2.0  # length r over which moves are smooth, cells
 LEAST_POINTS = 8  # control points of a closed run; an open one has 3 more than it has spans
 SAMPLES = 8  # points for every control point that a run is fitted to
-STIFF = 1.0  # of second differences of control points, where they are fitted: stairs of cells fade
+STIFF = 1e-4  # of second differences of control points, where they are fitted
+FAIR = 1.0  # the same where a part has the stairs of its cells, which fade
 WORN = 0.15  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
 CHORD = 0.005  # distance of polygons from the curves, cells
 NEAREST = 200  # places around each that may be the other side of a member or a gap
@@ -583,13 +584,13 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
             smooth = direction(piece.curve, 1.0) @ direction(after.curve, 0.0) > np.cos(KINK)
             if not (after.free and smooth):
                 found.append(len(runs))
-                runs.append(Run(_fitted_open(line, SPACING * cell), False))
+                runs.append(Run(_fitted_open(line, SPACING * cell, FAIR), False))
                 line = np.empty((0, 2))
         loops.append(tuple(found))
     tool = part.outline.tool_radius
     for ring in _free_rings(shape, tool, chord, len(fixed)):
         loops.append((len(runs),))
-        runs.append(Run(fitted_closed(ring, SPACING * cell, domain.symmetric), True))
+        runs.append(Run(fitted_closed(ring, SPACING * cell, domain.symmetric, FAIR), True))
     partner = None
     if domain.symmetric:
         runs, partner = mirrored(runs)
@@ -646,7 +647,9 @@ def _length(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def fitted_closed(ring: np.ndarray, spacing: float, symmetric: bool) -> np.ndarray:
+def fitted_closed(
+    ring: np.ndarray, spacing: float, symmetric: bool, stiff: float = STIFF
+) -> np.ndarray:
     """Return control points (n, 2) of a periodic spline through a ring of corners."""
     if symmetric and ring[:, 1].min() < 0.0 < ring[:, 1].max():  # begin on the axis
         ring = np.roll(ring, -int(np.argmin(np.abs(ring[:, 1]))), axis=0)
@@ -656,18 +659,18 @@ def fitted_closed(ring: np.ndarray, spacing: float, symmetric: bool) -> np.ndarr
     points = _resampled(line, SAMPLES * n)[:-1]
     basis = _periodic(n, np.arange(SAMPLES * n) / (SAMPLES * n))
     bend = np.roll(np.eye(n), 1, axis=0) - 2.0 * np.eye(n) + np.roll(np.eye(n), -1, axis=0)
-    A = basis.T @ basis / SAMPLES + STIFF * bend.T @ bend
+    A = basis.T @ basis / SAMPLES + stiff * bend.T @ bend
     return np.linalg.solve(A, basis.T @ points / SAMPLES)
 
 
-def _fitted_open(line: np.ndarray, spacing: float) -> np.ndarray:
+def _fitted_open(line: np.ndarray, spacing: float, stiff: float = STIFF) -> np.ndarray:
     """Return control points (n, 2) of a clamped spline along a line, its ends and directions."""
     n = max(6, round(_length(line) / spacing) + DEGREE)
     knots = _curves_of(n, False)[0][0]
     points = _resampled(line, SAMPLES * n)
     basis = BSpline.design_matrix(np.linspace(0.0, 1.0, len(points)), knots, DEGREE).toarray()
     bend = np.diff(np.eye(n), 2, axis=0)
-    A = basis.T @ basis / SAMPLES + STIFF * bend.T @ bend
+    A = basis.T @ basis / SAMPLES + stiff * bend.T @ bend
     right = basis.T @ points / SAMPLES
     found = np.empty((n, 2))
     step = _length(line) * knots[DEGREE + 1] / DEGREE
