@@ -200,7 +200,8 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 SectionName = Literal["box", "tube"]
 WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
-WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall")
+WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall", "ribs")
+RIB_LENGTH, RIB_PITCH = 2, 4  # cells along a hollow arm: of a rib; from one to the next at least
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
@@ -326,6 +327,12 @@ class Arm(Table):
         default=None,
         description="largest thickness of the wall, also that of the flanges, rings over passive "
         "at both ends; default: twice wall [m]",
+    )
+    ribs: int | None = Field(
+        default=None,
+        ge=0,
+        description="rings of a hollow arm at even distances between its ends, two cells long and "
+        "as thick as max_wall; default: none [-]",
     )
     design: str | None = Field(
         default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
@@ -493,6 +500,13 @@ class Arm(Table):
             raise Refusal(
                 f"expected at most {MOST_AROUND} cells round the section with hollow = true, "
                 f"2 (ny + nz), found {around}",
+                ("cells",),
+            )
+        if self.ribs and RIB_PITCH * (self.ribs + 1) > self.cells[0]:
+            raise Refusal(
+                f"expected at most {max(0, self.cells[0] // RIB_PITCH - 1)} with "
+                f"{self.cells[0]} cells along the arm, {RIB_PITCH} from rib to rib",
+                ("ribs",),
                 ("cells",),
             )
         self._check_wall()
@@ -716,7 +730,9 @@ class Arm(Table):
     @property
     def passive_share(self) -> float:
         """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
-        return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
+        if self.cells is None:
+            return 0.0
+        return (2.0 * self.passive_columns + RIB_LENGTH * (self.ribs or 0)) / self.cells[0]
 
     @property
     def fixed_shares(self) -> tuple[float, float]:
