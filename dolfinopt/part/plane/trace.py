@@ -562,6 +562,7 @@ def with_area(
     )
     if length == 0.0:
         return change(shape)
+    shape = Shape(tuple(tuple(map(_bendable, loop)) for loop in shape.loops))
     offset, slope = 0.0, length  # curves with ends that stay gain less than that
     moved = change(shape)
     for _ in range(STEPS):
@@ -574,6 +575,15 @@ def with_area(
         gained = (missing - (area - moved.area)) / step
         slope = gained if gained > 0.1 * slope else slope
     return replace(moved, offset=offset)
+
+
+def _bendable(piece: Piece) -> Piece:
+    """Return a piece with control points that can move, where its ends would hold them all."""
+    curve, held = piece.curve, 2 * sum(piece.fixed)
+    if not (piece.free and isinstance(curve, Spline) and held >= len(curve.points)):
+        return piece
+    more = np.union1d(curve.breaks, np.linspace(0.0, 1.0, held + 1))
+    return replace(piece, curve=curve.over(more))
 
 
 def _offset(shape: Shape, distance: float) -> Shape:
