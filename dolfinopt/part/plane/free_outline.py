@@ -667,14 +667,9 @@ def _without_hooks(loop: list[Piece | _Line], size: float, edge: Geometry) -> li
 
 
 def _straight(points: np.ndarray, side: Line, size: float, edge: Geometry) -> np.ndarray | None:
-    """Return points whose beginning comes straight from where they cross a side; None if nowhere.
-
-    Args:
-        points: (n, 2) from the side on, m.
-        side: on which they begin.
-        size: length that becomes straight, m; the beginning moves by at most twice as much.
-        edge: the arm's own, on which the beginning stays.
-    """
+    """Return points that come straight from where they cross a side; None if nowhere."""
+    # They begin on the side; over `size` (m) they become straight, and their beginning moves by at
+    # most twice as much, on the arm's own `edge`.
     import shapely
 
     s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))

@@ -216,10 +216,8 @@ def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarr
 
 
 def _corners(points: np.ndarray, on: np.ndarray, reach: float, apart: float) -> np.ndarray:
-    """Return (n,) True where a free polygon has a corner: it turns by `CORNER` within 2 `reach`.
-
-    None is nearer than `apart` to where it comes to another curve.
-    """
+    """Return (n,) True where a free polygon has a corner: it turns by `CORNER` within 2 `reach`."""
+    # None is nearer than `apart` to where it comes to another curve.
     step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     total = step.sum()
     here = np.cumsum(step) - step
