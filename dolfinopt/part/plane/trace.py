@@ -625,13 +625,16 @@ ENOUGH = 0.98  # share of the tool's radius for which no other attempt is made
 ARCS = 0.25  # share of the tolerance for arcs in place of splines
 
 
-def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
+def make_shape(
+    outline: Outline, tolerance: float, arcs: bool = False, area: float | None = None
+) -> Shape:
     """Return the curves of an outline.
 
     Args:
         outline: whose polygon they follow.
         tolerance: largest distance of the free curves from it, m.
         arcs: lines and arcs in place of splines.
+        area: to be enclosed, m2; None: that of the design.
 
     Raises:
         InputError: curves on both sides of a neck meet.
@@ -643,7 +646,8 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     best: Shape | None = None
     for share, finer in ATTEMPTS:
         finest = share * tolerance * (1.0 - ARCS if arcs else 1.0)
-        shape = with_area(_follow(outline, finest, finer), outline.domain.volume, change)
+        wanted = outline.domain.volume if area is None else area
+        shape = with_area(_follow(outline, finest, finer), wanted, change)
         if shape.distance > tolerance or not shape.is_simple(0.1 * share * tolerance):
             continue
         if shape.concave_radius >= ENOUGH * outline.tool_radius:
