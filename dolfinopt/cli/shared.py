@@ -198,7 +198,7 @@ def draw(
     from dolfinopt.plots.machine import machine_figure
     from dolfinopt.plots.style import save
 
-    title, closure, bodies = scene.name, trajectory.closure, trajectory.mechanism.bodies
+    title, closure, bodies = scene.name, trajectory.closure, trajectory.mechanism.arms
     if arms := designed(views):
         masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
         save(design_figure(arms, title, masses), folder / "design.png")

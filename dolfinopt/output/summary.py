@@ -229,7 +229,7 @@ def _contacts(found: Contacts) -> dict[str, Any]:
 def _first_frequencies(run: Simulated, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
     """Return those of flexible arms by name, Hz; of a body from a file, what its modes tell."""
     found = {}
-    bodies = () if run.trajectory is None else run.trajectory.mechanism.bodies
+    bodies = () if run.trajectory is None else run.trajectory.mechanism.arms
     for arm, body in zip(run.scene.arms, bodies, strict=False):
         own = by_arm[arm.name].frequency if arm.name in by_arm else None
         value = body.first_frequency if own is None else own
@@ -289,7 +289,7 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         return dict(zip(scene.driven, map(float, values[columns]), strict=True))
 
     peak, rms = trajectory.drives
-    bodies = trajectory.mechanism.bodies
+    bodies = trajectory.mechanism.arms
     found = {
         "max_rotation": trajectory.max_rotation,
         "settling": trajectory.settling,

@@ -12,6 +12,20 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
 from dolfinopt.scene.tables.design import Region, check_regions
+from dolfinopt.scene.tables.joint_parts import (
+    FRICTION_SPEED,
+    PART_KEYS,
+    BearingDamping,
+    BearingStiffness,
+    Friction,
+    FrictionSpeed,
+    GearDamping,
+    GearRatio,
+    GearStiffness,
+    RotorInertia,
+    check_parts,
+    check_plane_bearing,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -213,8 +227,10 @@ MESH_FILES = (".geo", ".msh", *STEP_FILES)
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = (
     "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
-    "joint_damping",
+    "joint_damping", *PART_KEYS,
 )  # fmt: skip
+SPRING_KEYS = "joint_stiffness", "joint_damping"  # the same spring by either pair of keys
+GEAR_KEYS = "gear_stiffness", "gear_damping"
 SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
 MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset")
@@ -366,28 +382,23 @@ class Arm(Table):
         le=1e9,
         description="moment of inertia at the outboard interface [kg m2]",
     )
-    rotor_inertia: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e9,
-        description="moment of inertia of the rotor that drives this arm's inboard joint [kg m2]",
-    )
-    gear_ratio: float = Field(
-        default=1.0,
-        ge=1e-3,
-        le=1e6,
-        description="revolutions of the rotor per revolution of the inboard joint [-]",
-    )
+    rotor_inertia: RotorInertia = 0.0
+    gear_ratio: GearRatio = 1.0
+    gear_stiffness: GearStiffness = 0.0
+    gear_damping: GearDamping = 0.0
     joint_stiffness: float = Field(
         default=0.0,
         ge=0,
         le=1e15,
-        description="spring between the drive and this arm, at its inboard joint; 0: none, the "
-        "arm follows the drive exactly [N m/rad]",
+        description="the same as gear_stiffness, in space, too [N m/rad, N/m]",
     )
     joint_damping: float = Field(
-        default=0.0, ge=0, le=1e15, description="damper beside that spring [N m s/rad]"
+        default=0.0, ge=0, le=1e15, description="damper beside that spring [N m s/rad, N s/m]"
     )
+    bearing_stiffness: BearingStiffness = None
+    bearing_damping: BearingDamping = None
+    friction: Friction = None
+    friction_speed: FrictionSpeed = FRICTION_SPEED
     sid: FileName | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
@@ -565,6 +576,13 @@ class Arm(Table):
                 ("joint_damping",),
                 ("joint_stiffness",),
             )
+        if self.joint_stiffness > 0.0 and self.gear_stiffness > 0.0:
+            raise Refusal(
+                "expected only one of gear_stiffness and joint_stiffness: they are the same spring",
+                ("joint_stiffness",),
+                ("gear_stiffness",),
+            )
+        check_parts(self, "arms")
         return self
 
     @property
@@ -773,6 +791,7 @@ class Arm(Table):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
         if not scene.is_spatial:
             self._check_files(before, at)
+            check_plane_bearing(self, at)
         if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "
