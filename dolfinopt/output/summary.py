@@ -21,6 +21,7 @@ from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
+from dolfinopt.output.budget import budget_of
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -80,6 +81,7 @@ def summarise(
             **_figures(run.evaluation),
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),
             **_of_responses(run),

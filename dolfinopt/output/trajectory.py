@@ -138,7 +138,8 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
         units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
     mechanism = trajectory.mechanism
     for place, body in zip(mechanism.bearings, mechanism.bodies[mechanism.num_arms :], strict=True):
-        units |= {f"q_bearing_{scene.arms[place].name}_{name}": unit for name, unit in moves(body)}
+        name = scene.joint_names[place]
+        units |= {f"q_bearing_{name}_{along}": unit for along, unit in moves(body)}
     units |= {f"compliance_{arm.name}": "N m" for arm in scene.arms}
     units |= {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
     if trajectory.is_machine:
