@@ -13,20 +13,18 @@ from dolfinopt.scene.tables.base import Loc, Refusal
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
+Inertia = Annotated[float, Field(ge=0, le=1e9)]  # kg m2
+Ratio = Annotated[float, Field(ge=1e-3, le=1e6)]
 RotorInertia = Annotated[
-    float,
+    Inertia,
     Field(
-        ge=0,
-        le=1e9,
         description="moment of inertia of the rotor that drives the inboard joint, about its own "
         "axis [kg m2]",
     ),
 ]
 GearRatio = Annotated[
-    float,
+    Ratio,
     Field(
-        ge=1e-3,
-        le=1e6,
         description="revolutions of the rotor per revolution of the inboard joint; of a "
         "prismatic joint in space radians per metre [-]",
     ),

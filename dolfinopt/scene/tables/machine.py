@@ -25,9 +25,9 @@ from dolfinopt.scene.tables.joint_parts import (
     Friction,
     FrictionSpeed,
     GearDamping,
-    GearRatio,
     GearStiffness,
-    RotorInertia,
+    Inertia,
+    Ratio,
     check_parts,
     joint_parts,
 )
@@ -87,12 +87,12 @@ class Joint(Table):
         "frame, as in URDF [rad]",
     )
 
-    rotor_inertia: RotorInertia | None = Field(
+    rotor_inertia: Inertia | None = Field(
         default=None,
         description="moment of inertia of the rotor that drives the joint, about its own axis; "
         "default: arms.rotor_inertia of the arm that it holds [kg m2]",
     )
-    gear_ratio: GearRatio | None = Field(
+    gear_ratio: Ratio | None = Field(
         default=None,
         description="revolutions of the rotor per revolution of the joint, radians per metre of a "
         "prismatic one; default: arms.gear_ratio of the arm that it holds [-]",
