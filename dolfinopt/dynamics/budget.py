@@ -68,7 +68,8 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     pose, undeformed, a part whose coordinates have gone by dq contributes n' J dq: the deflection
     of a machine of which this part alone gives way, as much as it does there. A link gives way by
     its elastic coordinates, a bearing by its own, a gear by the joint's angle less the motor's; the
-    control error is the motor's angle less the desired one. In a closed loop the joints without a
+    control error is the motor's angle less the desired one. By how much the control asks a motor to
+    turn ahead of its joint is taken off the gear's part. In a closed loop the joints without a
     drive follow from the others by the linearised constraints.
     """
     worst = int(np.argmax(trajectory.distance))
@@ -126,7 +127,11 @@ def _rigid(
     if not isinstance(problem, MachineSystem):
         return
     drives, error = problem.drives, trajectory.q_r[worst] - trajectory.desired.q[worst]
-    motors = trajectory.motor_columns
+    motors, winding = trajectory.motor_columns, np.zeros_like(error)
+    if drives.winding:
+        asked = problem.at(trajectory.t[worst : worst + 1]).winding
+        assert asked is not None
+        winding[drives.free] = asked[0]
     for k in map(int, drives.free[drives.driven]):
         if trajectory.scene.control is None:
             yield "gear", names[k], float(by_rigid[k] * error[k])
@@ -134,6 +139,7 @@ def _rigid(
         left = 0.0
         if k in motors:
             assert trajectory.motors is not None
-            left = trajectory.q_r[worst, k] - trajectory.motors[worst, motors.index(k)]
+            twist = trajectory.q_r[worst, k] - trajectory.motors[worst, motors.index(k)]
+            left = twist + winding[k]
             yield "gear", names[k], float(by_rigid[k] * left)
         yield "control", names[k], float(by_rigid[k] * (error[k] - left))

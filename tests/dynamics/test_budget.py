@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from machines import Tree, fork, loop_tree, simulated, two_arm, with_keys
+from runs import demo
 
 from dolfinopt.dynamics.budget import Budget, deflection_budget
 
@@ -128,3 +129,28 @@ def test_of_a_slider_and_of_a_pin(tmp_path) -> None:
     assert budget is not None and list(budget.shares) == ["links"]
     assert budget.linear == pytest.approx(budget.deviation, rel=0.05)
     assert deflection_budget(simulated(loop_tree("pin")).trajectory) is None
+
+
+def test_motors_ahead_take_off_what_gears_give(tmp_path) -> None:
+    """At rest nothing is left of gear and drive; the rest stays."""
+    rigid, wound = (
+        by_part(budget_of(held_level(tmp_path, control={"feed_forward": one})))
+        for one in ("rigid", "elastic")
+    )
+    gear = WEIGHT * LENGTHS[1] ** 2 / GEAR
+    assert rigid["gear", "arm"] == pytest.approx(gear, rel=1e-4)
+    assert abs(wound["gear", "arm"]) < 1e-4 * gear and abs(wound["control", "arm"]) < 1e-4 * gear
+    for part in (("link", "arm"), ("bearing", "arm")):
+        assert wound[part] == pytest.approx(rigid[part], rel=1e-4)
+
+
+@pytest.mark.slow
+def test_budget_of_the_demo(tmp_path) -> None:
+    """Gears hold most of the deflection; lighter links hold more of it than before."""
+    rows = demo("demo_geared_robot").main(tmp_path, 2)
+    before, after, *ahead = rows
+    assert before["gears [mm]"] > 0.8 * before["deflection [mm]"]
+    assert after["mass of links [kg]"] < before["mass of links [kg]"]
+    assert after["links [mm]"] > before["links [mm]"]
+    assert all(row["gears [mm]"] < 0.1 * before["gears [mm]"] for row in ahead)
+    assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
