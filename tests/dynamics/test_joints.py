@@ -21,6 +21,7 @@ from machines import (
 )
 from mpi4py import MPI
 from remainders import built_of
+from scipy.linalg import eigh
 
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.responses.response import bodies_in
@@ -209,3 +210,74 @@ def test_bearings_stand_in_files(tmp_path) -> None:
     mass = sum(body.mass for body in trajectory.mechanism.arms) + 2.0
     assert found["q_e"][0, 6 + 2] == pytest.approx(-9.81 * mass / 4e6, rel=1e-4)
     assert found["compliance"].shape[1] == 2
+
+
+def frame(angle: float, springs: tuple[float, float], masses: tuple[float, float]) -> np.ndarray:
+    """Return the lowest three frequencies of two links as Timoshenko beams on springs, Hz.
+
+    Each of 20 elements, 0.5 and 0.54 x 0.03 x 0.01 m of aluminium, the second turned by `angle`,
+    rotational springs inboard of both, point masses at both outboard ends.
+    """
+    E, G, rho, h, b, count = 70e9, 70e9 / 2.66, 2700.0, 0.03, 0.01, 20
+    A, inertia = b * h, b * h**3 / 12.0
+    size = 3 * (2 * count + 1) + 2  # the joints' own rotations stand last: ground and elbow
+    K, M = np.zeros((2, size, size))
+    for k, (length, turn) in enumerate(((0.5, 0.0), (0.54, angle))):
+        s = length / count
+        phi = 12.0 * E * inertia / (5.0 / 6.0 * G * A * s * s)
+        c = E * inertia / (s**3 * (1.0 + phi))
+        stiff, mass = np.zeros((2, 6, 6))
+        stiff[np.ix_([0, 3], [0, 3])] = E * A / s * np.array([[1, -1], [-1, 1]])
+        bend = np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
+        near, far = (4 + phi) * s**2, (2 - phi) * s**2
+        stiff[bend] = c * np.array([
+            [12, 6 * s, -12, 6 * s], [6 * s, near, -6 * s, far],
+            [-12, -6 * s, 12, -6 * s], [6 * s, far, -6 * s, near]])  # fmt: skip
+        mass[np.ix_([0, 3], [0, 3])] = rho * A * s / 6.0 * np.array([[2, 1], [1, 2]])
+        mass[bend] = rho * A * s / 420.0 * np.array([
+            [156, 22 * s, 54, -13 * s], [22 * s, 4 * s**2, 13 * s, -3 * s**2],
+            [54, 13 * s, 156, -22 * s], [-13 * s, -3 * s**2, -22 * s, 4 * s**2]])  # fmt: skip
+        mass[np.ix_([2, 5], [2, 5])] += rho * inertia * s / 6.0 * np.array([[2, 1], [1, 2]])
+        R = np.eye(6)
+        for i in (0, 3):
+            R[i : i + 2, i : i + 2] = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        for e in range(count):
+            dofs = 3 * (k * count + e) + np.arange(6)
+            if e == 0:  # its inboard rotation is the joint's
+                dofs[2] = size - 2 + k
+            K[np.ix_(dofs, dofs)] += R.T @ stiff @ R
+            M[np.ix_(dofs, dofs)] += R.T @ mass @ R
+        end = 3 * (k + 1) * count
+        M[[end, end + 1], [end, end + 1]] += masses[k]
+        inner, outer = 3 * k * count + 2, size - 2 + k
+        pair = np.ix_([inner, outer], [inner, outer])
+        K[pair] += springs[k] * np.array([[1, -1], [-1, 1]])
+    free = np.arange(3, size)  # clamped at the ground
+    values = eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[:3]
+    return np.sqrt(values) / (2.0 * np.pi)
+
+
+@pytest.mark.parametrize("elbow", [0.0, 45.0, 90.0])
+def test_frequencies_of_two_links_on_elastic_joints(elbow, tmp_path) -> None:
+    """With motors held, in three poses, against a frame of Timoshenko beams."""
+    file, springs, masses = tmp_path / "still.csv", (2e3, 8e2), (0.3, 0.5)
+    angle = np.deg2rad(elbow)
+    file.write_text(f"t,upper,fore\n0,0,{angle}\n0.2,0,{angle}\n")
+    bar = {"height": 0.03, "thickness": 0.01, "cells": [50, 4], "passive": 0.0}
+    tree = two_arm("reduction.coordinates=8")
+    tree["arms"] = [
+        {"name": "upper", "length": 0.5, "gear_stiffness": springs[0], "joint_mass": 0.3, **bar},
+        {"name": "fore", "length": 0.54, "gear_stiffness": springs[1], "joint_mass": 0.0, **bar},
+    ]
+    tree |= {"design": {"initial": 1.0}, "payload": {"mass": masses[1]}, "motion": {
+        "path": "joints", "file": str(file), "base": "fixed", "joint_height": 0.0,
+        "duration": 0.2, "horizon": 0.2}}  # fmt: skip
+    scene = scene_from_dict(tree)
+    built = built_of(scene, MPI.COMM_SELF)
+    owned = {k: arm.reduce(arm.uniform(1.0)) for k, arm in built.arms.items()}
+    system = build_system(scene, bodies_in(scene, scene, owned))
+    rest = np.zeros((1, system.num_coordinates))
+    K, _, M = np.split(system.at(np.zeros(1)).linearise(rest, rest, rest).dense()[0], 3, axis=1)
+    found = np.sort(np.sqrt(1.0 / np.linalg.eigvals(np.linalg.solve(K, M)).real)) / (2.0 * np.pi)
+    expected = frame(angle, springs, masses)
+    np.testing.assert_allclose(found[:3], expected, rtol=5e-3)
