@@ -280,4 +280,5 @@ def test_frequencies_of_two_links_on_elastic_joints(elbow, tmp_path) -> None:
     K, _, M = np.split(system.at(np.zeros(1)).linearise(rest, rest, rest).dense()[0], 3, axis=1)
     found = np.sort(np.sqrt(1.0 / np.linalg.eigvals(np.linalg.solve(K, M)).real)) / (2.0 * np.pi)
     expected = frame(angle, springs, masses)
-    np.testing.assert_allclose(found[:3], expected, rtol=5e-3)
+    # Measured 1.7e-4, 2.2e-4, 8.6e-4: clamped ends of plane arms, which beams do not have.
+    np.testing.assert_allclose(found[:3], expected, rtol=1.5e-3)
