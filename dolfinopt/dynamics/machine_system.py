@@ -397,6 +397,8 @@ class MachineSystem:
             + ("weak or soft" if limited else "soft")
             + " for gravity, or the loop cannot be closed; raise "
             + ("control.limits, " if limited else "")
+            + ("gear_stiffness, " if len(self.drives.springs.joints) else "")
+            + ("bearing_stiffness, " if self.mechanism.bearings else "")
             + "control.stiffness or material.young_modulus, or leave feed-forward on, "
             'control.feed_forward = "rigid"'
         )

@@ -158,6 +158,12 @@ def test_stiff_bearings_hold() -> None:
     assert left[1] < 2e-3
 
 
+def test_inf_is_rigid_as_zero_is() -> None:
+    """JSON does not know it: scenes keep 0."""
+    given = scene_from_dict(small({"bearing_stiffness": [1e6, np.inf, np.inf, 0.0, 0.0, 5e4]}))
+    assert given.arms[0].bearing_stiffness == (1e6, 0.0, 0.0, 0.0, 0.0, 5e4)
+
+
 def test_friction_of_prescribed_joints_is_the_drives() -> None:
     """The motion keeps its bits; forces grow by f_v v + f_c tanh(v / v_s)."""
     free, rubbed = (
