@@ -22,9 +22,12 @@ from dolfinopt.scene.tables.joint_parts import (
     GearDamping,
     GearRatio,
     GearStiffness,
+    JointDamping,
+    JointStiffness,
     RotorInertia,
     check_parts,
     check_plane_bearing,
+    check_springs,
 )
 
 if TYPE_CHECKING:
@@ -386,15 +389,8 @@ class Arm(Table):
     gear_ratio: GearRatio = 1.0
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0
-    joint_stiffness: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e15,
-        description="the same as gear_stiffness, in space, too [N m/rad, N/m]",
-    )
-    joint_damping: float = Field(
-        default=0.0, ge=0, le=1e15, description="damper beside that spring [N m s/rad, N s/m]"
-    )
+    joint_stiffness: JointStiffness = 0.0
+    joint_damping: JointDamping = 0.0
     bearing_stiffness: BearingStiffness = None
     bearing_damping: BearingDamping = None
     friction: Friction = None
@@ -570,18 +566,7 @@ class Arm(Table):
         for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
                 raise Refusal("expected only with rigid = true", (key,), ("rigid",))
-        if self.joint_damping > 0.0 and self.joint_stiffness == 0.0:
-            raise Refusal(
-                "expected 0 without arms.joint_stiffness, beside whose spring the damper acts",
-                ("joint_damping",),
-                ("joint_stiffness",),
-            )
-        if self.joint_stiffness > 0.0 and self.gear_stiffness > 0.0:
-            raise Refusal(
-                "expected only one of gear_stiffness and joint_stiffness: they are the same spring",
-                ("joint_stiffness",),
-                ("gear_stiffness",),
-            )
+        check_springs(self)
         check_parts(self, "arms")
         return self
 

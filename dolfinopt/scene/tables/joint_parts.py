@@ -45,6 +45,16 @@ GearDamping = Annotated[
 ]
 
 
+# The same spring and damper by the names that arms have had.
+JointStiffness = Annotated[
+    float,
+    Field(ge=0, le=1e15, description="the same as gear_stiffness, in space, too [N m/rad, N/m]"),
+]
+JointDamping = Annotated[
+    float, Field(ge=0, le=1e15, description="damper beside that spring [N m s/rad, N s/m]")
+]
+
+
 def _zero_for_inf(values: Any) -> Any:
     """Take 0 for inf, which JSON does not know: both mean that nothing gives way."""
     if not isinstance(values, (list, tuple)):
@@ -122,6 +132,22 @@ def check_parts(one: _Table, table: str) -> None:
                 ("bearing_damping",),
                 ("bearing_stiffness",),
             )
+
+
+def check_springs(arm: Any) -> None:
+    """Refuse a damper beside no spring, and the gear's spring by both of its names."""
+    if arm.joint_damping > 0.0 and arm.joint_stiffness == 0.0:
+        raise Refusal(
+            "expected 0 without arms.joint_stiffness, beside whose spring the damper acts",
+            ("joint_damping",),
+            ("joint_stiffness",),
+        )
+    if arm.joint_stiffness > 0.0 and arm.gear_stiffness > 0.0:
+        raise Refusal(
+            "expected only one of gear_stiffness and joint_stiffness: they are the same spring",
+            ("joint_stiffness",),
+            ("gear_stiffness",),
+        )
 
 
 def check_plane_bearing(one: _Table, at: Loc) -> None:
