@@ -12,6 +12,7 @@ from dolfinopt.multibody.joints import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joint_parts import joint_parts
 
+BEHIND = "; behind them the bearings', m and rad"
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
 
 if TYPE_CHECKING:
@@ -43,13 +44,13 @@ def write_trajectory(
     if initial is not None and len(initial):
         even = np.linspace(0.0, scene.motion.horizon, len(initial))
         arrays["initial_deviation"] = _between(even, initial, trajectory.t)
-    rigid = ", ".join(scene.rigid_units.values())
+    rigid, bearings = ", ".join(scene.rigid_units.values()), trajectory.mechanism.bearings
     units = {
         "t": "s",
         "q_r": rigid,
         "q_r_desired": rigid,
         "q_motors": ", ".join(_motor_units(trajectory).values()),
-        "q_e": "m or rad: times V is a displacement in m; behind them those of bearings",
+        "q_e": "m or rad: times V is a displacement in m" + BEHIND * bool(bearings),
         "deviation": "m",
         "compliance": "N m",
         "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
