@@ -37,7 +37,7 @@ def sentence(budget: Mapping[str, Any]) -> str:
     """Return the shares of all kinds of parts in a line, the links' first."""
     links, *others = [f"{name} {100.0 * x:.3g} %" for name, x in budget["shares"].items()]
     held = links.replace("links ", "links hold ", 1)
-    return f"{held} of the largest deviation{''.join(f', {one}' for one in others)}"
+    return f"{held} of the deflection{''.join(f', {one}' for one in others)}"
 
 
 def table(budget: Mapping[str, Any]) -> list[str]:

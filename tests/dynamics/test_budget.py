@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from machines import Tree, fork, loop_tree, simulated, two_arm, with_keys
-from runs import demo
+from runs import TWO_ARM, demo, overrides, run
 
 from dolfinopt.dynamics.budget import Budget, deflection_budget
 
@@ -154,3 +156,23 @@ def test_budget_of_the_demo(tmp_path) -> None:
     assert after["links [mm]"] > before["links [mm]"]
     assert all(row["gears [mm]"] < 0.1 * before["gears [mm]"] for row in ahead)
     assert (tmp_path / "budget.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_budget_is_the_first_thing_told(tmp_path, capsys) -> None:
+    """On the screen, in summary.json and as a table, all the same."""
+    run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "run", *overrides(
+        "arms.cells=[16,3]", "motion.horizon=1.9", "simulation.tolerance=1e-3",
+        "arms.gear_stiffness=1e4"))  # fmt: skip
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    found = summary["deflection_budget"]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"links hold {100.0 * found['shares']['links']:.3g} % of the defl")
+    assert lines[1].startswith(f"at {found['instant']:.3f} s")
+    assert found["deviation"] == summary["max_deviation"]
+    rows = (tmp_path / "run" / "budget.csv").read_text().splitlines()
+    assert rows[0] == "kind,part,deflection [m],share [-]"
+    for row, part, line in zip(rows[1:], found["parts"], lines[2:6], strict=True):
+        kind, name, deflection, share = row.split(",")
+        assert (kind, name) == (part["kind"], part["name"]) == tuple(line.split()[:2])
+        assert float(deflection) == pytest.approx(part["deflection"], rel=1e-9)
+        assert float(share) == pytest.approx(part["share"], rel=1e-9)
