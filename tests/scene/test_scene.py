@@ -321,6 +321,10 @@ BAD_VALUES = [
      "arms.0.rotor_inertia arms.0.passive damping.stiffness_proportional objective.stress_margin "
      "design.filter_radius optimizer.tolerance", [-1e-9], "a number >= 0"),
     ("arms.0.gear_ratio", [0.0], "a number >= 0.001"),
+    ("arms.0.gear_stiffness arms.0.gear_damping", [-1e-9], "a number >= 0"),
+    ("arms.0.bearing_stiffness arms.0.bearing_damping", [[1e6, 1e6, 1e6]], "six numbers >= 0"),
+    ("arms.0.friction", [[1.0]], "two numbers >= 0"),
+    ("arms.0.friction_speed", [0.0], "a number >= 1e-06"),
     ("motion.path", ["circle"], '"arc" | "line" | "points" | "joints"'),
     ("motion.radius", [0.0], LENGTHS),
     ("motion.flattening simulation.rho_inf", [-0.1, 1.01], "a number >= 0 and <= 1"),

@@ -12,6 +12,23 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
 from dolfinopt.scene.tables.design import Region, check_regions
+from dolfinopt.scene.tables.joint_parts import (
+    FRICTION_SPEED,
+    PART_KEYS,
+    BearingDamping,
+    BearingStiffness,
+    Friction,
+    FrictionSpeed,
+    GearDamping,
+    GearRatio,
+    GearStiffness,
+    JointDamping,
+    JointStiffness,
+    RotorInertia,
+    check_parts,
+    check_plane_bearing,
+    check_springs,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -214,8 +231,10 @@ MESH_FILES = (".geo", ".msh", *STEP_FILES)
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = (
     "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
-    "joint_damping",
+    "joint_damping", *PART_KEYS,
 )  # fmt: skip
+SPRING_KEYS = "joint_stiffness", "joint_damping"  # the same spring by either pair of keys
+GEAR_KEYS = "gear_stiffness", "gear_damping"
 SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
 MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset")
@@ -373,28 +392,16 @@ class Arm(Table):
         le=1e9,
         description="moment of inertia at the outboard interface [kg m2]",
     )
-    rotor_inertia: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e9,
-        description="moment of inertia of the rotor that drives this arm's inboard joint [kg m2]",
-    )
-    gear_ratio: float = Field(
-        default=1.0,
-        ge=1e-3,
-        le=1e6,
-        description="revolutions of the rotor per revolution of the inboard joint [-]",
-    )
-    joint_stiffness: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e15,
-        description="spring between the drive and this arm, at its inboard joint; 0: none, the "
-        "arm follows the drive exactly [N m/rad]",
-    )
-    joint_damping: float = Field(
-        default=0.0, ge=0, le=1e15, description="damper beside that spring [N m s/rad]"
-    )
+    rotor_inertia: RotorInertia = 0.0
+    gear_ratio: GearRatio = 1.0
+    gear_stiffness: GearStiffness = 0.0
+    gear_damping: GearDamping = 0.0
+    joint_stiffness: JointStiffness = 0.0
+    joint_damping: JointDamping = 0.0
+    bearing_stiffness: BearingStiffness = None
+    bearing_damping: BearingDamping = None
+    friction: Friction = None
+    friction_speed: FrictionSpeed = FRICTION_SPEED
     sid: FileName | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
@@ -573,12 +580,8 @@ class Arm(Table):
         for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
                 raise Refusal("expected only with rigid = true", (key,), ("rigid",))
-        if self.joint_damping > 0.0 and self.joint_stiffness == 0.0:
-            raise Refusal(
-                "expected 0 without arms.joint_stiffness, beside whose spring the damper acts",
-                ("joint_damping",),
-                ("joint_stiffness",),
-            )
+        check_springs(self)
+        check_parts(self, "arms")
         return self
 
     @property
@@ -789,6 +792,7 @@ class Arm(Table):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
         if not scene.is_spatial:
             self._check_files(before, at)
+            check_plane_bearing(self, at)
         if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "
