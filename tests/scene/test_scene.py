@@ -315,6 +315,7 @@ BAD_VALUES = [
     ("arms.0.section", ["oval"], '"box" | "tube"'),
     ("arms.0.hull", ["absent.msh"], "found neither /"),
     ("arms.0.wall arms.0.min_wall arms.0.max_wall", [0.01], "only with hollow = true"),
+    ("arms.0.ribs", [2], "only with hollow = true"),
     ("arms.0.passive", [0.5], "less than half of length = 1.0 [m]"),
     ("arms.0.passive", [0.26], "volume_fraction = 0.5 can be met"),
     ("arms.0.joint_stiffness arms.0.joint_damping arms.0.joint_mass arms.0.joint_inertia "
