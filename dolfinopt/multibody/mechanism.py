@@ -373,7 +373,11 @@ class Mechanism:
     @cached_property
     def way(self) -> tuple[Site, ...]:
         """From the ground to the end-effector: every body and the interface that leads on."""
-        found = [self.end]
+        return self.way_to(self.end)
+
+    def way_to(self, site: Site) -> tuple[Site, ...]:
+        """Return every body from the ground to a site, and the interface that leads on."""
+        found = [site]
         while (joint := self.joints[found[0][0]]).parent != GROUND:
             found.insert(0, (joint.parent, joint.interface))
         return tuple(found)
