@@ -5,7 +5,7 @@ interface or on the ground. Its equations are made of three kinds, each with its
 
     along     e . (p_a - p_b) = 0       e fixed to b
     facing    l u . v = 0               u fixed to a, v to b; l a length, so that all are in m
-    distance  |p_a - p_b| - L = 0
+    distance  |p_a - p_b| - L = 0       L constant, or a rigid coordinate: a cylinder
 
     kind        equations   in space                                    in the plane
     ball        3           three along
@@ -281,13 +281,15 @@ class Facing:
 
 @dataclass(frozen=True, eq=False)
 class Distance:
-    """|p_a - p_b| - length = 0, m."""
+    """|p_a - p_b| - L = 0, L a constant length, m, or else a rigid coordinate by its place."""
 
     length: float
+    coordinate: int | None = None
 
     def value(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return it (n,), m."""
-        out: np.ndarray = np.linalg.norm(a.place - b.place, axis=0) - self.length
+        length = self.length if self.coordinate is None else a.posed.q_r[:, self.coordinate]
+        out: np.ndarray = np.linalg.norm(a.place - b.place, axis=0) - length
         return out
 
     def loads(self, a: SiteMotion, b: SiteMotion) -> Loads:
@@ -329,9 +331,6 @@ class Tie:
         point: (d,) of the joint's frame in b's frame, m.
         rotation: (d, d) of the joint's frame.
         equations: all of them.
-        driven: whether a rod's length is prescribed over time; `Distance.length` is 0 then.
-        compliance: of a rod that is a spring, m/N; 0 of what is stiff.
-        relaxation: its damping over its stiffness, s.
     """
 
     name: str
@@ -340,9 +339,6 @@ class Tie:
     point: np.ndarray
     rotation: np.ndarray
     equations: tuple[Equation, ...]
-    driven: bool = False
-    compliance: float = 0.0
-    relaxation: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,30 +366,6 @@ class Loops:
         """Number m of equations that count."""
         return len(self.weights)
 
-    @cached_property
-    def driven(self) -> np.ndarray:
-        """Which of the k equations are rods whose length is prescribed."""
-        return self._of_equations([tie.driven for tie in self.ties])
-
-    @cached_property
-    def compliance(self) -> np.ndarray:
-        """Compliance (m,) of springs, m/N."""
-        return self.weights @ self._of_equations([tie.compliance for tie in self.ties])
-
-    @cached_property
-    def relaxation(self) -> np.ndarray:
-        """Damping over stiffness (m,) of springs, s."""
-        return self.weights @ self._of_equations([tie.relaxation for tie in self.ties])
-
-    @property
-    def is_soft(self) -> bool:
-        """Whether there is a spring."""
-        return any(tie.compliance > 0.0 for tie in self.ties)
-
-    def _of_equations(self, values: Sequence[float | bool]) -> np.ndarray:
-        counts = [len(tie.equations) for tie in self.ties]
-        return np.repeat(np.array(values), counts)
-
     def at(self, mechanism: Mechanism, q_r: np.ndarray, q: np.ndarray) -> ClosedLoops:
         """Return them at n poses, q_r (n, R) and q (n, N)."""
         return ClosedLoops(self, Posed(mechanism, q_r, q))
@@ -401,15 +373,12 @@ class Loops:
     def independent(self, jacobian: np.ndarray) -> Loops:
         """Return those combinations that are independent, by the Jacobian (k, C) of a pose.
 
-        Columns of the Jacobian are scaled alike; springs stay by themselves.
+        Its columns are of like size. What is left out follows from the others where the loops are
+        closed, as the equations out of a plane mechanism's plane do.
         """
-        soft = self._of_equations([tie.compliance > 0.0 for tie in self.ties]).astype(bool)
-        stiff, every = np.flatnonzero(~soft), np.eye(len(soft))
-        U, sizes, _ = np.linalg.svd(jacobian[stiff], full_matrices=False)
+        U, sizes, _ = np.linalg.svd(jacobian, full_matrices=False)
         rank = int((sizes > INDEPENDENT_SHARE * sizes.max(initial=0.0)).sum())
-        if rank == len(stiff):
-            return replace(self, weights=every)
-        weights = np.concatenate([U[:, :rank].T @ every[stiff], every[soft]])
+        weights = np.eye(len(jacobian)) if rank == len(jacobian) else U[:, :rank].T
         return replace(self, weights=weights)
 
 
@@ -445,7 +414,10 @@ class ClosedLoops:
         rows = []
         for one, a, b in self._equations:
             on_a, on_b = one.loads(a, b)
-            rows.append(a.work(on_a) + b.work(on_b))
+            row = a.work(on_a) + b.work(on_b)
+            if isinstance(one, Distance) and one.coordinate is not None:
+                row[:, one.coordinate] -= 1.0
+            rows.append(row)
         return np.stack(rows, axis=1)
 
     @property

@@ -158,6 +158,7 @@ def inverse_dynamics(
         on_ground = tree.hanging[GROUND, 0]
         pulls = [links[i].joint.at_interface(loads.joints[i])[0][0] for i in on_ground]
         drives.insert(0, np.sum(pulls, axis=0))
+    drives += [np.zeros(len(q))] * tree.rods  # weigh nothing
     forces = np.stack(drives, axis=1) if drives else np.zeros((len(q), 0))
     return elastic_rows(links, loads), forces + tree.rotors * motion.qdd
 

@@ -263,6 +263,7 @@ class Mechanism:
         origin: (d,) of the ground's frame, which a cart moves along x, m.
         cart: its mass, kg, of the first rigid coordinate; None without one.
         scales: of every body's elastic rows, forces and moments, or none.
+        rods: number of further rigid coordinates, lengths of rods that close loops.
     """
 
     bodies: tuple[ShapeIntegrals, ...]
@@ -273,6 +274,7 @@ class Mechanism:
     origin: np.ndarray
     cart: float | None = None
     scales: tuple[Scale, ...] = ()
+    rods: int = 0
 
     def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
         """Return it at some of the instants."""
@@ -309,7 +311,7 @@ class Mechanism:
 
     @property
     def num_rigid(self) -> int:
-        """Number R of rigid coordinates, of cart and joints."""
+        """Number R of rigid coordinates, of cart, joints and rods."""
         return len(self.rotors)
 
     @cached_property
@@ -327,7 +329,7 @@ class Mechanism:
     def rotors(self) -> np.ndarray:
         """Mass of the cart and reflected inertia of every rigid coordinate's drive (R,)."""
         cart = [] if self.cart is None else [self.cart]
-        return np.array([*cart, *(self.joints[i].rotor for i in self.movable)])
+        return np.array([*cart, *(self.joints[i].rotor for i in self.movable), *[0.0] * self.rods])
 
     # -- how the recursions go along it ------------------------------------------------------
 
@@ -437,7 +439,8 @@ class Mechanism:
         reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in self.constants)
         reach += sum(float(np.linalg.norm(one.origin)) for one in self.joints)
         slides = [self.joints[i].kind == "prismatic" for i in self.movable]
-        return np.where([True, *slides] if self.cart is not None else slides, 1.0, reach)
+        slides = [True, *slides] if self.cart is not None else slides
+        return np.where(slides + [True] * self.rods, 1.0, reach)
 
     @cached_property
     def stiffnesses(self) -> tuple[np.ndarray, ...]:

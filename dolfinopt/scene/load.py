@@ -50,6 +50,7 @@ from dolfinopt.scene.tables.arms import (
     Arm,
 )
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
+from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Joint
 from dolfinopt.scene.tables.motion import Motion
@@ -78,7 +79,7 @@ else:
     import tomli as tomllib
 
 # Arrays of tables of which --set knows single ones by their name.
-NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint}
+NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint, "closures": Closures}
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
