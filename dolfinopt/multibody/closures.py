@@ -16,9 +16,10 @@ interface or on the ground. Its equations are made of three kinds, each with its
 
 Every coordinate inboard of a site shifts it by dp and turns it by s; a coordinate further out is
 turned with it, so that d2p = s x dp' and ds' = s x s': this is all there is of second order, but
-for the arms' own deformation. Plane and space are one code, see `dimension`; coordinates are ordered
-[rigid (R), elastic (N)], C together. Source: Featherstone, Rigid Body Dynamics Algorithms (2008),
-ch. 8; Garcia de Jalon & Bayo, Kinematic and Dynamic Simulation of Multibody Systems (1994), ch. 2.
+for the arms' own deformation. Plane and space are one code, see `dimension`; coordinates are
+ordered [rigid (R), elastic (N)], C together. Source: Featherstone, Rigid Body Dynamics Algorithms
+(2008), ch. 8; Garcia de Jalon & Bayo, Kinematic and Dynamic Simulation of Multibody Systems (1994),
+ch. 2.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from dolfinopt.multibody.body_motion import Load
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, product
 from dolfinopt.multibody.end_effector import Posed, rotated
 from dolfinopt.multibody.measured import INDEPENDENT_SHARE
-from dolfinopt.multibody.mechanism import Mechanism, Site
+from dolfinopt.multibody.mechanism import Closure, Mechanism, Site
 
 
 class SiteMotion:
@@ -81,7 +82,7 @@ class SiteMotion:
         self.by_place[:, k] = dim.velocity(self.by_spin[:, k], self.place - origin)
 
     def _add_modes(self, i: int, number: int, order: int) -> None:
-        mechanism, dim = self.posed.mechanism, self.dim
+        dim = self.dim
         section = self.posed.section(i, number)
         if section.turning is None:
             return
@@ -366,6 +367,31 @@ class Loops:
         """Number m of equations that count."""
         return len(self.weights)
 
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """By what (k,) a multiplier is a moment, m; 1 of forces."""
+        every = [one for tie in self.ties for one in tie.equations]
+        return np.array([one.length if isinstance(one, Facing) else 1.0 for one in every])
+
+    def reactions(self, multipliers: np.ndarray) -> np.ndarray:
+        """Return forces and moments (n, k) on the first frames, N and N m, of (n, m)."""
+        out: np.ndarray = (multipliers @ self.weights) * self.lengths
+        return out
+
+    @classmethod
+    def of_plane(cls, closure: Closure, site: Site) -> Loops:
+        """Return what holds an interface of a plane machine."""
+        normals = [np.array([n.real, n.imag]) for n in closure.normals]
+        equations, given = [Along(n) for n in normals], np.zeros(len(normals))
+        if closure.force:
+            size = abs(closure.force)
+            along = closure.force / size
+            equations.append(Along(np.array([along.real, along.imag])))
+            given = np.append(given, size)
+        point = np.array([closure.point.real, closure.point.imag])
+        tie = Tie("closure", site, None, point, np.eye(2), tuple(equations))
+        return cls((tie,), np.eye(len(normals), len(equations)), given)
+
     def at(self, mechanism: Mechanism, q_r: np.ndarray, q: np.ndarray) -> ClosedLoops:
         """Return them at n poses, q_r (n, R) and q (n, N)."""
         return ClosedLoops(self, Posed(mechanism, q_r, q))
@@ -438,6 +464,34 @@ class ClosedLoops:
         """Return what the closures' forces of multipliers (n, m) do on every coordinate (n, C)."""
         out: np.ndarray = np.einsum("nk,nkc->nc", self.forces(multipliers), self.every_row)
         return out
+
+    def closing(self, forces: np.ndarray, dependent: np.ndarray) -> np.ndarray:
+        """Return the multipliers (n, m) that give what joints that follow need.
+
+        Args:
+            forces: (n, R) of inverse dynamics without closures.
+            dependent: (m,) the joints that follow, rigid coordinates.
+        """
+        J = self.jacobian[:, :, dependent]
+        left = forces[:, dependent] - self.work(np.zeros(J.shape[:2]))[:, dependent]
+        out: np.ndarray = np.linalg.solve(J.swapaxes(1, 2), left[:, :, None])[:, :, 0]
+        return out
+
+    def pulls(self, multipliers: np.ndarray) -> dict[Site, Load]:
+        """Return what interfaces give to the closures, force and moment in their components."""
+        found: dict[Site, Load] = {}
+        for sites, loads in zip(self._sites, self._loads(multipliers), strict=True):
+            for site, (force, moment) in zip(sites, loads, strict=True):
+                if not site.way:
+                    continue
+                end, R = self.posed.interface(*site.way[-1])
+                back, moment = R.swapaxes(0, 1), moment + self.dim.moment(site.place - end, force)
+                own = -product(back, force), -self.dim.rotated(back, moment)
+                other = found.get(site.way[-1])
+                if other is not None:
+                    own = own[0] + other[0], own[1] + other[1]
+                found[site.way[-1]] = own
+        return found
 
     def _loads(self, multipliers: np.ndarray) -> list[Loads]:
         """Return the loads of every closure on its two frames."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -125,6 +125,11 @@ class Drives:
         out[:, self.limited] = saturated(wanted[:, self.limited], limits)[1]
         return out
 
+    @property
+    def dependent(self) -> np.ndarray:
+        """Rigid coordinates that follow from a closed loop."""
+        return self.free[~self.driven]
+
     @cached_property
     def limited(self) -> np.ndarray:
         """Where there is a limit (R,)."""
@@ -189,12 +194,6 @@ class Closure:
 def repeated(count: int) -> np.ndarray | None:
     """Return indices that make `LEAST_INSTANTS` of fewer, the last one repeated; None: enough."""
     return np.minimum(np.arange(LEAST_INSTANTS), count - 1) if 0 < count < LEAST_INSTANTS else None
-
-
-def several(*arguments: Any) -> tuple[Any, ...]:
-    """Return the arguments at `LEAST_INSTANTS` instants, the last one as often as it takes."""
-    every = repeated(len(arguments[-1]))
-    return arguments if every is None else tuple(x[every] for x in arguments)
 
 
 # -- a tree of bodies, in the plane and in space: what inverse dynamics works on

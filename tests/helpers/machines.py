@@ -15,7 +15,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
-from dolfinopt.multibody.end_effector import _frames, interface_place, outboard
+from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
@@ -149,7 +149,8 @@ def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
     assert np.allclose(corners[node], middle)
     q = trajectory.q_e[:, mechanism.slices[arm]]
     place = complex(*middle) + q @ (modes[node, 0] + 1j * modes[node, 1])
-    chord = outboard(mechanism.bodies[arm], q)[0]
+    x, y = Posed(mechanism, trajectory.q_r, trajectory.q_e).section(arm, 0).place
+    chord = x + 1j * y
     return (np.conj(chord / np.abs(chord)) * place).imag
 
 
@@ -214,7 +215,7 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     speeds = np.concatenate([motion.qd, qd], axis=1)
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
     strain = np.zeros(len(t))
-    origins, rotations, _ = _frames(mechanism, motion, q)
+    origins, rotations = plane_frames(mechanism, motion.q, q)
     moment = np.zeros(len(t), dtype=complex)  # first moment of all masses
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         e = q[:, part]
@@ -229,17 +230,26 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     return kinetic, strain, potential
 
 
+def plane_frames(
+    mechanism: Any, q_r: np.ndarray, q: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return origins of a plane chain's frames, its end last, and rotations, (n,) complex."""
+    posed, bodies = Posed(mechanism, q_r, q), range(len(mechanism.bodies))
+    places = [posed.body(k)[1] for k in bodies] + [posed.interface(*mechanism.end)[0]]
+    turns = [posed.body(k)[2] for k in bodies]
+    return [x + 1j * y for x, y in places], [R[0, 0] + 1j * R[1, 0] for R in turns]
+
+
 def gaps(result: SimulationResult) -> np.ndarray:
     """Return the violation of a loop's constraints at all stages (n, m), m."""
     trajectory, system = machine(result)
-    assert system.closure is not None
+    assert system.loops is not None
     grid, nodes = trajectory.solution.time_grid, trajectory.solution.nodes
     t = (grid[:-1, None] + np.diff(grid)[:, None] * nodes).ravel()
     y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
     instants = system.at(t)
     motion = instants.motion(y, yd, ydd)
-    place = interface_place(system.mechanism, motion, instants.split(y)[1]).place
-    return system.closure.gap(place)
+    return system.loops.at(system.mechanism, motion.q, instants.split(y)[1]).gap
 
 
 def fork() -> dict:

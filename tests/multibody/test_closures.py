@@ -10,7 +10,6 @@ from bodies import assert_close, change_of, changed, derivative, random_tree, st
 from test_mechanism import machine_of
 
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
-from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.machine import exponential
 from dolfinopt.multibody.mechanism import Mechanism
 
@@ -62,9 +61,7 @@ def test_derivatives_of_every_equation(kind: str) -> None:
         assert_close(here.jacobian[:, :, c], by, 1e-10, np.abs(here.jacobian).max())
         by = derivative(lambda t, unit=unit: at(y + t * unit).work(multipliers))
         assert_close(H[:, :, c], by, 1e-9, np.abs(H).max())
-    rates = derivative(
-        lambda t: np.einsum("nmc,nc->nm", at(y + t * virtual).jacobian, virtual)
-    )
+    rates = derivative(lambda t: np.einsum("nmc,nc->nm", at(y + t * virtual).jacobian, virtual))
     assert_close(here.acceleration(virtual), rates, 1e-9)
     for k, by in enumerate(here.gradient(weights, multipliers, virtual)):
         for name, gradient in by.items():
