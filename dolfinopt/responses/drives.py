@@ -49,7 +49,7 @@ def _at_drives(trajectory: Trajectory, cases: LoadCases) -> Any:
     columns = trajectory.scene.driven_columns
     if isinstance(columns, slice):
         return cases.indices, columns
-    return np.ix_(cases.indices, columns)
+    return np.ix_(cases.indices, np.array(columns))
 
 
 # -- effort of the drives: what their motors' heat, and with it their size, follow from ----------
