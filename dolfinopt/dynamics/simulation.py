@@ -26,6 +26,7 @@ from dolfinopt.dynamics.newton import ONE_RUN
 from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
@@ -46,6 +47,7 @@ from dolfinopt.multibody.shape_integrals import (
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.closures import PARTS
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -200,7 +202,7 @@ class Trajectory:
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
         """What loads every body (n, 7 + 2 q), in space (n, 18 + 9 q), see the function."""
-        if self.is_closed:
+        if self.loops is not None:
             return load_coefficients(self.problem, self.t, self.unknowns)
         q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
         return coefficients_of(self.mechanism, self.motion, (q, qd, qdd))
@@ -211,9 +213,9 @@ class Trajectory:
         return isinstance(self.problem, MachineSystem)
 
     @property
-    def is_closed(self) -> bool:
-        """Whether there are closed loops."""
-        return isinstance(self.problem, MachineSystem) and self.problem.loops is not None
+    def loops(self) -> Loops | None:
+        """What closes loops, in the plane and in space, or None."""
+        return self.problem.loops if isinstance(self.problem, MachineSystem) else None
 
     @property
     def closure(self) -> Closure | None:
@@ -228,10 +230,27 @@ class Trajectory:
         by +90 degrees, without the given constant force; of a pin along x and y. In space those of
         every closure on its first interface, in the joint's frame, see `tables.closures.PARTS`.
         """
-        if not isinstance(self.problem, MachineSystem) or self.problem.loops is None:
+        if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
         multipliers = self.unknowns[2][:, slice(*self.problem.ends[1:])]
-        return multipliers if self.closure else self.problem.loops.reactions(multipliers)
+        return multipliers if self.closure else self.loops.reactions(multipliers)
+
+    @property
+    def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
+        """Magnitude of every closure's force and moment in space, (n,), by name and unit."""
+        found: dict[str, dict[str, np.ndarray]] = {}
+        forces, k = self.closure_force, 0
+        if forces is None:
+            return found
+        for one in self.scene.closures:
+            units = [unit for _, unit in PARTS[one.kind]]
+            own = forces[:, k : k + len(units)]
+            found[one.name] = {
+                unit: np.linalg.norm(own[:, [u == unit for u in units]], axis=1)
+                for unit in dict.fromkeys(units)
+            }
+            k += len(units)
+        return found
 
     @cached_property
     def end(self) -> np.ndarray:

@@ -341,6 +341,11 @@ class Tie:
     rotation: np.ndarray
     equations: tuple[Equation, ...]
 
+    @property
+    def is_rod(self) -> bool:
+        """Whether its frames are apart."""
+        return isinstance(self.equations[0], Distance)
+
 
 @dataclass(frozen=True, eq=False)
 class Loops:
@@ -366,6 +371,11 @@ class Loops:
     def count(self) -> int:
         """Number m of equations that count."""
         return len(self.weights)
+
+    @property
+    def redundant(self) -> int:
+        """Number of equations that follow from the others."""
+        return len(self.given) - int(np.count_nonzero(self.given)) - self.count
 
     @cached_property
     def lengths(self) -> np.ndarray:
@@ -423,6 +433,12 @@ class ClosedLoops:
             )
             for tie in loops.ties
         ]
+
+    @property
+    def places(self) -> np.ndarray:
+        """Where both frames of every closure are (n, closures, 2, d), m."""
+        pairs = [np.stack([a.place.T, b.place.T], axis=1) for a, b in self._sites]
+        return np.stack(pairs, axis=1)
 
     @property
     def _equations(self) -> list[tuple[Equation, SiteMotion, SiteMotion]]:

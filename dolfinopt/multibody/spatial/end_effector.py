@@ -11,6 +11,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.machine import (
@@ -54,6 +55,8 @@ class Frames:
         held: (n, b, 3) of the interface that every body hangs on; the world's origin of those on
             the ground, m.
         end: (n, 3) of the end-effector, m.
+        tied: (n, k, 2, 3) of both frames of the k closures, m.
+        ties: the closures.
     """
 
     origin: np.ndarray
@@ -63,6 +66,8 @@ class Frames:
     axes: np.ndarray
     held: np.ndarray
     end: np.ndarray
+    tied: np.ndarray
+    ties: tuple[Tie, ...] = ()
 
     def __getitem__(self, part: slice | np.ndarray) -> Frames:
         """Return those at some of the instants."""
@@ -74,18 +79,26 @@ class Frames:
             self.axes[part],
             self.held[part],
             self.end[part],
+            self.tied[part],
+            self.ties,
         )
 
 
-def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
+def body_frames(
+    mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray, loops: Loops | None = None
+) -> Frames:
     """Return the frames of all bodies.
 
     Args:
         mechanism: b bodies.
         q_r: (n, joints) rigid coordinates; rad or m.
         q_e: (n, N) elastic coordinates.
+        loops: closures, or None.
     """
     posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
+    tied, ties = np.zeros((len(q_r), 0, 2, 3)), () if loops is None else loops.ties
+    if loops is not None:
+        tied = ClosedLoops(loops, posed).places
     origin, rotation, outboard, axes, held = [], [], [], [], []
     for i, joint in enumerate(joints):
         _, place, R = posed.body(i)
@@ -103,6 +116,8 @@ def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frame
         axes=np.stack(axes, axis=1),
         held=np.stack(held, axis=1),
         end=posed.interface(*mechanism.way[-1])[0].T,
+        tied=tied,
+        ties=ties,
     )
 
 
