@@ -483,11 +483,14 @@ class Follower:
             if far <= REACHED_RESIDUAL_SHARE * self.chain.reach:
                 break
         else:
+            if self.loops is not None:
+                self._check_held(best, path)
             raise self._unreachable(0.0, best, path)
         turned = self.unknown[~self._slides]
         best[0, turned] -= 2.0 * np.pi * np.round((best[0, turned] - guess[turned]) / (2.0 * np.pi))
         if self.loops is not None:
-            self._check_mobility(best, path)
+            self._check_held(best, path)
+            self._check_idle(best, path)
         self._check_singular(0.0, best, path)
         return best
 
@@ -594,27 +597,31 @@ class Follower:
             f"off at best; change {self._key}{more}"
         )
 
-    def _check_mobility(self, q: np.ndarray, path: EndPath) -> None:
-        """Raise where closures hold driven joints, or leave joints that nothing moves."""
+    def _check_held(self, q: np.ndarray, path: EndPath) -> None:
+        """Raise where closures hold some of the driven coordinates."""
         assert self.loops is not None
         names, rows = list(self.scene.rigid_units), self.loops.rows(q)[0]
-        rank = [_rank(one) for one in (rows, rows[:, self.unknown])]
-        source = f"{self.scene.source}: closures"
-        if path.rows == 0 and rank[1] < rank[0]:
+        every, followed = _rank(rows), _rank(rows[:, self.unknown])
+        if path.rows == 0 and followed < every:
             held = ", ".join(names[k] for k in self.given)
             raise InputError(
-                f"{source}: {rank[0]} independent equations hold {rank[0] - rank[1]} of the driven "
-                f"coordinates ({held}); give as many more joints passive = true, or leave out a "
-                "closure"
+                f"{self.scene.source}: closures: {every} independent equations hold "
+                f"{every - followed} of the driven coordinates ({held}); give as many more joints "
+                "passive = true, or leave out a closure"
             )
-        J = self.jacobian(q, path.rows)[0]
+
+    def _check_idle(self, q: np.ndarray, path: EndPath) -> None:
+        """Raise where nothing moves some of the joints that follow."""
+        assert self.loops is not None
+        J, names = self.jacobian(q, path.rows)[0], list(self.scene.rigid_units)
         if (found := _rank(J)) < len(self.unknown):
             loose = np.abs(np.linalg.svd(J)[2][found:]).max(axis=0)
             idle = ", ".join(names[k] for k, x in zip(self.unknown, loose, strict=True) if x > 1e-6)
             raise InputError(
-                f"{source}: {rank[0]} independent equations leave {len(self.unknown) - found} of "
-                f"the joints that follow free ({idle}); let one of them be driven, without "
-                "passive = true and with a column in the table, or take another kind of closure"
+                f"{self.scene.source}: closures: {found} independent equations leave "
+                f"{len(self.unknown) - found} of the joints that follow free ({idle}); let one of "
+                "them be driven, without passive = true and with a column in the table, or take "
+                "another kind of closure"
             )
 
     def _open(self, t: float, error: np.ndarray) -> InputError:
