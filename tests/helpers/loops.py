@@ -159,8 +159,8 @@ def delta() -> Tree:
     for k in range(3):
         angle, side = 2.0 * np.pi * k / 3.0, 0.5 * SPREAD
         c, s = np.cos(angle), np.sin(angle)
-        arms.append(flexible(f"upper{k}", UPPER, cells=[6, 2, 4], thickness=2.0 * SPREAD,
-                             interfaces=[{"name": f"rod{i}", "radius": 0.015,
+        arms.append(flexible(f"upper{k}", UPPER + 0.06, cells=[13, 2, 2], thickness=SPREAD,
+                             interfaces=[{"name": f"rod{i}", "radius": 0.013,
                                           "point": [UPPER, 0.0, (2 * i - 1) * side]}
                                          for i in (0, 1)]))  # fmt: skip
         # About the tangent of the base's circle: at zero outwards, positive downwards.

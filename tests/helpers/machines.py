@@ -15,6 +15,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
+from dolfinopt.multibody.dimension import product
 from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
@@ -209,25 +210,25 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     motion, q, qd, qdd, _ = states(trajectory, t)
     mechanism = trajectory.mechanism
-    rigid = np.arange(1 + len(mechanism.bodies))
+    rigid = np.arange(mechanism.num_rigid)
     tangent = linearise(mechanism, motion, q, qd, qdd, None, rigid).dense()
     size = tangent.shape[1]
     speeds = np.concatenate([motion.qd, qd], axis=1)
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
-    strain = np.zeros(len(t))
-    origins, rotations = plane_frames(mechanism, motion.q, q)
-    moment = np.zeros(len(t), dtype=complex)  # first moment of all masses
+    strain, moment = np.zeros(len(t)), np.zeros((mechanism.dim.d, len(t)))  # first of all masses
+    posed, d = Posed(mechanism, motion.q, q), mechanism.dim.d
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         e = q[:, part]
         strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
-        own = body.moment + e @ body.C.T
+        own = body.w[:, :1] + body.w[:, 1:] @ e.T
         if body.is_stiffened:
-            own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:2], e)
-        moment = moment + body.mass * origins[k] + rotations[k] * (own[:, 0] + 1j * own[:, 1])
-    for (k, _), load in mechanism.loads.items():
-        moment = moment + load.mass * origins[1 + k]
-    potential = -(np.conj(complex(*mechanism.gravity[:, 0])) * moment).real
-    return kinetic, strain, potential
+            own = own - 0.5 * np.einsum("ni,pij,nj->pn", e, body.K0[:d], e)
+        _, place, R = posed.body(k)
+        moment += body.mass * place + product(R, own)
+    for site, load in mechanism.loads.items():
+        place, R = posed.interface(*site)
+        moment += load.mass * place + product(R, load.c)
+    return kinetic, strain, -(mechanism.gravity * moment).sum(axis=0)
 
 
 def plane_frames(
