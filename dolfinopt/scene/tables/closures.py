@@ -16,6 +16,7 @@ from dolfinopt.scene.tables.machine import (
     Gain,
     check_joint_name,
 )
+from dolfinopt.scene.tables.objective import need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -146,6 +147,13 @@ class Closures(Table):
                 "expected 0 with [control]: a driven rod has its drive's gains there",
                 (*at, "stiffness"),
                 ("control",),
+            )
+        if need_of(scene, "eigenproblem") and scene.objective.attached != "none":
+            raise Refusal(
+                'expected "none" with [[closures]]: what a link carries through a loop does not '
+                "vibrate with it; take a response of the motion, or links that carry nothing",
+                ("objective", "attached"),
+                (*at, "kind"),
             )
         if not scene.driven:
             raise Refusal(
