@@ -18,12 +18,13 @@ from loops import (
     closed,
     double_four_bar,
     five_bar,
+    flexible_slider_crank,
     four_bar,
     free,
     spatial_slider_crank,
     started,
 )
-from machines import gaps, imbalance, machine, reference
+from machines import apart, gaps, imbalance, machine, reference
 from mpi4py import MPI
 from remainders import taylor, wave
 from scipy.integrate import solve_ivp
@@ -31,6 +32,7 @@ from scipy.integrate import solve_ivp
 import dolfinopt as do
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.parallel import on_root
 
 WORLD = MPI.COMM_WORLD
@@ -105,6 +107,24 @@ def test_spatial_slider_crank(tmp_path) -> None:
     assert np.abs(q[:, 1] - expected["slider_position"]).max() < 5e-8  # m; measured 2e-8
     assert np.abs(qd[:, 1] - expected["slider_velocity"]).max() < 2e-5  # m/s; measured 1e-5
     assert np.abs(qd[:, 0] - expected["crank_rate"]).max() < 1.5e-3  # of 28 rad/s; measured 7e-4
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+def test_flexible_slider_crank(tmp_path) -> None:
+    """Out of the plane, too: the rod is beside the crank, and bends and twists it."""
+    expected = reference("flexible_slider_crank_in_space")
+    trajectory, system = machine(do.Model(flexible_slider_crank(tmp_path)).simulate())
+    assert system.loops is not None and system.rigid_loops is not None
+    assert (system.loops.count, system.rigid_loops.count) == (5, 2)
+    assert np.allclose(trajectory.t, expected["t"])
+    end = Posed(trajectory.mechanism, trajectory.q_r, trajectory.q_e).interface(0, 0)[0]
+    assert apart(trajectory.q_r[:, 2], expected["piston_displacement"]) < 1e-4
+    assert apart(trajectory.motion.qd[:, 0], expected["crank_rate"]) < 3e-4
+    assert apart(end[2], expected["crank_end_z"]) < 1e-2  # of 1 um
+    force = np.linalg.norm(trajectory.closure_force[:, :3], axis=1)
+    parts = [expected[f"pin_force_{one}"] for one in ("on_rod_along", "across", "z")]
+    assert apart(force, np.linalg.norm(parts, axis=0)) < 1e-2
 
 
 @pytest.mark.serial

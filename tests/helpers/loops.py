@@ -188,6 +188,34 @@ def delta() -> Tree:
     }  # fmt: skip
 
 
+def flexible_slider_crank(folder: Path, torque: float = 0.5) -> Scene:
+    """Return the machine of `flexible_slider_crank_in_space.csv`: torque, N m, on a free crank."""
+    wide, last = 0.01, 0.02  # m, s
+    if MPI.COMM_WORLD.rank == 0:
+        (folder / "torque.csv").write_text(f"t,turn\n0,{torque}\n{last},{torque}\n")
+    MPI.COMM_WORLD.barrier()
+    slide = {"name": "slide", "type": "prismatic", "parent": "ground", "child": "piston",
+             "origin": [0, 0.11, -wide], "axis": [0, 1, 0], "passive": True}  # fmt: skip
+    tree = {
+        "name": "slider-crank in space",
+        "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2710.0},
+        "arms": [flexible("crank", 0.03, cells=[9, 3, 3]), flexible("rod", 0.08, cells=[24, 3, 3]),
+                 weightless("piston") | {"mass": 0.1}],
+        "joints": [hinge("turn", "ground", "crank", rpy=[0, 0, QUARTER]),
+                   hinge("knee", "crank", "rod", origin=[0, 0, -wide], passive=True), slide],
+        "closures": [{"name": "pin", "kind": "pin", "between": ["rod", "piston"], "axis": UP}],
+        "control": {"feed_forward": "none", "stiffness": [0.0], "damping": [0.0],
+                    "forces": str(folder / "torque.csv")},
+        "motion": {"initial_joints": [0, 0, 0], "duration": last, "horizon": last},
+        "payload": {"mass": 0.0, "arm": "rod"},
+        "damping": {"stiffness_proportional": 1e-5},
+        "reduction": {"coordinates": 12},
+        "simulation": {"tolerance": 1e-3, "sample": 1e-4, "stiffening": False},
+        "design": {"volume_fraction": 1.0, "initial": 1.0},
+    }  # fmt: skip
+    return closed(folder, f"t,turn\n0,0\n{last},1e-3\n", tree)
+
+
 # -- rigid machines that move freely -------------------------------------------------------------
 
 
