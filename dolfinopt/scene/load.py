@@ -50,7 +50,7 @@ from dolfinopt.scene.tables.arms import (
     Arm,
 )
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
-from dolfinopt.scene.tables.closures import Closures
+from dolfinopt.scene.tables.closures import Closures, as_closure
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Joint
 from dolfinopt.scene.tables.motion import Motion
@@ -146,6 +146,9 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _resolve_files(tree, source, changes)
     _drop_sizes(tree, sizes)
     _measure_bodies(tree, inherited)
+    if (closure := as_closure(tree)) is not None:
+        tree["closure"] = closure
+        del tree["closures"]
     derived = complete(tree, source, changes)
     try:
         scene = Scene.model_validate(tree)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from loops import BOOM_TABLE, boom, closed, four_bar
-from machines import with_keys
+from machines import loop, loop_tree, with_keys
 from runs import TWO_ARM, refused
 
 from dolfinopt.multibody.machine import loops_of
@@ -68,6 +68,24 @@ def test_kinds(tmp_path, keys, count):
     assert np.isfinite(loops.lengths).all()
 
 
+def in_plane(kind: str, **keys: Any) -> dict:
+    """Return the plane slider-crank or four-bar that states its loop as [[closures]]."""
+    tree = {key: value for key, value in loop_tree(kind).items() if key != "closure"}
+    one = {"name": "end", "kind": kind, "between": [tree["arms"][-1]["name"], "ground"]}
+    return tree | {"closures": [one | keys]}
+
+
+def test_the_plane_has_closures_that_are_its_closure():
+    found = scene_from_dict(in_plane("slider", axis=[2.0, 0.0, 0.0]))
+    assert found == loop("slider", closure={"direction": [2.0, 0.0]}) and not found.closures
+    found = scene_from_dict(in_plane("pin", point=[0.25, 0.0, 0.0], side=-1))
+    assert found == loop("pin")
+    up = {"axis": [0, 0, 1]}
+    for keys in ({"point": [0.2, 0.0, 0.1]}, {"axis": [1, 0, 0]}, {"between": ["crank", "ground"]}):
+        with refused("closures.0.kind", "the last arm and the ground", "[[joints]]"):
+            scene_from_dict(in_plane("pin", **(up | keys)))
+
+
 CLOSURE = ("closures", 0)
 REFUSED = [
     ((*CLOSURE, "kind"), "hinge", ("closures.0.kind", '"ball"')),
@@ -76,6 +94,7 @@ REFUSED = [
     ((*CLOSURE, "cross_axis"), [1, 0, 0], ("closures.0.cross_axis", "closures.kind")),
     ((*CLOSURE, "length"), 0.2, ("closures.0.length", "none", "closures.kind")),
     ((*CLOSURE, "stiffness"), 1e5, ("closures.0.stiffness", "closures.kind")),
+    ((*CLOSURE, "side"), -1, ("closures.0.side", "motion.initial_joints")),
     ((*CLOSURE, "name"), "knee", ("closures.0.name", "no joint or other closure")),
     ((*CLOSURE, "name"), "t", ("closures.0.name", "the time")),
     ((*CLOSURE, "between"), ["rocker.tip", "ground"], ("closures.0.between", '"outboard"')),
@@ -108,7 +127,7 @@ def test_refused_with_others(tmp_path):
         closed(tmp_path, TURN, with_keys(four_bar(), {"closures": [one]}))
     tree = load_scene(TWO_ARM).to_tree()
     end = {"name": "end", "kind": "ball", "between": ["arm2", "ground"]}
-    with refused("closures.0.kind", "[closure]", "[[joints]]"):
+    with refused("closures.0.kind", "one pin or slider", "[[joints]]"):
         scene_from_dict(tree | {"closures": [end]})
     with refused("motion.initial_joints", "[[closures]]"):
         tree = four_bar()

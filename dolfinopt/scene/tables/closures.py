@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -21,6 +22,7 @@ from dolfinopt.scene.tables.objective import need_of
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
+UP = [0, 0, 1]
 Kind = Literal["ball", "pin", "slider", "universal", "rod"]
 Direction = tuple[Component, Component, Component]
 # What is positive of every equation's force, in the joint's frame, and its unit.
@@ -70,6 +72,11 @@ class Closures(Table):
         default=None,
         description="of a rod; default: it is driven, its length a column of the motion's table, "
         "or what the path asks for [m]",
+    )
+    side: Literal[-1, 1] = Field(
+        default=1,
+        description="in the plane: which way the loop is assembled, as of [closure]; in space "
+        "motion.initial_joints says it [-]",
     )
     stiffness: float = Field(
         default=0.0, ge=0, le=1e15, description="of a rod that is a spring; 0: it is rigid [N/m]"
@@ -126,10 +133,18 @@ class Closures(Table):
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         if not scene.is_spatial:
             raise Refusal(
-                "expected none without [[joints]]: in the plane [closure] holds the last arm's "
-                "end; state the machine in space with [[joints]], each about the plane's normal",
+                "expected one pin or slider between the last arm and the ground without "
+                "[[joints]], nothing else of [[closures]] beside it: more is closed in space, with "
+                "[[joints]] about the plane's normal",
                 (*at, "kind"),
                 ("arms",),
+            )
+        if self.side != type(self).model_fields["side"].default:
+            raise Refusal(
+                "expected 1, the default, with [[joints]]: motion.initial_joints says which way "
+                "the loop is assembled",
+                (*at, "side"),
+                ("joints",),
             )
         taken = [joint.name for joint in scene.joints]
         taken += [one.name for one in scene.closures[: at[-1]]]
@@ -189,3 +204,29 @@ def closing_site(scene: Scene, one: Closures, which: int) -> tuple[int, int] | N
         return None
     k = [arm.name for arm in scene.arms].index(name)
     return k, interface_number(scene.arms[k], interface) or 0
+
+
+def as_closure(tree: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return [closure] of a plane scene, not validated yet, that states it as [[closures]].
+
+    None where that is not all that is asked for: validation tells why.
+    """
+    closures, arms = tree.get("closures"), tree.get("arms")
+    if tree.get("joints") or tree.get("closure") or not isinstance(arms, list):
+        return None
+    if not isinstance(closures, list) or len(closures) != 1 or not isinstance(closures[0], dict):
+        return None
+    one, last = closures[0], arms[-1].get("name") if isinstance(arms[-1], dict) else None
+    point, axis = one.get("point", [0.0, 0.0, 0.0]), one.get("axis", UP)
+    slides = one.get("kind") == "slider"
+    along = isinstance(axis, list) and len(axis) == 3 and (slides or axis[:2] == UP[:2])
+    if (
+        one.get("kind") not in ("pin", "slider")
+        or set(one) - {"name", "kind", "between", "point", "axis", "side"}
+        or one.get("between") not in ([last, GROUND], [f"{last}.{OUTBOARD}", GROUND])
+        or not (isinstance(point, list) and len(point) == 3 and point[2] == 0.0 and along)
+        or (slides and ("axis" not in one or axis[2] != 0.0))
+    ):
+        return None
+    found = {key: one[key] for key in ("kind", "side") if key in one} | {"point": point[:2]}
+    return found | ({"direction": axis[:2]} if slides else {})
