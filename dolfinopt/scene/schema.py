@@ -288,8 +288,8 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _check_tables(self) -> Scene:
-        # The closure first: which joints are driven depends on it.
-        for key in sorted(type(self).model_fields, key=lambda name: name != "closure"):
+        # Closures first: which joints are driven depends on them.
+        for key in sorted(type(self).model_fields, key=lambda name: "closure" not in name):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):
