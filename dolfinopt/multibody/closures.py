@@ -550,9 +550,7 @@ class ClosedLoops:
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
         """Return what rates (n, C) add to the equations' second derivatives (n, m), m/s2."""
-        one = replace(self.loops, given=np.zeros_like(self.loops.given))
-        here = ClosedLoops(one, self.posed)
-        found = []
+        here, found = self._without_given(), []
         for unit in np.eye(self.loops.count):
             H = here.hessian(np.broadcast_to(unit, (len(rates), len(unit))))
             found.append(np.einsum("ni,nij,nj->n", rates, H, rates, optimize=True))
@@ -577,16 +575,16 @@ class ClosedLoops:
             if body.is_stiffened:
                 by["K0_outboard"] = np.zeros_like(body.K0_outboard)
         moved = [(*a.along(virtual), *b.along(virtual)) for a, b in self._sites]
-        values = ClosedLoops._of_weights(self, weights)
+        values = self._without_given()._loads(weights)
         forces, changes = self._loads(multipliers), self._changes(multipliers, moved)
         for sites, value, load, change in zip(self._sites, values, forces, changes, strict=True):
             for site, of_gap, of_force, by in zip(sites, value, load, change, strict=True):
                 self._add_gradient(found, site, of_gap, of_force, by, virtual)
         return found
 
-    def _of_weights(self, weights: np.ndarray) -> list[Loads]:
-        none = replace(self.loops, given=np.zeros_like(self.loops.given))
-        return ClosedLoops(none, self.posed)._loads(weights)
+    def _without_given(self) -> ClosedLoops:
+        """Return them without constant forces."""
+        return ClosedLoops(replace(self.loops, given=0.0 * self.loops.given), self.posed)
 
     def _add_gradient(
         self,
