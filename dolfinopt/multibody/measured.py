@@ -64,6 +64,6 @@ SAME_NODE_SHARE = 1e-9  # of an arm's extent: nodes of two ranks that are no far
 # -- closures --------------------------------------------------------------------------------
 
 # Singular values of the closures' Jacobian, columns of like size, over the largest: below it
-# equations follow from others. Rounding leaves 1e-15; stiff directions of flexible arms, by their
-# coordinates, came to 1e-3.
-INDEPENDENT_SHARE = 1e-8
+# equations follow from others. Rounding leaves 1e-16; the least that counts was 0.4, of pins that
+# hold flexible arms out of their plane.
+INDEPENDENT_SHARE = 1e-6
