@@ -282,9 +282,20 @@ class MachineSystem:
         """Weights (R,), J^(1/2) per m or rad, that make free coordinates comparable to modes.
 
         The energy that a deflection of the same size as the coordinate's at the chain's end would
-        store in the softest arm.
+        store in the softest arm. Joints that follow in loops of rigid arms have none: they are as
+        the others have them, and rounding of theirs is no error beside stiff arms that bear little.
         """
-        return self.mechanism.levers[self.drives.free] / np.sqrt(self._softness)
+        scale = self.mechanism.levers[self.drives.free] / np.sqrt(self._softness)
+        return np.where(self.drives.driven, scale, 0.0) if self._loops_are_rigid else scale
+
+    @cached_property
+    def _loops_are_rigid(self) -> bool:
+        """Whether no flexible arm is part of a loop."""
+        if self.loops is None:
+            return False
+        rest = np.zeros((1, self.mechanism.num_coordinates))
+        here = self.loops.at(self.mechanism, self.motion(np.zeros(1)).q, rest)
+        return not here.jacobian[:, :, self.mechanism.num_rigid :].any()
 
     def at(self, t: np.ndarray) -> MachineInstants:
         """Return the machine at instants t (n,), s."""

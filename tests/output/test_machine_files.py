@@ -132,8 +132,7 @@ def test_loops_in_space_leave_their_forces_and_what_follows(tmp_path):
     tree = four_bar()
     tree["arms"] = [*tree["arms"][:2], bar("rocker", 0.25), flexible("tool", 0.05)]
     tree["joints"].append({"name": "hold", "type": "fixed", "parent": "crank", "child": "tool"})
-    keys = {"reduction": {"coordinates": 6}, "payload": {"mass": 5.0}}
-    scene = closed(tmp_path, "t,turn\n0,0.5\n1,1.0\n", tree, **keys)
+    scene = closed(tmp_path, "t,turn\n0,0.5\n1,1.0\n", tree, reduction={"coordinates": 6})
     arrays, table, summary, _ = left_by(scene, folders[1])
     assert arrays["closure_force"].shape[1] == 5
     for k, name in enumerate(("x", "y", "z", "moment_1", "moment_2")):
