@@ -21,6 +21,7 @@ from dolfinopt.cli import commands
 from dolfinopt.scene.load import describe_keys
 
 ROOT = Path(__file__).parents[1]
+ARRAYS = ("arms", "arms.regions", "arms.interfaces", "joints", "closures", "scenarios")
 TABLES = {
     "": "Top level",
     "material": 'Material of all arms that state none of their own. `material = "NAME"` at the top '
@@ -36,6 +37,7 @@ TABLES = {
     "motion": "What the machine does.",
     "control": "Drives with feed-forward and feedback; without this table joints are prescribed.",
     "closure": "What closes the chain: a slider or a pin at the end of the last arm.",
+    "closures": "An array of tables, one `[[closures]]` a joint that closes a loop in space.",
     "payload": "What the end-effector carries.",
     "damping": "Damping of the arms.",
     "reduction": "The reduced model of every arm.",
@@ -94,7 +96,7 @@ def scene_reference() -> str:
         table, _, key = info.key.rpartition(".")
         if table not in known:
             known.add(table)
-            array = table in ("arms", "arms.regions", "arms.interfaces", "joints", "scenarios")
+            array = table in ARRAYS
             title = f"`[[{table}]]`" if array else f"`[{table}]`" if table else TABLES[""]
             lines += [f"\n## {title} {{#{table or 'top'}}}\n"]
             lines += [f"{TABLES.get(table, '')}\n"] if table else []

@@ -53,6 +53,13 @@ if TYPE_CHECKING:
     help="folder with ROS packages, for package:// in ROBOT; may be given several times. Then "
     "ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders above ROBOT are looked through",
 )
+@click.option(
+    "--closures",
+    type=PATH,
+    metavar="FILE",
+    help="table (TOML) of closed loops, which URDF cannot state: joints that are passive, and "
+    "[[closures]] with links and points in their frames",
+)
 @click.option("--boxes", is_flag=True, help="solid boxes, whatever the links' geometry")
 @out_option("the scene; default: ROBOT without its ending")
 def import_robot(
@@ -61,6 +68,7 @@ def import_robot(
     trajectory: Path,
     tool: str | None,
     package_path: tuple[Path, ...],
+    closures: Path | None,
     boxes: bool,
     out: Path | None,
 ) -> None:
@@ -77,7 +85,7 @@ def import_robot(
         if world.rank == 0:
             with ending_at_once():
                 model = _robot(robot, package_path)
-                found = _read(model, links, trajectory, tool, boxes)
+                found = _read(model, links, trajectory, tool, boxes, closures)
             _write_scene(out or Path(robot.stem), *found)
 
 
@@ -92,22 +100,33 @@ def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
 
 
 def _read(
-    model: Robot, links: str, trajectory: Path, tool: str | None, boxes: bool
+    model: Robot,
+    links: str,
+    trajectory: Path,
+    tool: str | None,
+    boxes: bool,
+    closures: Path | None,
 ) -> tuple[RobotScene, np.ndarray, np.ndarray]:
-    """Return the scene, instants (n,) and rows (n, joints) of its table."""
+    """Return the scene, instants (n,) and rows (n, joints and rods) of its table."""
+    from dolfinopt.exchange.urdf.closures import NO_LOOPS, read_loops
     from dolfinopt.exchange.urdf.file import implausible_inertias
-    from dolfinopt.exchange.urdf.robot import scene_bodies
+    from dolfinopt.exchange.urdf.robot import default_tool, places_of, scene_bodies
     from dolfinopt.exchange.urdf.scene import RobotScene, read_trajectory
 
     chosen = tuple(name for word in links.split(",") if (name := word.strip()))
     if not chosen:
         raise InputError(f"--links {links!r}: expected names of links of {model.file}, A,B")
     bodies = scene_bodies(model, chosen, tool)
-    t, rows, said = read_trajectory(model, os.fspath(trajectory))
+    loops = NO_LOOPS
+    if closures is not None:
+        places = places_of(model, chosen, tool or default_tool(model, chosen))
+        loops = read_loops(model, bodies, places, closures)
+    t, rows, said = read_trajectory(model, os.fspath(trajectory), loops)
     warn([*said, *implausible_inertias(model)])
     if not boxes:
         bodies = tuple(_meshed(model, one) if one.is_solid else one for one in bodies)
-    return RobotScene(model, bodies, float(t[-1])), t, rows
+    start_joints = tuple(map(float, rows[0, : len(model.movable)]))
+    return RobotScene(model, bodies, float(t[-1]), loops, start_joints), t, rows
 
 
 def _meshed(model: Robot, body: SceneBody) -> SceneBody:

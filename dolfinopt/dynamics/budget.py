@@ -9,14 +9,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.end_effector import end_effector_gradient, interface_place
+from dolfinopt.multibody.end_effector import end_effector_gradient
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.multibody.motion import RigidMotion
 
 # Kinds of parts, and the words for all of a kind.
-KINDS = {"link": "links", "bearing": "bearings", "gear": "gears", "control": "control error"}
+KINDS = {
+    "link": "links",
+    "bearing": "bearings",
+    "gear": "gears",
+    "rod": "rods",
+    "control": "control error",
+}
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,7 @@ class Contribution:
     """What one part contributes.
 
     Attributes:
-        kind: "link", "bearing", "gear" or "control".
+        kind: "link", "bearing", "gear", "rod" (one of a closed loop that is a spring) or "control".
         name: of the link; of bearings, gears and drives that of the joint, in the plane the arm's.
         deflection: of the end-effector along its deviation by this part alone, m.
         share: of the sum of all parts.
@@ -44,7 +50,7 @@ class Budget:
         instant: of the largest deviation, s.
         deviation: its length, m.
         linear: sum of the contributions, m: the deviation to first order.
-        parts: in the order links, bearings, gears, control, each from the ground outwards.
+        parts: in the order links, bearings, gears, rods, control, each from the ground outwards.
     """
 
     instant: float
@@ -96,10 +102,10 @@ def _derivatives(
     """Return those of the end-effector's place along a direction (1, d): (N,), (R,)."""
     mechanism, none = trajectory.mechanism, np.zeros((1, trajectory.mechanism.num_coordinates))
     by_q, by_rigid, _ = end_effector_gradient(mechanism, desired, none, direction)
-    problem, closure = trajectory.problem, trajectory.closure
-    if not isinstance(problem, MachineSystem) or closure is None:
+    problem = trajectory.problem
+    if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
         return by_q[0], by_rigid[0]
-    G = closure.project(interface_place(mechanism, desired, none).jacobian)[0]
+    G = problem.rigid_loops.at(mechanism, desired.q, none).jacobian[0]
     dependent = problem.drives.free[~problem.drives.driven]
     every = np.concatenate([by_rigid[0], by_q[0]])
     every -= np.linalg.solve(G[:, dependent].T, every[dependent]) @ G
@@ -127,6 +133,7 @@ def _rigid(
     if not isinstance(problem, MachineSystem):
         return
     drives, error = problem.drives, trajectory.q_r[worst] - trajectory.desired.q[worst]
+    rods = {one.name for one in trajectory.scene.rods}
     motors, winding = trajectory.motor_columns, np.zeros_like(error)
     if drives.winding:
         asked = problem.at(trajectory.t[worst : worst + 1]).winding
@@ -134,7 +141,8 @@ def _rigid(
         winding[drives.free] = asked[0]
     for k in map(int, drives.free[drives.driven]):
         if trajectory.scene.control is None:
-            yield "gear", names[k], float(by_rigid[k] * error[k])
+            kind = "rod" if names[k] in rods else "gear"
+            yield kind, names[k], float(by_rigid[k] * error[k])
             continue
         left = 0.0
         if k in motors:

@@ -18,8 +18,9 @@ from dolfinopt.dynamics.measured import (
     TABLE_BREAKPOINTS_LIMIT,
 )
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import largest_change
-from dolfinopt.multibody.machine import family_of, friction_of
+from dolfinopt.multibody.machine import family_of, friction_of, loops_of
 from dolfinopt.multibody.mechanism import (
     Closure,
     Drives,
@@ -45,9 +46,17 @@ def soft_joints(scene: Scene) -> dict[int, JointParts]:
     return dict(sorted(found.items()))
 
 
+def dependent_coordinates(scene: Scene) -> list[int]:
+    """Return the rigid coordinates that follow from the others in closed loops."""
+    if scene.is_spatial:
+        return [k for k, joint in enumerate(scene.movable) if joint.passive]
+    return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
+
+
 def is_machine(scene: Scene) -> bool:
-    """Return whether rigid coordinates are unknown: by control, a closed loop, soft joints."""
-    return scene.control is not None or scene.closure is not None or bool(soft_joints(scene))
+    """Return whether rigid coordinates are unknown: by control, closed loops, soft joints."""
+    closed = scene.closure is not None or bool(scene.closures)
+    return scene.control is not None or closed or bool(soft_joints(scene))
 
 
 def check_motion(scene: Scene) -> None:
@@ -98,8 +107,9 @@ def build_system(
     instants = breakpoints(scene, family.curve)
     if not is_machine(scene):
         return ElasticSystem(mechanism, motion, instants)
-    instants, closure = _with_rows(instants, scene), closure_of(scene)
-    return MachineSystem(mechanism, motion, instants, _drives(scene), closure)
+    instants, drives = _with_rows(instants, scene), _drives(scene)
+    loops = _loops(scene, mechanism, motion, drives)
+    return MachineSystem(mechanism, motion, instants, drives, *loops)
 
 
 def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
@@ -109,7 +119,11 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
     """
     family = family_of(scene)
     mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
-    return largest_change(mechanism, motion, closure_of(scene))
+    if scene.closure is None:
+        return largest_change(mechanism, motion)
+    drives = _drives(scene)
+    loops = _loops(scene, mechanism, desired_motion(scene), drives)[1]
+    return largest_change(mechanism, motion, loops, drives.dependent)
 
 
 def closure_of(scene: Scene) -> Closure | None:
@@ -123,23 +137,46 @@ def closure_of(scene: Scene) -> Closure | None:
     return Closure.slider(point, complex(*closure.direction), closure.force)
 
 
+def _loops(
+    scene: Scene,
+    mechanism: Mechanism,
+    motion: Callable[[np.ndarray], RigidMotion],
+    drives: Drives,
+) -> tuple[Loops | None, Loops | None]:
+    """Return the closures with those equations that are independent: of the arms, of rigid ones."""
+    if (closure := closure_of(scene)) is not None:
+        loops = Loops.of_plane(closure, mechanism.end)
+        return loops, loops
+    every = loops_of(scene)
+    if every is None:
+        return None, None
+    q_r, rigid = motion(np.zeros(1)).q, mechanism.num_rigid
+    rows = every.at(mechanism, q_r, np.zeros((1, mechanism.num_coordinates))).every_row[0]
+    by_rigid, by_elastic = rows[:, :rigid], rows[:, rigid:]
+    # Of like size: modes are normalised by their energy.
+    by_elastic = by_elastic / (np.abs(by_elastic).max(initial=0.0) or 1.0)
+    free = by_rigid[:, drives.free] / np.abs(by_rigid).max()
+    return every.independent(np.hstack([free, by_elastic])), every.independent(by_rigid)
+
+
 def _drives(scene: Scene) -> Drives:
     """Return the drives of all rigid coordinates that are not prescribed."""
     # With control all of them are free; without it those of a loop that follow from the others,
     # which have no drive, and joints with a spring between drive and arm.
-    first = scene.driven_columns.start  # a fixed base has no coordinate
-    count = scene.num_rigid
-    last = count - scene.dependent_joints
+    count, driven = scene.num_rigid, scene.driven_columns
     stiffness, damping = np.zeros((2, count))
     limits = np.full(count, np.inf)
-    free = np.zeros(count, dtype=bool)
-    free[last:] = True
+    free, dependent = np.zeros((2, count), dtype=bool)
+    dependent[dependent_coordinates(scene)] = free[dependent_coordinates(scene)] = True
     rotors, soft = np.zeros(count), soft_joints(scene)
     for k, one in soft.items():
         rotors[k] = one.rotor
-        if k < last:
+        if not dependent[k]:
             free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
-    control, driven = scene.control, slice(first, last)
+    for k, rod in enumerate(scene.rods, len(scene.movable)):
+        if rod.is_spring:
+            free[k], stiffness[k], damping[k] = True, rod.stiffness, rod.damping
+    control = scene.control
     if control is not None:
         free[driven] = True
         stiffness[driven] = control.stiffness_factor * np.array(control.stiffness)
@@ -162,7 +199,7 @@ def _drives(scene: Scene) -> Drives:
         stiffness=stiffness[rows],
         damping=damping[rows],
         limits=limits[rows],
-        driven=(rows >= first) & (rows < last),
+        driven=~dependent[rows],
         rigid_feed_forward=control is not None and control.feed_forward != "none",
         winding=control is not None and control.feed_forward == "elastic",
         table=None if table is None else lambda t: table(t)[:, rows],
@@ -177,12 +214,12 @@ def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
     if scene.control is None or scene.control.forces is None:
         return None
     times, curve = _forces(scene.control.forces, scene.driven)
-    first = scene.driven_columns.start
+    places = np.arange(scene.num_rigid)[scene.driven_columns]
 
     def forces(t: np.ndarray) -> np.ndarray:
         out = np.zeros((len(t), scene.num_rigid))
         inside = t <= times[-1]
-        out[inside, first : first + len(scene.driven)] = curve(t[inside])
+        out[np.ix_(inside, places)] = curve(t[inside])
         return out
 
     return forces

@@ -22,9 +22,9 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.measured import EQUILIBRIUM_ITERATIONS, MACHINE_EQUILIBRIUM_ROUNDING_ERROR
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.end_effector import interface_place, place_gradient
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Closure, Drives, Mechanism, repeated
+from dolfinopt.multibody.mechanism import Drives, Mechanism, repeated
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
@@ -162,9 +162,9 @@ class MachineInstants:
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
-        if machine.closure is not None:
-            jacobian = interface_place(machine.mechanism, motion, q).jacobian
-            forces -= machine.ground_work(multipliers, jacobian[:, : forces.shape[1]])
+        if machine.loops is not None:
+            here = machine.loops.at(machine.mechanism, motion.q, q)
+            forces -= here.work(multipliers)[:, : forces.shape[1]]
         free, rotors = machine.drives.free, machine.drives.rotors
         forces[:, free] = self.drive_forces(y, yd)
         if rotors is not None:
@@ -190,13 +190,11 @@ class MachineInstants:
         if springs.friction.acts:
             motors += springs.friction.force(self.motor_speeds(yd))
         out = np.concatenate([rigid, rows, np.zeros_like(multipliers), motors], axis=1)
-        if machine.closure is None:
+        if machine.loops is None:
             return out
-        here = interface_place(machine.mechanism, motion, q)
-        jacobian = here.jacobian[:, machine.columns]
-        out[:, : machine.ends[1]] -= machine.ground_work(multipliers, jacobian)
-        gaps = slice(*machine.ends[1:])
-        out[:, gaps] = machine.gap_scale * machine.closure.gap(here.place)
+        here = machine.loops.at(machine.mechanism, motion.q, q)
+        out[:, : machine.ends[1]] -= here.work(multipliers)[:, machine.columns]
+        out[:, slice(*machine.ends[1:])] = machine.gap_scale * here.gap
         return out
 
     def linearise(
@@ -225,12 +223,11 @@ class MachineInstants:
         matrix[:, motors, 2, motors] += springs.rotor
         if springs.friction.acts:
             matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_speeds(yd))
-        if machine.closure is not None:
-            here = interface_place(machine.mechanism, motion, q, second=True)
-            assert here.hessian is not None
-            J = machine.closure.project(here.jacobian[:, machine.columns])  # (n, m, R + N)
-            H = here.hessian[:, machine.columns[:, None], machine.columns]
-            matrix[:, :moving, 0, :moving] -= machine.ground_work(multipliers, H)
+        if machine.loops is not None:
+            here = machine.loops.at(machine.mechanism, motion.q, q)
+            J = here.jacobian[:, :, machine.columns]  # (n, m, R + N)
+            H = here.hessian(multipliers)[:, machine.columns[:, None], machine.columns]
+            matrix[:, :moving, 0, :moving] -= H
             matrix[:, :moving, 2, moving:last] -= J.swapaxes(1, 2)
             matrix[:, moving:last, 0, :moving] += machine.gap_scale * J
         return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
@@ -245,20 +242,22 @@ class MachineSystem:
         motion: desired rigid coordinates at given instants (n,) s.
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
-        closure: of the last outboard interface, or None; in the plane.
+        loops: closures, of whose equations m are independent for flexible arms; or None.
+        rigid_loops: the same with those that are for rigid arms: as many as joints that follow.
     """
 
     mechanism: Any
     motion: Callable[[np.ndarray], RigidMotion]
     breakpoints: tuple[float, ...]
     drives: Drives
-    closure: Closure | None = None
+    loops: Loops | None = None
+    rigid_loops: Loops | None = None
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
         """Ends R, R + N, R + N + m of three kinds of unknowns; M motors follow."""
         moving = len(self.drives.free) + self.mechanism.num_coordinates
-        constraints = 0 if self.closure is None else self.closure.count
+        constraints = 0 if self.loops is None else self.loops.count
         return len(self.drives.free), moving, moving + constraints
 
     @cached_property
@@ -308,19 +307,20 @@ class MachineSystem:
         """Weights (R,), J^(1/2) per m or rad, that make free coordinates comparable to modes.
 
         The energy that a deflection of the same size as the coordinate's at the chain's end would
-        store in the softest arm.
+        store in the softest arm. Joints that follow in loops of rigid arms have none: they are as
+        the others have them, and rounding of theirs is no error beside stiff arms that bear little.
         """
-        return self.mechanism.levers[self.drives.free] / np.sqrt(self._softness)
+        scale = self.mechanism.levers[self.drives.free] / np.sqrt(self._softness)
+        return np.where(self.drives.driven, scale, 0.0) if self._loops_are_rigid else scale
 
-    def ground_force(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the force (n,) on the interface, complex, N, by the multipliers (n, m)."""
-        assert self.closure is not None
-        return multipliers @ self.closure.normals + self.closure.force
-
-    def ground_work(self, multipliers: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
-        """Return the work (n, ...) of `ground_force` along complex derivatives of the place."""
-        pull = self.ground_force(multipliers).reshape(-1, *(1,) * (derivatives.ndim - 1))
-        return (np.conj(pull) * derivatives).real
+    @cached_property
+    def _loops_are_rigid(self) -> bool:
+        """Whether no flexible arm is part of a loop."""
+        if self.loops is None:
+            return False
+        rest = np.zeros((1, self.mechanism.num_coordinates))
+        here = self.loops.at(self.mechanism, self.motion(np.zeros(1)).q, rest)
+        return not here.jacobian[:, :, self.mechanism.num_rigid :].any()
 
     def at(self, t: np.ndarray) -> MachineInstants:
         """Return the machine at instants t (n,), s."""
@@ -343,7 +343,7 @@ class MachineSystem:
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.rigid, desired, self.drives, self.closure)
+        return feed_forward(self.rigid, desired, self.drives, self.rigid_loops)
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -426,14 +426,13 @@ class MachineSystem:
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
         pushed = -instants.passing(y, yd) * instants.at_drives(multipliers)
         total = self.with_feed_forward(total, instants, pushed)
-        if self.closure is None:
+        if self.loops is None:
             return total
-        # -J' f . multipliers, by which the interface moves in their direction, and the gap's part.
-        moved = np.zeros((len(t), 1 + len(self.mechanism.bodies) + q.shape[1]))
+        # -J' f . multipliers, by which the frames move in their direction, and the gaps' part.
+        moved = np.zeros((len(t), motion.q.shape[1] + q.shape[1]))
         moved[:, self.columns] = multipliers[:, :moving]
-        pull = -self.ground_force(ground)
-        along_gap = self.gap_scale * (of_gap @ self.closure.normals)
-        parts = place_gradient(self.mechanism, motion, q, along_gap, moved, pull)
+        here = self.loops.at(self.mechanism, motion.q, q)
+        parts = here.gradient(self.gap_scale * of_gap, ground, -moved)
         return [add_integrals(a, part) for a, part in zip(total, parts, strict=True)]
 
     def with_feed_forward(
@@ -454,7 +453,9 @@ class MachineSystem:
             weights = weights.copy()
             weights[:, springs.joints] *= 1.0 + turned
         desired = instants.desired
-        of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
+        of_forces = feed_forward_weights(
+            self.rigid, desired, self.drives, self.rigid_loops, weights
+        )
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
         return [a + b.padded(a) for a, b in zip(total, rigid, strict=True)]
@@ -573,19 +574,18 @@ def feed_forward(
     rigid: Any,
     desired: RigidMotion,
     drives: Drives,
-    closure: Closure | None,
+    loops: Loops | None,
 ) -> np.ndarray:
     """Return the forces (n, R) that move the machine with rigid arms on the desired motion.
 
     In a closed loop the joints that follow from others have no drive: what they would need, the
-    ground gives through the constraint.
+    closures give.
     """
     none = np.zeros((len(desired.q), 0))
     forces = inverse_dynamics(rigid, desired, none, none, none)[1]
-    if closure is not None:
-        place = interface_place(rigid, desired, none)
-        forces = forces - (np.conj(closure.force) * place.jacobian).real
-        forces = forces + _carried_over(forces, place.jacobian, drives, closure)
+    if loops is not None:
+        here = loops.at(rigid, desired.q, none)
+        forces = forces - here.work(here.closing(forces, drives.dependent))
     return forces[:, drives.free] * drives.driven
 
 
@@ -593,29 +593,18 @@ def feed_forward_weights(
     rigid: Any,
     desired: RigidMotion,
     drives: Drives,
-    closure: Closure | None,
+    loops: Loops | None,
     weights: np.ndarray,
 ) -> np.ndarray:
-    """Return weights (n, 1 + arms) of inverse dynamics' forces from those (n, R) of its result.
+    """Return weights (n, R) of inverse dynamics' forces from those (n, free) of its result.
 
     The transpose of what `feed_forward` does with the forces.
     """
     out = np.zeros_like(desired.q)
     out[:, drives.free] = weights * drives.driven
-    if closure is not None:
-        none = np.zeros((len(desired.q), 0))
-        J = closure.project(interface_place(rigid, desired, none).jacobian)
-        dependent = drives.free[~drives.driven]
+    if loops is not None:
+        J = loops.at(rigid, desired.q, np.zeros((len(desired.q), 0))).jacobian
+        dependent = drives.dependent
         pulled = np.linalg.solve(J[:, :, dependent], (J @ out[:, :, None]))[:, :, 0]
         out[:, dependent] -= pulled
     return out
-
-
-def _carried_over(
-    forces: np.ndarray, jacobian: np.ndarray, drives: Drives, closure: Closure
-) -> np.ndarray:
-    """Return what the constraints add to the forces (n, 1 + arms) when dependent ones vanish."""
-    J = closure.project(jacobian)
-    dependent = drives.free[~drives.driven]
-    ground = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), forces[:, dependent, None])
-    return -(J.swapaxes(1, 2) @ ground)[:, :, 0]

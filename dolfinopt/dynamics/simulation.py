@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.build import build_system, desired_motion, rests_of
+from dolfinopt.dynamics.build import build_system, closure_of, desired_motion, rests_of
 from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
@@ -26,14 +26,13 @@ from dolfinopt.dynamics.newton import ONE_RUN
 from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.end_effector import (
     deviation,
     end_effector,
     end_effector_gradient,
     end_rotation,
-    interface_place,
     lengths,
-    place_gradient,
 )
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
@@ -48,6 +47,7 @@ from dolfinopt.multibody.shape_integrals import (
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.closures import PARTS
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -202,7 +202,7 @@ class Trajectory:
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
         """What loads every body (n, 7 + 2 q), in space (n, 18 + 9 q), see the function."""
-        if self.closure is not None:
+        if self.loops is not None:
             return load_coefficients(self.problem, self.t, self.unknowns)
         q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
         return coefficients_of(self.mechanism, self.motion, (q, qd, qdd))
@@ -213,20 +213,44 @@ class Trajectory:
         return isinstance(self.problem, MachineSystem)
 
     @property
+    def loops(self) -> Loops | None:
+        """What closes loops, in the plane and in space, or None."""
+        return self.problem.loops if isinstance(self.problem, MachineSystem) else None
+
+    @property
     def closure(self) -> Closure | None:
-        """What holds the last interface of a closed loop, or None."""
-        return self.problem.closure if isinstance(self.problem, MachineSystem) else None
+        """What holds the last interface of a closed loop in the plane, or None."""
+        return closure_of(self.scene)
 
     @cached_property
     def closure_force(self) -> np.ndarray | None:
-        """Force of the ground on the closed loop's end along its normals (n, m), N; or None.
+        """Forces of closures on what they hold (n, k), N; moments, N m; or None.
 
-        Of a slider along the line's direction turned by +90 degrees, without the given constant
-        force; of a pin along x and y.
+        In the plane of the ground on the chain's end: of a slider along the line's direction turned
+        by +90 degrees, without the given constant force; of a pin along x and y. In space those of
+        every closure on its first interface, in the joint's frame, see `tables.closures.PARTS`.
         """
-        if not isinstance(self.problem, MachineSystem) or self.problem.closure is None:
+        if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
-        return self.unknowns[2][:, slice(*self.problem.ends[1:])]
+        multipliers = self.unknowns[2][:, slice(*self.problem.ends[1:])]
+        return multipliers if self.closure else self.loops.reactions(multipliers)
+
+    @property
+    def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
+        """Magnitude of every closure's force and moment in space, (n,), by name and unit."""
+        found: dict[str, dict[str, np.ndarray]] = {}
+        forces, k = self.closure_force, 0
+        if forces is None:
+            return found
+        for one in self.scene.closures:
+            units = [unit for _, unit in PARTS[one.kind]]
+            own = forces[:, k : k + len(units)]
+            found[one.name] = {
+                unit: np.linalg.norm(own[:, [u == unit for u in units]], axis=1)
+                for unit in dict.fromkeys(units)
+            }
+            k += len(units)
+        return found
 
     @cached_property
     def end(self) -> np.ndarray:
@@ -301,20 +325,21 @@ class Trajectory:
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
 
-        With g(d, q) = 0 of the closure and its dependent joints d, by_q - g_q' g_d'^-1 by_d.
+        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' g_d'^-1 by_d; of
+        flexible arms that closures hold by more equations than that, the further forces are held.
 
         Args:
             indices: (n,) of the instants.
             by: (n, S) derivatives by the system's coordinates, each held.
         """
-        problem, closure = self.problem, self.closure
+        problem = self.problem
         by_q = by[:, problem.elastic_columns]
-        if not isinstance(problem, MachineSystem) or closure is None:
+        if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
             return by_q
-        here = interface_place(self.mechanism, self.motion[indices], self.q_e[indices])
-        J = closure.project(here.jacobian[:, problem.columns])
-        free = problem.ends[0]
-        dependent = slice(free - closure.count, free)
+        q_r, q = self.motion.q[indices], self.q_e[indices]
+        here = problem.rigid_loops.at(self.mechanism, q_r, q)
+        J = here.jacobian[:, :, problem.columns]
+        dependent = np.flatnonzero(~problem.drives.driven)
         by_g = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), by[:, dependent, None])
         return by_q - np.einsum("nm,nmk->nk", by_g[..., 0], J[:, :, problem.elastic_columns])
 
@@ -490,7 +515,14 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
     problems: list[Problem] = []
     for scene, own in zip(scenes, bodies, strict=True):
         lengths = tuple((arm.name, arm.length) for arm in scene.arms)
-        key = (scene.motion, scene.closure, lengths, scene.joints, scene.end_effector)
+        key = (
+            scene.motion,
+            scene.closure,
+            lengths,
+            scene.joints,
+            scene.closures,
+            scene.end_effector,
+        )
         motion = motions.setdefault(key, desired_motion(scene))
         problems.append(build_system(scene, own, motion))
     return problems
@@ -644,19 +676,16 @@ class _Machine:
             return by, bodies
         _, moving, last = system.ends
         by[:, :, :moving] = self.prescribed.by_all(weights)[:, :, system.columns]
-        if system.closure is None:
+        if system.loops is None:
             return by, bodies
         motion, q, rigid = self.prescribed.motion, self.prescribed.rates[0], weights.shape[1]
-        here = interface_place(system.mechanism, motion, q, second=True)
-        assert here.hessian is not None
+        here = system.loops.at(system.mechanism, motion.q, q)
         multipliers = self.instants.split(self.rates[2])[2]
-        turned = np.einsum("ni,nic->nc", weights, here.hessian[:, :rigid, system.columns])
-        by[0][:, :moving] -= system.ground_work(multipliers, turned)
-        pull = -system.ground_force(multipliers)
-        J = system.closure.project(here.jacobian[:, :rigid])
-        by[2][:, moving:last] -= np.einsum("nmi,ni->nm", J, weights)
+        H = here.hessian(multipliers)[:, :rigid, system.columns]
+        by[0][:, :moving] -= np.einsum("ni,nic->nc", weights, H)
+        by[2][:, moving:last] -= np.einsum("nmi,ni->nm", here.jacobian[:, :, :rigid], weights)
         moved = np.concatenate([weights, np.zeros_like(q)], axis=1)
-        parts = place_gradient(system.mechanism, motion, q, np.zeros_like(pull), moved, pull)
+        parts = here.gradient(np.zeros_like(multipliers), multipliers, -moved)
         return by, [add_integrals(a, part) for a, part in zip(bodies, parts, strict=True)]
 
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.dimension import Turning, product
 from dolfinopt.multibody.kinematics import MovingJoint
-from dolfinopt.multibody.measured import LEAST_INSTANTS
-from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site, several
+from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
@@ -52,7 +48,7 @@ def end_rotation(
     end = mechanism.way[-1]
     R = Posed(mechanism, motion.q, q).interface(*end)[1]
     rigid = Posed(mechanism, desired.q, np.zeros_like(q)).interface(*end)[1]
-    apart = _turned(R, rigid.swapaxes(0, 1))
+    apart = rotated(R, rigid.swapaxes(0, 1))
     dim = mechanism.constants[0].dim
     vectors = dim.rotation_vector(apart.reshape(dim.d, dim.d, -1))
     return np.broadcast_to(vectors.T, (len(q), dim.r))
@@ -159,7 +155,7 @@ class Posed:
             moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
             if moving.is_offset:
                 place = place + product(R, moving.r)
-            self._bodies[i] = moving, place, _turned(R, moving.R)
+            self._bodies[i] = moving, place, rotated(R, moving.R)
         return self._bodies[i]
 
     def section(self, i: int, number: int) -> Section:
@@ -173,180 +169,11 @@ class Posed:
         """Return its place (d, n) and its rotation; of `GROUND` where that is."""
         if (i, number) not in self._interfaces:
             (_, place, R), section = self.body(i), self.section(i, number)
-            turned = R if section.turning is None else _turned(R, section.turning.R)
+            turned = R if section.turning is None else rotated(R, section.turning.R)
             self._interfaces[i, number] = place + product(R, section.place), turned
         return self._interfaces[i, number]
 
 
-def _turned(R: np.ndarray, S: np.ndarray) -> np.ndarray:
+def rotated(R: np.ndarray, S: np.ndarray) -> np.ndarray:
     """Return R S of rotations (d, d, n), or one (d, d)."""
     return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)
-
-
-# -- in the plane: first and second derivatives by all coordinates, for what closes a loop
-#
-# Coordinates are ordered [rigid (1 + arms), elastic (N)]; places are complex, p = p_x + i p_y.
-# Going outwards along the chain every coordinate moves all that lies outboard of it: it shifts it
-# by t and rotates it by r about a point o,  dp = t + i r (p - o). A second coordinate further out
-# is rotated with it, so d2p = i r dp'; this is all there is, but for the second order of the arms'
-# own deformation.
-
-
-def outboard(body: ShapeIntegrals, e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outboard point (n,), complex, and its rotation, for coordinates e (n, q)."""
-    x, y, angle = body.outboard @ e.T
-    if body.is_stiffened:
-        bent = np.einsum("pkl,nk,nl->pn", body.K0_outboard, e, e, optimize=True)
-        x, y, angle = x - 0.5 * bent[0], y - 0.5 * bent[1], angle - 0.5 * bent[2]
-    return complex(*body.outboard_point) + (x + 1j * y), angle
-
-
-@dataclass(frozen=True, eq=False)
-class InterfacePlace:
-    """Where the last outboard interface is, and how it moves with the coordinates; n instants.
-
-    Attributes:
-        place: (n,) complex, m.
-        jacobian: (n, C) complex, C = 1 + arms + N.
-        hessian: (n, C, C) complex, symmetric; None where it was not asked for.
-    """
-
-    place: np.ndarray
-    jacobian: np.ndarray
-    hessian: np.ndarray | None = None
-
-
-def interface_place(
-    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, *, second: bool = False
-) -> InterfacePlace:
-    """Return place, Jacobian and, if asked for, Hessian at the motion's n instants; q (n, N)."""
-    if 0 < len(q) < LEAST_INSTANTS:
-        few = interface_place(*several(mechanism, motion, q), second=second)
-        H = None if few.hessian is None else few.hessian[: len(q)]
-        return InterfacePlace(few.place[: len(q)], few.jacobian[: len(q)], H)
-    count, rigid = len(q), 1 + len(mechanism.bodies)
-    size = rigid + q.shape[1]
-    origins, rotations, shifts = _frames(mechanism, motion, q)
-    end = origins[-1]
-    J = np.zeros((count, size), dtype=complex)
-    turn = np.zeros((count, size))  # rotation of all that lies outboard, by each coordinate
-    J[:, 0] = 1.0
-    order = [np.array([0])]  # groups of coordinates from the base outwards
-    for k, part in enumerate(mechanism.slices):
-        columns = slice(rigid + part.start, rigid + part.stop)
-        B, rotation = shifts[k]
-        J[:, 1 + k], turn[:, 1 + k] = 1j * (end - origins[k]), 1.0
-        lever = (end - origins[k + 1])[:, None]
-        J[:, columns] = rotations[k][:, None] * B + 1j * lever * rotation
-        turn[:, columns] = rotation
-        order += [np.array([1 + k]), np.arange(columns.start, columns.stop)]
-    if not second:
-        return InterfacePlace(end, J)
-    H = np.zeros((count, size, size), dtype=complex)
-    for i, group in enumerate(order):
-        beyond = np.concatenate([np.zeros(0, dtype=int), *order[i + 1 :]])
-        H[:, group[:, None], beyond] = 1j * turn[:, group, None] * J[:, None, beyond]
-        H[:, beyond[:, None], group] = H[:, group[:, None], beyond].swapaxes(1, 2)
-    for k, part in enumerate(mechanism.slices):
-        own = slice(rigid + part.start, rigid + part.stop)
-        lever = end - origins[k + 1]
-        H[:, 1 + k, 1 + k] = 1j * J[:, 1 + k]
-        r = turn[:, own]
-        H[:, own, own] = -lever[:, None, None] * r[:, :, None] * r[:, None, :]
-        if mechanism.bodies[k].is_stiffened:
-            x, y, turned = mechanism.bodies[k].K0_outboard
-            H[:, own, own] -= rotations[k][:, None, None] * (x + 1j * y)
-            H[:, own, own] -= 1j * lever[:, None, None] * turned
-    return InterfacePlace(end, J, H)
-
-
-def _frames(
-    mechanism: Mechanism, motion: RigidMotion, q: np.ndarray
-) -> tuple[list[np.ndarray], list[np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
-    """Return origins (the last one the end's), rotations and (shift, rotation) by the modes."""
-    origins = [motion.q[:, 0] + 1j * mechanism.origin[1]]
-    rotations: list[np.ndarray] = []
-    shifts: list[tuple[np.ndarray, np.ndarray]] = []
-    outer = np.ones(len(q), dtype=complex)
-    for k, part in enumerate(mechanism.slices):
-        body, e = mechanism.bodies[k], q[:, part]
-        rotations.append(outer * motion.joint_rotations[k])
-        d, angle = outboard(body, e)
-        origins.append(origins[-1] + rotations[-1] * d)
-        outer = rotations[-1] * np.exp(1j * angle)
-        B, rotation = body.outboard[0] + 1j * body.outboard[1], body.outboard[2]
-        if body.is_stiffened:
-            bent = np.tensordot(e, body.K0_outboard, (1, 1))  # K0_p is symmetric
-            B, rotation = B - bent[:, 0] - 1j * bent[:, 1], rotation - bent[:, 2]
-        shifts.append((B, np.broadcast_to(rotation, e.shape)))
-    return origins, rotations, shifts
-
-
-def place_gradient(
-    mechanism: Mechanism,
-    motion: RigidMotion,
-    q: np.ndarray,
-    weights: np.ndarray,
-    moved: np.ndarray,
-    pull: np.ndarray,
-) -> list[dict[str, np.ndarray]]:
-    """Return the derivative of sum_n Re(conj(weights) p + conj(pull) J moved) by every body.
-
-    p is the end's place and J moved the direction in which the coordinates `moved` take it.
-
-    Args:
-        mechanism, motion, q: as for `interface_place`, n instants.
-        weights, pull: (n,) complex.
-        moved: (n, C) virtual displacements of all coordinates.
-
-    Returns:
-        Of every body, by its outboard modes (3, q) and K0_outboard (3, q, q).
-    """
-    if 0 < len(q) < LEAST_INSTANTS:
-        few = several(mechanism, motion, q, weights, moved, pull)
-        for x in few[3:]:
-            x[len(q) :] = 0.0
-        return place_gradient(*few)
-    origins, rotations, shifts = _frames(mechanism, motion, q)
-    first = 1 + len(mechanism.bodies)
-    virtual = [moved[:, first + part.start : first + part.stop] for part in mechanism.slices]
-    turns, swept = _virtual_motion(origins, rotations, shifts, moved[:, :first], virtual)
-    found = []
-    for k, (part, v) in enumerate(zip(mechanism.slices, virtual, strict=True)):
-        e, back = q[:, part], np.conj(rotations[k])
-        lever, change = origins[-1] - origins[k + 1], swept[-1] - swept[k + 1]
-        # What a shift along the frame's axes, and a rotation of all that is outboard, are worth:
-        # of the place itself and as the frame turns by `moved`, and of the modes' variation.
-        turned = weights - 1j * turns[k] * pull
-        spin = (np.conj(weights) * 1j * lever + np.conj(pull) * 1j * change).real
-        values = ((back * turned).real, (back * turned).imag, spin)
-        rates = ((back * pull).real, (back * pull).imag, (np.conj(pull) * 1j * lever).real)
-        pairs = list(zip(values, rates, strict=True))
-        by = {"outboard": np.stack([a @ e + b @ v for a, b in pairs])}
-        if mechanism.bodies[k].is_stiffened:
-            by["K0_outboard"] = -np.stack(
-                [e.T @ (0.5 * a[:, None] * e + b[:, None] * v) for a, b in pairs]
-            )
-        found.append(by)
-    return found
-
-
-def _virtual_motion(
-    origins: list[np.ndarray],
-    rotations: list[np.ndarray],
-    shifts: list[tuple[np.ndarray, np.ndarray]],
-    rigid: np.ndarray,
-    virtual: list[np.ndarray],
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return how far virtual displacements turn every frame, and shift every origin (complex)."""
-    # Virtual displacements: of rigid coordinates (n, 1 + arms), of every arm's elastic ones (n, q).
-    turns, swept = [], [rigid[:, 0].astype(complex)]
-    turn = np.zeros(len(rigid))
-    for k, ((B, rotation), v) in enumerate(zip(shifts, virtual, strict=True)):
-        turn = turn + rigid[:, 1 + k]
-        turns.append(turn)
-        bend = np.einsum("nk,nk->n", np.broadcast_to(B, v.shape), v)
-        arm = origins[k + 1] - origins[k]
-        swept.append(swept[-1] + 1j * turn * arm + rotations[k] * bend)
-        turn = turn + np.einsum("nk,nk->n", rotation, v)
-    return turns, swept

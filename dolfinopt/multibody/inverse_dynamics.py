@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.multibody.body_motion import BodyMotion, Load
-from dolfinopt.multibody.end_effector import interface_place
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.kinematics import Interface, MovingJoint
-from dolfinopt.multibody.mechanism import GROUND, Closure, Mechanism, Site
+from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
@@ -158,6 +158,7 @@ def inverse_dynamics(
         on_ground = tree.hanging[GROUND, 0]
         pulls = [links[i].joint.at_interface(loads.joints[i])[0][0] for i in on_ground]
         drives.insert(0, np.sum(pulls, axis=0))
+    drives += [np.zeros(len(q))] * tree.rods  # weigh nothing
     forces = np.stack(drives, axis=1) if drives else np.zeros((len(q), 0))
     forces = forces + tree.rotors * motion.qdd
     if tree.friction is not None:
@@ -245,7 +246,10 @@ class Stiffening:
 
 
 def largest_change(
-    mechanism: Mechanism, motion: RigidMotion, closure: Closure | None = None
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    loops: Loops | None = None,
+    dependent: np.ndarray | None = None,
 ) -> float:
     """Return the largest |eigenvalue| of K^-1 sum_p p K0_p over arms and instants.
 
@@ -254,10 +258,11 @@ def largest_change(
     Args:
         mechanism: bodies with geometric stiffness.
         motion: at n instants.
-        closure: of the last interface, or None.
+        loops: closures, with those equations that count for rigid arms; or None.
+        dependent: rigid coordinates that follow from them.
     """
     largest = 0.0
-    loads = _loads(mechanism.rigid, motion, closure)
+    loads = _loads(mechanism.rigid, motion, loops, dependent)
     for body, p in zip(mechanism.bodies, loads, strict=True):
         largest = max(largest, stiffness_change(body, p))
     return largest
@@ -273,28 +278,14 @@ def stiffness_change(body: ShapeIntegrals, p: np.ndarray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
 
-def _loads(rigid: Mechanism, motion: RigidMotion, closure: Closure | None) -> list[np.ndarray]:
+def _loads(
+    rigid: Mechanism, motion: RigidMotion, loops: Loops | None, dependent: np.ndarray | None
+) -> list[np.ndarray]:
     """Return what loads every body (n, loads); in the plane a_x, a_y, wd, -w^2, F_x, F_y, T."""
     none = np.zeros((len(motion.q), 0))
-    pull: dict[Site, Load] = {}
-    if closure is not None:
-        force = _ground_force(rigid, motion, closure)
-        pull[len(rigid.bodies) - 1, 0] = (
-            np.stack([force.real, force.imag]),
-            np.zeros((1, len(none))),
-        )
+    pull: Mapping[Site, Load] = {}
+    if loops is not None and dependent is not None:
+        forces = inverse_dynamics(rigid, motion, none, none, none)[1]
+        here = loops.at(rigid, motion.q, none)
+        pull = here.pulls(here.closing(forces, dependent))
     return body_loads(rigid, motion, (none, none, none), pull)
-
-
-def _ground_force(rigid: Mechanism, motion: RigidMotion, closure: Closure) -> np.ndarray:
-    """Return what the last arm must give to the ground (n,), complex, in its end's components."""
-    # The joints that close the loop have no drive: there are as many of them as constraints.
-    none = np.zeros((len(motion.q), 0))
-    forces = inverse_dynamics(rigid, motion, none, none, none)[1][:, -closure.count :]
-    place = interface_place(rigid, motion, none)
-    J = place.jacobian[:, -closure.count :]
-    left = forces - (np.conj(closure.force) * J).real
-    ground = np.linalg.solve(closure.project(J).swapaxes(1, 2), left[:, :, None])[:, :, 0]
-    pull = ground @ closure.normals + closure.force
-    angle = motion.q[:, 1:].sum(axis=1)
-    return -np.exp(-1j * angle) * pull

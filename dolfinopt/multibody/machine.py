@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
+from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
 from dolfinopt.multibody.dimension import series
 from dolfinopt.multibody.joints import Friction, bearing_body, with_bearings
 from dolfinopt.multibody.mechanism import GROUND, Joint, JointHardware, Mechanism, Site, plane_chain
@@ -24,6 +25,7 @@ from dolfinopt.paths.tables import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.arms import interface_number
+from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
 
 # -- rigid bodies ----------------------------------------------------------------------------
@@ -274,7 +276,8 @@ def build_spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mecha
         gravity if len(gravity) == 3 else (0.0, 0.0, 0.0),
         end,
     )
-    return _with_parts(mechanism, scene)
+    mechanism = _with_parts(mechanism, scene)
+    return replace(mechanism, rods=len(scene.rods)) if scene.rods else mechanism
 
 
 def _with_parts(mechanism: Mechanism, scene: Scene) -> Mechanism:
@@ -328,6 +331,59 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     return tuple(joints)
 
 
+# -- what closes loops in space ------------------------------------------------------------------
+
+
+def skeleton(scene: Scene) -> Mechanism:
+    """Return the scene's joints and interfaces without any mass: what moves rigid links."""
+    none = np.zeros(3)
+    bodies = []
+    for arm in scene.arms:
+        first, *further = arm.interface_points
+        bodies.append(rigid_spatial_body(0.0, none, np.zeros(6), first, tuple(further)))
+    one = spatial_mechanism(bodies, joints_of(scene), {}, none, scene.end_effector)
+    return replace(one, rods=len(scene.rods))
+
+
+def loops_of(scene: Scene) -> Loops | None:
+    """Return the scene's closures in space with all of their equations; None of a tree."""
+    if not scene.closures:
+        return None
+    reach, first = end_chain(scene).reach, len(scene.movable)
+    places = {one.name: first + k for k, one in enumerate(scene.rods)}
+    ties = []
+    for one in scene.closures:
+        a, b = (closing_site(scene, one, which) for which in (0, 1))
+        assert a is not None
+        equations = _equations(one, reach, places.get(one.name))
+        point, rotation = np.array(one.point, dtype=float), roll_pitch_yaw(one.rpy)
+        ties.append(Tie(one.name, a, b, point, rotation, equations))
+    return Loops.of(ties)
+
+
+def _equations(one: Closures, reach: float, place: int | None) -> tuple[Equation, ...]:
+    """Return a closure's equations; vectors of the second frame are in the joint's."""
+    if one.kind == "rod":
+        return (Distance(0.0 if place is not None else one.length or 0.0, place),)
+    together: tuple[Equation, ...] = tuple(map(Along, ONE))
+    if one.kind == "ball":
+        return together
+    axis = _unit(one.axis)
+    if one.kind == "universal":
+        return (*together, Facing(_unit(one.cross_axis), axis, reach))
+    across = _unit(np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))
+    other = np.cross(axis, across)
+    if one.kind == "pin":
+        return (*together, Facing(axis, across, reach), Facing(axis, other, reach))
+    pairs = (across, other), (other, axis), (axis, across)
+    return (Along(across), Along(other), *(Facing(u, v, reach) for u, v in pairs))
+
+
+def _unit(v: Sequence[float] | np.ndarray | None) -> np.ndarray:
+    assert v is not None
+    return np.asarray(v, dtype=float) / np.linalg.norm(v)
+
+
 def end_chain(scene: Scene) -> RigidChain:
     """Return the rigid links from the ground to the end-effector."""
     joints, (arm, interface) = joints_of(scene), scene.end_effector
@@ -368,7 +424,7 @@ def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     Raises:
         InputError: the table cannot be used, or the path cannot be followed.
     """
-    if scene.motion.path != "joints":
+    if scene.motion.path != "joints" or scene.closures:
         from dolfinopt.multibody.spatial.end_effector import follower
 
         return RigidMotion(*follower(scene).at(t))

@@ -60,3 +60,10 @@ FILE_ROUNDING_SHARE = 1e-6
 # 5 %, geometric stiffening by rotation changes the sign of its diagonal for slender bodies.
 CENTRIFUGAL_EXCESS_SHARE = 0.1
 SAME_NODE_SHARE = 1e-9  # of an arm's extent: nodes of two ranks that are no farther apart are one
+
+# -- closures --------------------------------------------------------------------------------
+
+# Singular values of the closures' Jacobian, columns of like size, over the largest: below it
+# equations follow from others. Rounding leaves 1e-16; the least that counts was 0.4, of pins that
+# hold flexible arms out of their plane.
+INDEPENDENT_SHARE = 1e-6

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -134,6 +134,11 @@ class Drives:
         out[:, self.limited] = saturated(wanted[:, self.limited], limits)[1]
         return out
 
+    @property
+    def dependent(self) -> np.ndarray:
+        """Rigid coordinates that follow from a closed loop."""
+        return self.free[~self.driven]
+
     @cached_property
     def limited(self) -> np.ndarray:
         """Where there is a limit (R,)."""
@@ -198,12 +203,6 @@ class Closure:
 def repeated(count: int) -> np.ndarray | None:
     """Return indices that make `LEAST_INSTANTS` of fewer, the last one repeated; None: enough."""
     return np.minimum(np.arange(LEAST_INSTANTS), count - 1) if 0 < count < LEAST_INSTANTS else None
-
-
-def several(*arguments: Any) -> tuple[Any, ...]:
-    """Return the arguments at `LEAST_INSTANTS` instants, the last one as often as it takes."""
-    every = repeated(len(arguments[-1]))
-    return arguments if every is None else tuple(x[every] for x in arguments)
 
 
 # -- a tree of bodies, in the plane and in space: what inverse dynamics works on
@@ -275,6 +274,7 @@ class Mechanism:
         bearings: the bodies whose joints sit on bearings, see `joints.with_bearings`: the last
             bodies, massless, in this order.
         friction: of the joints' coordinates, or None.
+        rods: number of further rigid coordinates, lengths of rods that close loops.
     """
 
     bodies: tuple[ShapeIntegrals, ...]
@@ -287,6 +287,7 @@ class Mechanism:
     scales: tuple[Scale, ...] = ()
     bearings: tuple[int, ...] = ()
     friction: Friction | None = None
+    rods: int = 0
 
     def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
         """Return it at some of the instants."""
@@ -339,7 +340,7 @@ class Mechanism:
 
     @property
     def num_rigid(self) -> int:
-        """Number R of rigid coordinates, of cart and joints."""
+        """Number R of rigid coordinates, of cart, joints and rods."""
         return len(self.rotors)
 
     @cached_property
@@ -357,7 +358,7 @@ class Mechanism:
     def rotors(self) -> np.ndarray:
         """Mass of the cart and reflected inertia of every rigid coordinate's drive (R,)."""
         cart = [] if self.cart is None else [self.cart]
-        return np.array([*cart, *(self.joints[i].rotor for i in self.movable)])
+        return np.array([*cart, *(self.joints[i].rotor for i in self.movable), *[0.0] * self.rods])
 
     # -- how the recursions go along it ------------------------------------------------------
 
@@ -403,7 +404,11 @@ class Mechanism:
     @cached_property
     def way(self) -> tuple[Site, ...]:
         """From the ground to the end-effector: every body and the interface that leads on."""
-        found = [self.end]
+        return self.way_to(self.end)
+
+    def way_to(self, site: Site) -> tuple[Site, ...]:
+        """Return every body from the ground to a site, and the interface that leads on."""
+        found = [site]
         while (joint := self.joints[found[0][0]]).parent != GROUND:
             found.insert(0, (joint.parent, joint.interface))
         return tuple(found)
@@ -463,7 +468,8 @@ class Mechanism:
         reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in self.constants)
         reach += sum(float(np.linalg.norm(one.origin)) for one in self.joints)
         slides = [self.joints[i].kind == "prismatic" for i in self.movable]
-        return np.where([True, *slides] if self.cart is not None else slides, 1.0, reach)
+        slides = [True, *slides] if self.cart is not None else slides
+        return np.where(slides + [True] * self.rods, 1.0, reach)
 
     @cached_property
     def stiffnesses(self) -> tuple[np.ndarray, ...]:

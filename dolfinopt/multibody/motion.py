@@ -65,11 +65,6 @@ class RigidMotion:
         """Return it at some of the instants."""
         return RigidMotion(self.q[part], self.qd[part], self.qdd[part])
 
-    @cached_property
-    def joint_rotations(self) -> tuple[np.ndarray, ...]:
-        """Return exp(i angle) (n,) of every joint."""
-        return tuple(np.exp(1j * self.q[:, k]) for k in range(1, self.q.shape[1]))
-
 
 @dataclass(frozen=True, eq=False)
 class Path:

@@ -336,7 +336,9 @@ def _body_tangent(
     """Return the derivative of body i's rows."""
     part, body, kept = tree.slices[i], link.body, places.kept[i]
     K, D, M = body.rows_by_rates(kept, interface_pushes(link, loads.outboard[i]))
-    left, right = [], []
+    # Closures may be all that sits on a body whose frame moves as prescribed.
+    count, width = body.a.shape[1], 3 * places.size
+    left, right = [np.zeros((0, len(K[0]), count))], [np.zeros((0, width, count))]
     for s, interface in link.interfaces.items():
         turning = interface.pushes_by_e(loads.outboard[i][s], kept)
         if turning is not None:

@@ -36,6 +36,7 @@ from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
+from dolfinopt.scene.tables.closures import PARTS
 from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
 from dolfinopt.version import __version__
 
@@ -263,6 +264,7 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
         *_limits_exceeded(run.trajectory),
+        *_redundant(run.trajectory),
         *_contact_warnings(run, traits),
         *(one.sentence for one in _too_narrow(run, traits)),
     ]
@@ -305,7 +307,12 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     if free := free_drives(scene):
         errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
         found["drive_error_peak"] = {name: errors[name] for name in free}
-    if trajectory.closure_force is not None:
+    if trajectory.closure_sizes:
+        found["closure_peak"] = {
+            name: {unit: float(size.max()) for unit, size in sizes.items()}
+            for name, sizes in trajectory.closure_sizes.items()
+        }
+    elif trajectory.closure_force is not None:
         found["closure_force_peak"] = float(np.linalg.norm(trajectory.closure_force, axis=1).max())
     return found
 
@@ -337,6 +344,18 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
     return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []
 
 
+def _redundant(trajectory: Trajectory | None) -> list[str]:
+    """Return a sentence that tells how many equations of closures follow from others."""
+    if trajectory is None or trajectory.loops is None or not trajectory.loops.redundant:
+        return []
+    loops = trajectory.loops
+    return [
+        f"closures: of {loops.count + loops.redundant} equations {loops.redundant} follow from the "
+        "others and are left out; how forces share between them is not determined, the smallest "
+        "ones are told"
+    ]
+
+
 def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | None:
     """Return the largest stress at element centres, and at Gauss points, too; of every arm."""
     if not stress:
@@ -361,6 +380,9 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
         units["drive_error_peak"] = {name: rigid[name] for name in free}
     if scene.closure is not None:
         units["closure_force_peak"] = "N"
+    if scene.closures:
+        kinds = {one.name: [unit for _, unit in PARTS[one.kind]] for one in scene.closures}
+        units["closure_peak"] = {name: {u: u for u in own} for name, own in kinds.items()}
     units["history.csv"] = {"objective": unit, **HISTORY}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)

@@ -10,6 +10,7 @@ import numpy as np
 from dolfinopt.disk import read_arrays, write_arrays, write_text
 from dolfinopt.multibody.joints import moves
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.closures import PARTS
 from dolfinopt.scene.tables.joint_parts import joint_parts
 
 BEHIND = "; behind them the bearings', m and rad"
@@ -54,7 +55,7 @@ def write_trajectory(
         "deviation": "m",
         "compliance": "N m",
         "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
-        "closure_force": "N, " + _directions(scene),
+        "closure_force": _of_closures(scene) or "N, " + _directions(scene),
         "slider_position": "m, from closure.point along closure.direction",
         "rotation": "rad",
         "initial_deviation": "m",
@@ -118,6 +119,7 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
     names = list(scene.rigid_units)
     soft = {names[k] for k, one in pairs if k is not None and one.stiffness > 0.0}
+    soft |= {one.name for one in scene.rods if one.is_spring}
     return tuple(name for name in scene.driven if name in soft)
 
 
@@ -146,12 +148,20 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     if trajectory.is_machine:
         units |= {f"q_r_desired_{name}": unit for name, unit in scene.rigid_units.items()}
         units |= {f"q_motor_{name}": unit for name, unit in _motor_units(trajectory).items()}
+    for one in scene.closures:
+        for part, unit in PARTS[one.kind]:
+            units["_".join(filter(None, ("closure", one.name, part)))] = unit
     if scene.closure is not None:
         names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
         units |= {f"closure_force_{name}": "N" for name in names}
         units |= {"slider_position": "m"} if scene.closure.kind == "slider" else {}
     ends = [""] if trajectory.mechanism.dim.r == 1 else [f"_{axis}" for axis in axes]
     return units | {f"rotation{end}": "rad" for end in ends}
+
+
+def _of_closures(scene: Scene) -> str:
+    """Return the unit of every column of the closures' forces in space; "" in the plane."""
+    return ", ".join(unit for one in scene.closures for _, unit in PARTS[one.kind])
 
 
 def _directions(scene: Scene) -> str:

@@ -264,7 +264,10 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         if scene.closure is None or scene.closure.kind != "pin":
             yield f"deviation_scenario_{number}", figures.max_deviation
             yield f"settling_scenario_{number}", other.settling
-    if motion.closure_force is not None:
+    if motion.closure_sizes:
+        for name, sizes in motion.closure_sizes.items():
+            yield f"closure_force_{name}", float(sizes["N"].max())
+    elif motion.closure_force is not None:
         yield "closure_force", float(np.linalg.norm(motion.closure_force, axis=1).max())
     yield STRESS, stress
 

@@ -202,7 +202,8 @@ def deviation_title(trajectory: Trajectory) -> str:
     """Return what of a motion deviates from what."""
     if trajectory.closure is not None:
         return OF_SLIDER
-    return OF_CONTROL if trajectory.is_machine else DEVIATION
+    controlled = trajectory.is_machine and (trajectory.scene.control or not trajectory.loops)
+    return OF_CONTROL if controlled else DEVIATION
 
 
 def deviation_figure(
@@ -318,7 +319,7 @@ def drives_figure(trajectory: Trajectory) -> Figure:
     panels = drive_panels(trajectory)
     columns = max(map(len, panels))
     used = np.array([[k >= columns - len(row) for k in range(columns)] for row in panels])
-    title = "Drives" if trajectory.closure is None else "Drives and what holds the loop"
+    title = "Drives" if trajectory.loops is None else "Drives and what holds the loop"
     figure, grid = panel_grid(used, title, "time [s]")
     t = trajectory.t
     quantities = [quantity for row in panels for quantity in row]
@@ -341,7 +342,7 @@ Panel = tuple[str, str, dict[str, np.ndarray]]  # label, SI unit, curves (n,) by
 def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
     """Return the rows of the figure: of every drive error and force, of the ground its force."""
     scene, rows = trajectory.scene, []
-    places = range(*scene.driven_columns.indices(trajectory.q_r.shape[1]))
+    places = np.arange(scene.num_rigid)[scene.driven_columns].tolist()
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
     units, loads = scene.rigid_units, drive_units(scene)
     for name, k in zip(scene.driven, places, strict=True):
@@ -350,8 +351,13 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
         if name in free:
             row.insert(0, (f"{name}: error", units[name], {"": error[:, k]}))
         rows.append(row)
+    driven = scene.driven
+    for name, sizes in trajectory.closure_sizes.items():
+        words = {"N": "force", "N m": "moment"}
+        row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
+        rows += [row] if name not in driven else []  # a driven rod's is its drive's
     forces = trajectory.closure_force
-    if forces is not None:
+    if forces is not None and trajectory.closure is not None:
         names = ("",) if forces.shape[1] == 1 else ("x", "y")
         what = "normal force on the slider" if len(names) == 1 else "force of the pin on the arm"
         rows.append([(what, "N", dict(zip(names, forces.T, strict=True)))])

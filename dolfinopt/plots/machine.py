@@ -137,7 +137,8 @@ def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str)
         from dolfinopt.plots.solid_machine import solid_machine_figure
 
         space: Any = trajectory.mechanism
-        return solid_machine_figure(views, space, trajectory.t, trajectory.q_r, title)
+        q_r, loops = trajectory.q_r, trajectory.loops
+        return solid_machine_figure(views, space, trajectory.t, q_r, title, loops)
     mechanism, closure, t = trajectory.mechanism, trajectory.closure, trajectory.t
     q_r, rigid = trajectory.q_r, np.zeros((len(t), mechanism.slices[-1].stop))
     closed = close_loop(mechanism, closure, q_r, rigid)

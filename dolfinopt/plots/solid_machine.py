@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.multibody.closures import Loops
 
 POSES = 4
 MOST = (10.0, 8.0)  # inches, of the picture
@@ -48,6 +49,7 @@ ELEVATION = np.radians(25.0)  # of the viewer
 AZIMUTHS = np.radians(np.arange(-75.0, 270.0, 30.0))
 # Sizes over the machine's.
 ROD, PIN, PIN_LENGTH, AXIS, BALL, PLATE = 0.01, 0.016, 0.05, 0.16, 0.03, 0.12
+BARREL = 0.55  # of a cylinder's length
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,7 @@ def solid_machine_figure(
     t: np.ndarray,
     q_r: np.ndarray,
     title: str,
+    loops: Loops | None = None,
 ) -> Figure:
     """Draw the assembled machine in a few poses along its path, undeformed; the last is darkest.
 
@@ -109,9 +112,10 @@ def solid_machine_figure(
         t: (n,) s.
         q_r: (n, joints) rigid coordinates; rad or m.
         title: above the picture.
+        loops: closures, or None.
     """
     machine = assemble(views, mechanism)
-    frames = body_frames(mechanism, q_r, np.zeros((len(t), mechanism.num_coordinates)))
+    frames = body_frames(mechanism, q_r, np.zeros((len(t), mechanism.num_coordinates)), loops)
     path = frames.end
     at = path_poses(path)
     camera = camera_of(machine, frames)
@@ -165,7 +169,7 @@ def seen_part(
     machine: Assembly, frames: Frames, camera: Camera, *paths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest place (2,) of the plane that anything reaches, and a margin."""
-    points = [frames.origin, frames.outboard, *paths]
+    points = [frames.origin, frames.outboard, frames.tied, *paths]
     for i, surface in enumerate(machine.surfaces):
         if surface is not None and len(surface.points):
             box = box_corners(surface.points.min(axis=0), surface.points.max(axis=0))
@@ -236,15 +240,31 @@ def draw_skeleton(
         origin = frames.origin[n, i]
         if surface is None:  # a bar to every interface that something sits on
             held = [frames.held[n, k] for k, parent in enumerate(frames.parents) if parent == i]
-            for end in (frames.outboard[n, i], *held):
+            for end in (frames.outboard[n, i], *held, *_tied_to(frames, n, i)):
                 studio.bar(np.stack([origin, end]), ROD * size, rod)
         if frames.parents[i] != GROUND:
             studio.bar(np.stack([frames.held[n, i], origin]), ROD * size, rod)
         if mechanism.joints[i].coordinate is not None:
             half = 0.5 * PIN_LENGTH * size * frames.axes[n, i]
             studio.bar(np.stack([origin - half, origin + half]), PIN * size, rod)
+    for tie, (a, b) in zip(frames.ties, frames.tied[n], strict=True):
+        if tie.is_rod:  # the barrel of a cylinder, and its rod
+            studio.bar(np.stack([b, a]), ROD * size, rod)
+            studio.bar(np.stack([b, b + BARREL * (a - b)]), 2.0 * ROD * size, rod)
+        studio.ball(a, PIN * size, rod)
     radius = (BALL if machine.carries else 0.5 * BALL) * size
     studio.ball(frames.end[n], radius, lighter(ORANGE, pale))
+
+
+def _tied_to(frames: Frames, n: int, i: int) -> list[np.ndarray]:
+    """Return where closures hold body i at an instant."""
+    sites = [(tie.a, tie.b) for tie in frames.ties]
+    return [
+        place
+        for pair, places in zip(sites, frames.tied[n], strict=True)
+        for site, place in zip(pair, places, strict=True)
+        if site is not None and site[0] == i
+    ]
 
 
 def lighter(colour: str, white: float) -> tuple[float, float, float]:
@@ -295,7 +315,8 @@ def make_solid_film(
     machine = assemble(views, mechanism, modes=True)
     q_r, q_e = trajectory.q_r, trajectory.q_e
     ideal = trajectory.desired.q if trajectory.is_machine else q_r
-    rigid = body_frames(mechanism, ideal, np.zeros_like(q_e))
+    loops = trajectory.loops
+    rigid = body_frames(mechanism, ideal, np.zeros_like(q_e), loops)
     if magnification is None:
         bent = body_frames(mechanism, q_r, q_e)
         away = np.concatenate([bent.outboard - rigid.outboard, bent.held - rigid.held], axis=1)
@@ -307,7 +328,8 @@ def make_solid_film(
         turn = max(*turns, float(np.abs(q_r - ideal).max()))
         largest = float(np.linalg.norm(away, axis=2).max())
         magnification = round_magnification(largest, machine.size, float(turn))
-    moving = body_frames(mechanism, ideal + magnification * (q_r - ideal), magnification * q_e)
+    off = magnification * (q_r - ideal)
+    moving = body_frames(mechanism, ideal + off, magnification * q_e, loops)
     count = sum(len(one.triangles) for one in machine.surfaces if one is not None)
     if count > TRIANGLES:
         frames = min(frames, max(FEWEST, frames * TRIANGLES // count))

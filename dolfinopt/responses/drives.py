@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ class DriveResponse(MotionResponse):
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
         weights = np.zeros_like(trajectory.joint_forces)
         by_forces = self.by_forces(trajectory, cases)
-        weights[cases.indices, trajectory.scene.driven_columns] = by_forces
+        weights[_at_drives(trajectory, cases)] = by_forces
         by_rates, bodies = trajectory.drive_forces.gradient(weights)
         return by_rates[:, cases.indices], [integrals_of(one) for one in bodies]
 
@@ -41,6 +42,14 @@ class DriveResponse(MotionResponse):
         """Return the weight of every drive (drives,), 1/N and 1/(N m): 1 of each by default."""
         given = self.options.effort_weights
         return np.ones(len(scene.driven)) if given is None else np.array(given)
+
+
+def _at_drives(trajectory: Trajectory, cases: LoadCases) -> Any:
+    """Return the places of the drives' forces at the instants among all."""
+    columns = trajectory.scene.driven_columns
+    if isinstance(columns, slice):
+        return cases.indices, columns
+    return np.ix_(cases.indices, np.array(columns))
 
 
 # -- effort of the drives: what their motors' heat, and with it their size, follow from ----------
@@ -69,7 +78,7 @@ class Effort(DriveResponse):
 
     def _weighted(self, trajectory: Trajectory, cases: LoadCases) -> np.ndarray:
         """Return the terms (n, drives) whose squares add up to the effort's."""
-        forces = trajectory.joint_forces[cases.indices, trajectory.scene.driven_columns]
+        forces = trajectory.joint_forces[_at_drives(trajectory, cases)]
         return self._factors(trajectory, cases) * forces
 
     def _factors(self, trajectory: Trajectory, cases: LoadCases) -> np.ndarray:

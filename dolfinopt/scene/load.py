@@ -52,6 +52,7 @@ from dolfinopt.scene.tables.arms import (
     Arm,
 )
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
+from dolfinopt.scene.tables.closures import Closures, as_closure
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Joint
 from dolfinopt.scene.tables.motion import Motion
@@ -80,7 +81,7 @@ else:
     import tomli as tomllib
 
 # Arrays of tables of which --set knows single ones by their name.
-NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint}
+NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint, "closures": Closures}
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
@@ -147,6 +148,9 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _resolve_files(tree, source, changes)
     _drop_sizes(tree, sizes)
     _measure_bodies(tree, inherited)
+    if (closure := as_closure(tree)) is not None:
+        tree["closure"] = closure
+        del tree["closures"]
     derived = complete(tree, source, changes)
     try:
         scene = Scene.model_validate(tree)

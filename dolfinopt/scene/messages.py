@@ -236,7 +236,7 @@ def _found(loc: Loc, tree: dict[str, Any]) -> str:
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:
     """Return the TOML spelling of a path, with the name of the arm it belongs to."""
     text = ".".join(map(key_text, loc))
-    named = loc[0] in ("arms", "joints") and len(loc) > 1
+    named = loc[0] in ("arms", "joints", "closures") and len(loc) > 1
     name = arm_name(tree, loc[1], loc[0]) if named else None
     return f"{text} ({name})" if name and loc[2:] != ("name",) else text
 

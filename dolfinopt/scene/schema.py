@@ -21,6 +21,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material, interface_number
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
+from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer
 from dolfinopt.scene.tables.machine import Closure, Control, Damping, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion
@@ -61,6 +62,11 @@ class Scene(Table):
     )
     closure: Closure | None = Field(
         default=None, description="closed loop; without this table the last arm's end is free"
+    )
+    closures: tuple[Closures, ...] = Field(
+        default=(),
+        description="joints that close loops of a machine in space; without this table it is a "
+        "tree",
     )
     payload: Payload = Field(
         description="load of the end-effector",
@@ -186,7 +192,8 @@ class Scene(Table):
         for joint in self.joints:
             if (k := index.get(joint.parent)) is not None:
                 found.add((k, interface_number(self.arms[k], joint.parent_interface) or 0))
-        return frozenset(found)
+        ends = [closing_site(self, one, which) for one in self.closures for which in (0, 1)]
+        return frozenset(found).union(end for end in ends if end is not None)
 
     @property
     def dependent_joints(self) -> int:
@@ -197,24 +204,31 @@ class Scene(Table):
     def driven(self) -> tuple[str, ...]:
         """Names of the rigid coordinates that are driven: the cart, and arms for their joints.
 
-        In space the joints' own.
+        In space the joints' own, of those that are not passive, then those of driven rods.
         """
         if self.is_spatial:
-            return tuple(joint.name for joint in self.movable)
+            joints = tuple(joint.name for joint in self.movable if not joint.passive)
+            return joints + tuple(one.name for one in self.closures if one.driven)
         names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
         return names if self.motion.base == "fixed" else ("cart", *names)
+
+    @property
+    def rods(self) -> tuple[Closures, ...]:
+        """Rods whose length is a rigid coordinate, behind those of the joints."""
+        return tuple(one for one in self.closures if one.has_coordinate)
 
     @property
     def rigid_units(self) -> dict[str, str]:
         """Unit of every rigid coordinate by its name: cart, then the arms; in space the joints."""
         if self.is_spatial:
-            return {one.name: "m" if one.type == "prismatic" else "rad" for one in self.movable}
+            units = {one.name: "m" if one.type == "prismatic" else "rad" for one in self.movable}
+            return units | {one.name: "m" for one in self.rods}
         return {"cart": "m", **{arm.name: "rad" for arm in self.arms}}
 
     @property
     def num_rigid(self) -> int:
-        """Number of rigid coordinates: cart and arms, or the joints in space that move."""
-        return len(self.movable) if self.is_spatial else 1 + len(self.arms)
+        """Number of rigid coordinates: cart and arms, or joints in space that move, and rods."""
+        return len(self.movable) + len(self.rods) if self.is_spatial else 1 + len(self.arms)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -231,11 +245,14 @@ class Scene(Table):
         return tuple(places.get(arm.name) for arm in self.arms)
 
     @property
-    def driven_columns(self) -> slice:
+    def driven_columns(self) -> slice | list[int]:
         """Where the drives stand among all rigid coordinates: cart, then the arms.
 
         A fixed base is no drive, and neither are joints that follow from the others in a loop.
         """
+        if self.closures:
+            names = list(self.rigid_units)
+            return [names.index(name) for name in self.driven]
         first = 1 if self.motion.base == "fixed" and not self.is_spatial else 0
         return slice(first, first + len(self.driven))
 
@@ -277,8 +294,8 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _check_tables(self) -> Scene:
-        # The closure first: which joints are driven depends on it.
-        for key in sorted(type(self).model_fields, key=lambda name: name != "closure"):
+        # Closures first: which joints are driven depends on them.
+        for key in sorted(type(self).model_fields, key=lambda name: "closure" not in name):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):

@@ -16,6 +16,7 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.end_effector import end_effector
 from dolfinopt.multibody.mechanism import Closure, Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
@@ -117,7 +118,7 @@ def crank(body: ShapeIntegrals) -> Crank:
         desired,
         (0.0, END),
         drives,
-        Closure.slider(0j, 1.0 + 0j),
+        *[Loops.of_plane(Closure.slider(0j, 1.0 + 0j), (1, 0))] * 2,
         start=(np.array([[0.0, *q, 0.0]]), np.array([[slower, *qd, 0.0]])),
     )
 

@@ -17,7 +17,7 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.dimension import product
-from dolfinopt.multibody.end_effector import Posed, interface_place, outboard
+from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
@@ -151,7 +151,8 @@ def mid_deflection(result: SimulationResult, arm: int) -> np.ndarray:
     assert np.allclose(corners[node], middle)
     q = trajectory.q_e[:, mechanism.slices[arm]]
     place = complex(*middle) + q @ (modes[node, 0] + 1j * modes[node, 1])
-    chord = outboard(mechanism.bodies[arm], q)[0]
+    x, y = Posed(mechanism, trajectory.q_r, trajectory.q_e).section(arm, 0).place
+    chord = x + 1j * y
     return (np.conj(chord / np.abs(chord)) * place).imag
 
 
@@ -258,41 +259,49 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     motion, q, qd, qdd, _ = states(trajectory, t)
     mechanism = trajectory.mechanism
-    d, rigid = mechanism.dim.d, np.arange(mechanism.num_rigid)
+    rigid = np.arange(mechanism.num_rigid)
     tangent = linearise(mechanism, motion, q, qd, qdd, None, rigid).dense()
     size = tangent.shape[1]
     speeds = np.concatenate([motion.qd, qd], axis=1)
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
-    strain = np.zeros(len(t))
-    posed = Posed(mechanism, motion.q, q)
-    moment = np.zeros((d, len(t)))  # first moment of all masses
+    strain, moment = np.zeros(len(t)), np.zeros((mechanism.dim.d, len(t)))  # first of all masses
+    posed, d = Posed(mechanism, motion.q, q), mechanism.dim.d
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         e = q[:, part]
         strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
-        own = body.moment + e @ body.C.T
+        own = body.w[:, :1] + body.w[:, 1:] @ e.T
         if body.is_stiffened:
-            own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:d], e)
+            own = own - 0.5 * np.einsum("ni,pij,nj->pn", e, body.K0[:d], e)
         _, place, R = posed.body(k)
-        moment = moment + body.mass * place + product(R, own.T)
+        moment += body.mass * place + product(R, own)
     for site, load in mechanism.loads.items():
         place, R = posed.interface(*site)
-        moment = moment + load.mass * place + product(R, load.c)
-    potential = -mechanism.gravity[:, 0] @ moment
+        moment += load.mass * place + product(R, load.c)
+    potential = -(mechanism.gravity * moment).sum(axis=0)
     parts = drive_trains(trajectory, t)
     return kinetic + parts.kinetic, strain + parts.strain, potential
+
+
+def plane_frames(
+    mechanism: Any, q_r: np.ndarray, q: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return origins of a plane chain's frames, its end last, and rotations, (n,) complex."""
+    posed, bodies = Posed(mechanism, q_r, q), range(len(mechanism.bodies))
+    places = [posed.body(k)[1] for k in bodies] + [posed.interface(*mechanism.end)[0]]
+    turns = [posed.body(k)[2] for k in bodies]
+    return [x + 1j * y for x, y in places], [R[0, 0] + 1j * R[1, 0] for R in turns]
 
 
 def gaps(result: SimulationResult) -> np.ndarray:
     """Return the violation of a loop's constraints at all stages (n, m), m."""
     trajectory, system = machine(result)
-    assert system.closure is not None
+    assert system.loops is not None
     grid, nodes = trajectory.solution.time_grid, trajectory.solution.nodes
     t = (grid[:-1, None] + np.diff(grid)[:, None] * nodes).ravel()
     y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
     instants = system.at(t)
     motion = instants.motion(y, yd, ydd)
-    place = interface_place(system.mechanism, motion, instants.split(y)[1]).place
-    return system.closure.gap(place)
+    return system.loops.at(system.mechanism, motion.q, instants.split(y)[1]).gap
 
 
 def fork() -> dict:

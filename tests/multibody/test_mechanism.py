@@ -25,11 +25,9 @@ from dolfinopt.multibody.end_effector import (
     end_effector,
     end_effector_gradient,
     end_rotation,
-    interface_place,
-    place_gradient,
 )
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism
+from dolfinopt.multibody.mechanism import JointHardware
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.scene.load import load_scene
@@ -259,33 +257,3 @@ def test_few_instants_do_not_depend_on_memory() -> None:
             ]
             found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
         assert len(found) == 1
-
-
-@pytest.mark.parametrize("kind", CHAINS)
-def test_interface_and_its_variation(kind: str) -> None:
-    """Jacobian and Hessian by all coordinates; both by outboard modes and their stiffness."""
-    one, rng = machine_of(kind), np.random.default_rng(8)
-    mechanism, y, moved = one.mechanism, *one.states[:2]
-
-    def at(y: np.ndarray, mechanism: Mechanism = mechanism, second: bool = False):
-        motion, (q, _, _) = one.split(np.stack([y, 0.0 * y, 0.0 * y]))
-        return interface_place(mechanism, motion, q, second=second)
-
-    here = at(y, second=True)
-    motion, (q, _, _) = one.split(one.states)
-    assert_close(here.place, end_effector(mechanism, motion, q) @ [1.0, 1j], 1e-14)
-    for c, unit in enumerate(np.eye(y.shape[1])):
-        for found, key in ((here.jacobian, "place"), (here.hessian, "jacobian")):
-            by = derivative(lambda t, unit=unit, key=key: getattr(at(y + t * unit), key))
-            assert_close(found[:, c], by, DIFFERENCES, np.abs(found).max())
-    weights, pull = rng.normal(size=(2, 4)) + 1j * rng.normal(size=(2, 4))
-    for k, by in enumerate(place_gradient(mechanism, motion, q, weights, moved, pull)):
-        for name, gradient in by.items():
-            change = change_of(rng, mechanism.bodies[k], name)
-
-            def worth(t: float, k: int = k, name: str = name, x: np.ndarray = change) -> float:
-                there = at(y, changed(mechanism, k, name, t * x))
-                swept = np.einsum("nc,nc->n", there.jacobian, moved)
-                return float((np.conj(weights) * there.place + np.conj(pull) * swept).real.sum())
-
-            assert_close(np.sum(gradient * change), derivative(worth), 1e-10, 10.0)

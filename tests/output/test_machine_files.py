@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from loops import BOOM_TABLE, bar, boom, closed, flexible, four_bar
 from machines import controlled, loop
 from mpi4py import MPI
 from remainders import built_of
@@ -110,6 +111,36 @@ def test_pin_leaves_its_force_along_x_and_y(tmp_path):
     assert summary["closure_force_peak"] == pytest.approx(largest, rel=1e-12)
     assert summary["max_deviation"] < 1e-7  # m: the end is pinned
     assert summary["stiffening"]["on"] in (True, False)
+
+
+def test_loops_in_space_leave_their_forces_and_what_follows(tmp_path):
+    """A cylinder's force is its drive's; a pin has forces and moments; rigid loops say what is left
+    out.
+    """
+    folders = [tmp_path / name for name in ("boom", "linkage")]
+    for folder in folders:
+        folder.mkdir()
+    arrays, table, summary, _ = left_by(closed(tmp_path, BOOM_TABLE, boom()), folders[0])
+    assert arrays["q_r"].shape[1] == 3 and not np.any(arrays["joint_forces"][:, 1])
+    np.testing.assert_allclose(table["closure_cylinder"], table["joint_force_cylinder"], rtol=1e-9)
+    assert summary["units"]["drive_peak"] == {"slew": "N m", "cylinder": "N"}
+    assert summary["closure_peak"]["cylinder"]["N"] == pytest.approx(
+        summary["drive_peak"]["cylinder"]
+    )
+    assert not any("closures" in one for one in summary["warnings"])
+    # With an arm beside it all of the linkage is rigid.
+    tree = four_bar()
+    tree["arms"] = [*tree["arms"][:2], bar("rocker", 0.25), flexible("tool", 0.05)]
+    tree["joints"].append({"name": "hold", "type": "fixed", "parent": "crank", "child": "tool"})
+    scene = closed(tmp_path, "t,turn\n0,0.5\n1,1.0\n", tree, reduction={"coordinates": 6})
+    arrays, table, summary, _ = left_by(scene, folders[1])
+    assert arrays["closure_force"].shape[1] == 5
+    for k, name in enumerate(("x", "y", "z", "moment_1", "moment_2")):
+        column = table[f"closure_foot_{name}"]
+        np.testing.assert_allclose(column, arrays["closure_force"][:, k], atol=1e-9)
+    assert set(summary["closure_peak"]["foot"]) == {"N", "N m"}
+    (told,) = [one for one in summary["warnings"] if one.startswith("closures")]
+    assert "of 5 equations 3 follow from the others" in told
 
 
 def test_prescribed_motion_leaves_what_it_left(tmp_path):

@@ -672,6 +672,7 @@ def test_described_defaults():
         *(f"arms.{key}" for key in ARM),
         *("motion.path", "payload.mass"),
         *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
+        *("closures.name", "closures.kind", "closures.between"),
         *("arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm"),
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),

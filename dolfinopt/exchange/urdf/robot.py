@@ -407,7 +407,7 @@ def scene_bodies(
     """
     _check_links(robot, chosen, tool)
     tool = tool or default_tool(robot, chosen)
-    places = _places(robot, chosen, tool)
+    places = places_of(robot, chosen, tool)
     solids = {name: solid_of(robot, name, tool) for name in chosen}
     found = []
     for link, (body, _) in places.items():
@@ -470,7 +470,9 @@ def default_tool(robot: Robot, chosen: tuple[str, ...]) -> str:
     return max(ends, key=reach)
 
 
-def _places(robot: Robot, chosen: tuple[str, ...], tool: str) -> dict[str, tuple[str, np.ndarray]]:
+def places_of(
+    robot: Robot, chosen: tuple[str, ...], tool: str
+) -> dict[str, tuple[str, np.ndarray]]:
     """Return of every link the body it belongs to and its pose in the frame of that body's link."""
     # Without mass a link on a fixed joint at a solid is only a place on it.
     places = {robot.root: (GROUND, np.eye(4))}

@@ -10,10 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.exchange.urdf.closures import NO_LOOPS, RobotLoops
 from dolfinopt.exchange.urdf.robot import (
     CELLS,
     FEWEST,
@@ -73,11 +75,15 @@ class RobotScene:
         robot: where it is from.
         bodies: its arms.
         duration: of the trajectory, s.
+        loops: closed ones.
+        start_joints: where all joints that move begin, rad or m.
     """
 
     robot: Robot
     bodies: tuple[SceneBody, ...]
     duration: float
+    loops: RobotLoops = NO_LOOPS
+    start_joints: tuple[float, ...] = ()
 
     @property
     def arms(self) -> dict[str, str]:
@@ -105,6 +111,8 @@ class RobotScene:
             lines += ["", *(self._solid(body) if body.is_solid else self._rigid(body))]
         for body in self.bodies:
             lines += ["", *self._joint(body)]
+        for one in self.loops.closures:
+            lines += ["", *self._closure(one)]
         lines += ["", *self._rest()]
         return "\n".join(lines) + "\n"
 
@@ -180,7 +188,24 @@ class RobotScene:
             f"mass = {number(own.mass)}",
             f"centre = {_list(own.centre)}",
             f"inertia = {_list(own.tensor[i] for i in INERTIA)}",
+            *self._interfaces(body),
         ]
+
+    def _interfaces(self, body: SceneBody) -> list[str]:
+        lines = []
+        for name, point in (self.loops.interfaces or {}).get(body.link, ()):
+            lines += ["[[arms.interfaces]]", f"name = {_string(name)}"]
+            lines.append(f"point = {_list(_tidy(point))}")
+        return lines
+
+    def _closure(self, one: Mapping[str, Any]) -> list[str]:
+        """Return a closure with arms in place of links."""
+        ends = []
+        for end in one["between"]:
+            link = max((k for k in (*self.arms, GROUND) if f"{end}.".startswith(f"{k}.")), key=len)
+            ends.append((GROUND if link == GROUND else self.arms[link]) + end[len(link) :])
+        values = {**one, "between": ends}
+        return ["[[closures]]", *(f"{key} = {_value(value)}" for key, value in values.items())]
 
     def _joint(self, body: SceneBody) -> list[str]:
         joint = body.joint
@@ -199,6 +224,8 @@ class RobotScene:
         if not joint.moves:
             return lines
         lines.append(f"axis = {_list(_tidy(body.axis))}")
+        if joint.name in self.loops.passive:
+            lines.append("passive = true")
         length, force = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
         if math.isfinite(joint.lower) and math.isfinite(joint.upper):
             lines.append(f"position_limits = {_list((joint.lower, joint.upper))}  # {length}")
@@ -218,6 +245,7 @@ class RobotScene:
             'path = "joints"',
             f"file = {_string(TRAJECTORY)}  # t in s, the joints in rad or m",
             f"horizon = {number(_up(self.duration * (1.0 + SETTLING)))}  # s simulated",
+            *self._assembly(),
             "gravity = [0.0, 0.0, -9.81]  # m/s2, in the robot's root frame",
             "",
             "[payload]",
@@ -236,18 +264,30 @@ class RobotScene:
             f"filter_radius = {number(_up(RADIUS * side))}  # m",
         ]
 
+    def _assembly(self) -> list[str]:
+        """Return where the loops' assembly begins, the joints in the scene's order."""
+        if not self.loops.closures:
+            return []
+        start = dict(zip((one.name for one in self.robot.movable), self.start_joints, strict=True))
+        order = [body.joint.name for body in self.bodies if body.joint.moves]
+        return [f"initial_joints = {_list(start[name] for name in order)}  # near the way it is"]
+
     def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
         """Return all files of a folder, the scene last: where it is, the others are.
 
         Args:
             folder: of the scene.
-            t, rows: (n,) s, (n, joints) of all joints that move.
+            t, rows: (n,) s, (n, joints) of all joints that move, then of driven rods.
         """
         new: dict[Path, str | bytes] = {
             folder / self.mesh_name(one): one.mesh.data for one in self.bodies if one.mesh
         }
-        lines = [",".join(["t", *(self.joints[joint.name] for joint in self.robot.movable)])]
-        lines += [",".join(map(repr, map(float, row))) for row in np.column_stack([t, rows])]
+        columns = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
+        kept = [k for k, name in enumerate(columns) if name not in self.loops.passive]
+        names = [self.joints.get(columns[k], columns[k]) for k in kept]
+        lines = [",".join(["t", *names])]
+        table = np.column_stack([t, rows[:, kept]])
+        lines += [",".join(map(repr, map(float, row))) for row in table]
         new[folder / TRAJECTORY] = "\n".join(lines) + "\n"
         # What `export --urdf` needs: the file, and every solid's link and frame.
         urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
@@ -353,6 +393,15 @@ def _list(values: Iterable[float]) -> str:
     return "[" + ", ".join(map(number, values)) + "]"
 
 
+def _value(value: Any) -> str:
+    """Return a closure's value in TOML: a word, a number, or an array of either."""
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return number(float(value))
+
+
 def _string(text: str) -> str:
     return json.dumps(_one_line(text), ensure_ascii=False)
 
@@ -367,20 +416,29 @@ LIMIT_ROUNDING = 1e-6  # of a limit, which files round
 SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
-def read_trajectory(robot: Robot, file: str) -> tuple[np.ndarray, np.ndarray, list[str]]:
+def read_trajectory(
+    robot: Robot, file: str, loops: RobotLoops = NO_LOOPS
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return instants (n,), s, and all joints (n, joints) of a table, and what there is to say.
+
+    Behind the joints stand the lengths of driven rods. Of joints that follow in closed loops the
+    first row says near what they begin.
 
     Raises:
         InputError: the robot cannot follow it.
     """
-    names = _columns_of(robot, file, column_names(file))
-    table = read_table(file, names)
+    every = column_names(file)
+    names = _columns_of(robot, file, [name for name in every if name not in loops.rods])
+    if missing := [name for name in loops.rods if name not in every]:
+        raise InputError(f"{file}: no column {missing[0]}, the length of this driven rod in m")
+    table = read_table(file, (*names, *loops.rods))
     assert table.t is not None
-    rows, held = _complete(robot, names, table.rows)
+    joints, lengths = np.split(table.rows, [len(names)], axis=1)
+    rows, held = _complete(robot, names, joints, loops.passive)
     _check_positions(robot, file, table.lines, rows)
     curve = curve_in_time(Table(file, table.lines, table.t, rows))
     rates = curve(np.linspace(0.0, curve.end, SAMPLES))[1]
-    return table.t, rows, [*held, *_too_fast(robot, file, rates)]
+    return table.t, np.hstack([rows, lengths]), [*held, *_too_fast(robot, file, rates)]
 
 
 def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]:
@@ -403,7 +461,9 @@ def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...
     return found
 
 
-def _complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _complete(
+    robot: Robot, names: Sequence[str], rows: np.ndarray, passive: frozenset[str]
+) -> tuple[np.ndarray, list[str]]:
     """Return values (n, joints) of all joints that move, and a sentence on those not given."""
     # Such a joint stands at zero, or at the limit nearest to it; one that follows another does so.
     given = dict(zip(names, np.asarray(rows, dtype=float).T, strict=True))
@@ -412,7 +472,8 @@ def _complete(robot: Robot, names: Sequence[str], rows: np.ndarray) -> tuple[np.
         if joint.mimic is None and joint.name not in given:
             value = min(max(0.0, joint.lower), joint.upper)
             given[joint.name] = np.full(len(rows), value)
-            held.append(f"{joint.name} = {value:g}")
+            if joint.name not in passive:
+                held.append(f"{joint.name} = {value:g}")
     for joint in robot.movable:
         if joint.mimic is not None:
             followed = given[joint.mimic.joint]

@@ -11,6 +11,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
+from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.machine import (
@@ -35,6 +36,7 @@ from dolfinopt.multibody.measured import (
     START_GUESSES,
 )
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
+from dolfinopt.multibody.spatial.loops import RigidLoops, rigid_loops
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
 from dolfinopt.scene.load import Scene
@@ -53,6 +55,8 @@ class Frames:
         held: (n, b, 3) of the interface that every body hangs on; the world's origin of those on
             the ground, m.
         end: (n, 3) of the end-effector, m.
+        tied: (n, k, 2, 3) of both frames of the k closures, m.
+        ties: the closures.
     """
 
     origin: np.ndarray
@@ -62,6 +66,8 @@ class Frames:
     axes: np.ndarray
     held: np.ndarray
     end: np.ndarray
+    tied: np.ndarray
+    ties: tuple[Tie, ...] = ()
 
     def __getitem__(self, part: slice | np.ndarray) -> Frames:
         """Return those at some of the instants."""
@@ -73,18 +79,26 @@ class Frames:
             self.axes[part],
             self.held[part],
             self.end[part],
+            self.tied[part],
+            self.ties,
         )
 
 
-def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
+def body_frames(
+    mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray, loops: Loops | None = None
+) -> Frames:
     """Return the frames of all bodies but bearings, which are points.
 
     Args:
         mechanism: b bodies besides bearings.
         q_r: (n, joints) rigid coordinates; rad or m.
         q_e: (n, N) elastic coordinates.
+        loops: closures, or None.
     """
     posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
+    tied, ties = np.zeros((len(q_r), 0, 2, 3)), () if loops is None else loops.ties
+    if loops is not None:
+        tied = ClosedLoops(loops, posed).places
     origin, rotation, outboard, axes, held = [], [], [], [], []
     parents = []
     for i, joint in enumerate(joints[: mechanism.num_arms]):
@@ -106,6 +120,8 @@ def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frame
         axes=np.stack(axes, axis=1),
         held=np.stack(held, axis=1),
         end=posed.interface(*mechanism.way[-1])[0].T,
+        tied=tied,
+        ties=ties,
     )
 
 
@@ -125,7 +141,8 @@ class EndPath:
     """What the end-effector is to do at n instants; world's components.
 
     Attributes:
-        p, v, a: (n, 3) place, velocity, acceleration; m.
+        p, v, a: (n, 3) place, velocity, acceleration; m; (n, 0) where a table prescribes joints and
+            the others follow from closed loops.
         turning: (R, w, wd), each of n, orientation (n, 3, 3), angular velocity and acceleration
             (n, 3); None where the orientation is free.
         joints: (q, qd, qdd), (n, k) each, of the joints that the table prescribes.
@@ -145,8 +162,8 @@ class EndPath:
 
     @property
     def rows(self) -> int:
-        """Number of coordinates that the path prescribes: 3, with an orientation 6."""
-        return 3 if self.turning is None else 6
+        """Number of coordinates that the path prescribes: 3, with an orientation 6; or none."""
+        return self.p.shape[1] if self.turning is None else 6
 
 
 def end_path(t: np.ndarray, scene: Scene) -> EndPath:
@@ -155,6 +172,10 @@ def end_path(t: np.ndarray, scene: Scene) -> EndPath:
     Raises:
         InputError: the table cannot be used; names file and line.
     """
+    if scene.motion.path == "joints":
+        q, qd, qdd = along_curve(t, scene.motion, *curve_of_table(scene))
+        none = np.zeros((len(t), 0))
+        return EndPath(none, none, none, None, _with_springs(scene, q, qd, qdd))
     found = _rows_of(scene)
     values = along_curve(t, scene.motion, *_curve(scene, file_stamp(scene.motion)))
     (p, v, a), first = (x[:, :3] for x in values), 3
@@ -164,7 +185,16 @@ def end_path(t: np.ndarray, scene: Scene) -> EndPath:
         R0, first = found.start, 6
         turning = R0 @ one.R.transpose(2, 0, 1), one.velocity.T @ R0.T, one.acceleration.T @ R0.T
     q, qd, qdd = (x[:, first:] for x in values)
-    return EndPath(p, v, a, turning, (q, qd, qdd))
+    return EndPath(p, v, a, turning, _with_springs(scene, q, qd, qdd))
+
+
+def _with_springs(
+    scene: Scene, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return given coordinates and, behind them, the lengths of springs, which stay at rest."""
+    lengths = [one.length for one in scene.rods if not one.driven]
+    still = np.broadcast_to(np.array(lengths, dtype=float), (len(q), len(lengths)))
+    return np.hstack([q, still]), np.hstack([qd, 0.0 * still]), np.hstack([qdd, 0.0 * still])
 
 
 def curve_in_space(scene: Scene) -> tuple[Curve, bool]:
@@ -181,6 +211,8 @@ def prescribed_joints(scene: Scene) -> tuple[str, ...]:
     """Return the names of the joints that are columns of the scene's table."""
     if scene.motion.path == "line":
         return ()
+    if scene.motion.path == "joints":
+        return scene.driven
     assert scene.motion.file is not None
     names = column_names(scene.motion.file)
     return tuple(name for name in scene.driven if name in names)
@@ -188,6 +220,9 @@ def prescribed_joints(scene: Scene) -> tuple[str, ...]:
 
 def num_rows(scene: Scene) -> int:
     """Return the number of rows through which the path leads."""
+    if scene.motion.path == "joints":
+        assert scene.motion.file is not None
+        return len(read_table(scene.motion.file, scene.driven).rows)
     return len(_rows_of(scene).table.rows)
 
 
@@ -291,19 +326,15 @@ class Follower:
         scene: with a path of the end-effector in space.
         chain: its rigid links.
         unknown: (k,) rigid coordinates to be found.
-        given: (m,) those that the table prescribes.
+        given: (m,) those that the table prescribes, then lengths of springs.
+        loops: closed loops of the links, or None.
     """
 
     scene: Scene
     chain: RigidChain
     unknown: np.ndarray
     given: np.ndarray
-
-    @cached_property
-    def _columns(self) -> np.ndarray:
-        """Places of the unknown joints in the chain's Jacobian."""
-        places = list(self.chain.coordinates)
-        return np.array([places.index(int(k)) for k in self.unknown], dtype=int)
+    loops: RigidLoops | None = None
 
     @cached_property
     def _weights(self) -> np.ndarray:
@@ -313,8 +344,11 @@ class Follower:
     @cached_property
     def _slides(self) -> np.ndarray:
         """Which of the unknowns (k,) are displacements."""
-        kinds = {joint.coordinate: joint.kind for joint in self.chain.joints}
-        return np.array([kinds[int(k)] == "prismatic" for k in self.unknown], dtype=bool)
+        if self.loops is None:
+            kinds = {joint.coordinate: joint.kind for joint in self.chain.joints}
+            return np.array([kinds[int(k)] == "prismatic" for k in self.unknown], dtype=bool)
+        units = list(self.scene.rigid_units.values())
+        return np.array([units[int(k)] == "m" for k in self.unknown], dtype=bool)
 
     @cached_property
     def _units(self) -> np.ndarray:
@@ -325,22 +359,51 @@ class Follower:
 
     def spread(self, unknown: np.ndarray, given: np.ndarray | float = 0.0) -> np.ndarray:
         """Return all rigid coordinates (n, joints), or rates, of the unknown and given ones."""
-        out = np.zeros((len(unknown), len(self.scene.movable)))
+        out = np.zeros((len(unknown), self.scene.num_rigid))
         out[:, self.unknown], out[:, self.given] = unknown, given
         return out
 
-    def residual(self, pose: Pose, path: EndPath) -> np.ndarray:
-        """Return how far a pose is off (n, 3 or 6), rotation vectors times the reach; m."""
-        away = path.p - pose.place
-        if path.turning is None:
-            return away
-        turn = Rotation.from_matrix(path.turning[0] @ pose.rotation.swapaxes(1, 2)).as_rotvec()
-        return np.hstack([away, self.chain.reach * turn])
+    def residual(self, q: np.ndarray, path: EndPath, pose: Pose | None = None) -> np.ndarray:
+        """Return how far joints q (n, joints) are off the path; m.
 
-    def jacobian(self, pose: Pose, rows: int) -> np.ndarray:
-        """Return the derivative of a pose by the unknowns in their units (n, 3 or 6, k), m."""
-        J = pose.jacobian[:, :rows, self._columns] * self._weights[:rows, None]
-        return J * self._units
+        Place (n, 3), rotation vectors times the reach (n, 3), closures (n, k).
+        """
+        pose = self.chain.at(q) if pose is None else pose
+        away = path.p - pose.place[:, : path.p.shape[1]]
+        if path.turning is not None:
+            apart = path.turning[0] @ pose.rotation.swapaxes(1, 2)
+            away = np.hstack([away, self.chain.reach * Rotation.from_matrix(apart).as_rotvec()])
+        return away if self.loops is None else np.hstack([away, -self.loops.gap(q)])
+
+    @cached_property
+    def _places(self) -> list[int]:
+        """The rigid coordinates by which rows are differentiated."""
+        return list(self.chain.coordinates if self.loops is None else range(self.scene.num_rigid))
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        """Places of the unknowns among these."""
+        return np.array([self._places.index(int(k)) for k in self.unknown], dtype=int)
+
+    def _rows(self, q: np.ndarray, rows: int, pose: Pose) -> np.ndarray:
+        """Return the derivative (n, ., places) of pose and closures, without weights."""
+        if self.loops is None:
+            return pose.jacobian[:, :rows]
+        every = np.zeros((len(q), rows, self.scene.num_rigid))
+        every[:, :, list(self.chain.coordinates)] = pose.jacobian[:, :rows]
+        return np.hstack([every, self.loops.rows(q)])
+
+    def _weighted(self, x: np.ndarray, rows: int) -> np.ndarray:
+        """Return rows (n, .) of pose and closures in m, those of a pose being the first."""
+        weights = np.ones(x.shape[1])
+        weights[:rows] = self._weights[:rows]
+        return weights.reshape(-1, *(1,) * (x.ndim - 2)) * x
+
+    def jacobian(self, q: np.ndarray, rows: int, pose: Pose | None = None) -> np.ndarray:
+        """Return the derivative of `residual`, negative, by the unknowns in their units, m."""
+        pose = self.chain.at(q) if pose is None else pose
+        every = self._rows(q, rows, pose)
+        return self._weighted(every[:, :, self._columns], rows) * self._units
 
     def _solve(self, J: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return J^+ right (n, k), the unknowns' units taken out."""
@@ -352,20 +415,23 @@ class Follower:
 
     def rates(self, q: np.ndarray, path: EndPath) -> tuple[np.ndarray, np.ndarray]:
         """Return rates and accelerations (n, joints) of joints q (n, joints) on the path."""
-        rows, columns = path.rows, list(self.chain.coordinates)
+        rows, loops = path.rows, self.loops
         v, a = path.v, path.a
         if path.turning is not None:
             v, a = np.hstack([v, path.turning[1]]), np.hstack([a, path.turning[2]])
         pose, none = self.chain.at(q), np.zeros((len(q), len(self.unknown)))
-        J, every = self.jacobian(pose, rows), pose.jacobian[:, :rows]
+        J, every = self.jacobian(q, rows, pose), self._rows(q, rows, pose)
 
         def solved(wanted: np.ndarray, given: np.ndarray) -> np.ndarray:
             known = self.spread(none, given)
-            left = wanted - np.einsum("nij,nj->ni", every, known[:, columns])
-            return known + self.spread(self._solve(J, self._weights[:rows] * left))
+            left = wanted - np.einsum("nij,nj->ni", every, known[:, self._places])
+            return known + self.spread(self._solve(J, self._weighted(left, rows)))
 
-        qd = solved(v, path.joints[1])
-        return qd, solved(a - self.chain.at(q, qd).bias[:, :rows], path.joints[2])
+        still = np.zeros((len(q), every.shape[1] - rows))
+        qd = solved(np.hstack([v, still]), path.joints[1])
+        closing = still if loops is None else -loops.acceleration(q, qd)
+        wanted = np.hstack([a - self.chain.at(q, qd).bias[:, :rows], closing])
+        return qd, solved(wanted, path.joints[2])
 
     # -- solutions ---------------------------------------------------------------------------
 
@@ -373,27 +439,26 @@ class Follower:
         """Return joints (n, joints) after Newton steps from q, and how far off (n,) they are, m."""
         for _ in range(steps):
             pose = self.chain.at(q)
-            step = self._solve(self.jacobian(pose, path.rows), self.residual(pose, path))
+            step = self._solve(self.jacobian(q, path.rows, pose), self.residual(q, path, pose))
             q = q + self.spread(step)
-        return q, np.linalg.norm(self.residual(self.chain.at(q), path), axis=1)
+        return q, np.linalg.norm(self.residual(q, path), axis=1)
 
     def nearest(self, q: np.ndarray, path: EndPath) -> tuple[np.ndarray, float]:
         """Return joints (1, joints) of the nearest pose by damped least squares, how far off, m."""
-        reach, damping, pose = self.chain.reach, 1e-3, self.chain.at(q)
-        error = self.residual(pose, path)
+        reach, damping = self.chain.reach, 1e-3
+        error = self.residual(q, path)
         for _ in range(DAMPED_ITERATIONS):
             far = float(np.linalg.norm(error))
             if far <= REACHED_RESIDUAL_SHARE * reach:
                 break
-            J = self.jacobian(pose, path.rows)[0]
+            J = self.jacobian(q, path.rows)[0]
             normal = J.T @ J + damping * reach**2 * np.eye(len(self.unknown))
             step = np.linalg.solve(normal, J.T @ error[0])
             other = q + self.spread((step * self._units)[None])
-            moved = self.chain.at(other)
-            new = self.residual(moved, path)
+            new = self.residual(other, path)
             gain = 1.0 - float(np.linalg.norm(new)) / far
             if gain > 0.0:
-                q, pose, error = other, moved, new
+                q, error = other, new
             damping = max(0.1 * damping, 1e-15) if gain > 0.0 else 10.0 * damping
             if np.abs(step).max() < 1e-13 or 0.0 < gain < STALLED_GAIN:
                 break
@@ -407,7 +472,10 @@ class Follower:
         """
         path = end_path(np.zeros(1), self.scene)
         stated = self.scene.motion.initial_joints
-        guess = np.zeros(len(self.scene.movable)) if stated is None else np.array(stated)
+        guess = np.zeros(self.scene.num_rigid)
+        guess[: len(self.scene.movable)] = 0.0 if stated is None else stated
+        if self.loops is not None:
+            guess = self.loops.with_lengths(guess)
         guess[self.given] = path.joints[0][0]
         random, best, far = np.random.default_rng(0), guess[None], np.inf
         width = 1.5 if stated is None else 0.1
@@ -419,9 +487,14 @@ class Follower:
             if far <= REACHED_RESIDUAL_SHARE * self.chain.reach:
                 break
         else:
+            if self.loops is not None:
+                self._check_held(best, path)
             raise self._unreachable(0.0, best, path)
         turned = self.unknown[~self._slides]
         best[0, turned] -= 2.0 * np.pi * np.round((best[0, turned] - guess[turned]) / (2.0 * np.pi))
+        if self.loops is not None:
+            self._check_held(best, path)
+            self._check_idle(best, path)
         self._check_singular(0.0, best, path)
         return best
 
@@ -496,7 +569,7 @@ class Follower:
     # -- errors ------------------------------------------------------------------------------
 
     def _check_singular(self, t: float, q: np.ndarray, path: EndPath) -> None:
-        J = self.jacobian(self.chain.at(q), path.rows)[0]
+        J = self.jacobian(q, path.rows)[0]
         sizes = np.linalg.svd(J, compute_uv=False)
         if sizes[-1] < SINGULAR_VALUE_RATIO * sizes[0]:
             raise self._singular(t)
@@ -513,7 +586,9 @@ class Follower:
         return self._singular(t if first is None else first)
 
     def _unreachable(self, t: float, q: np.ndarray, path: EndPath) -> InputError:
-        error = self.residual(self.chain.at(q), path)[0]
+        error = self.residual(q, path)[0]
+        if self.loops is not None and np.abs(error[path.rows :]).max() > 0.1 * np.abs(error).max():
+            return self._open(t, error[path.rows :])
         place = ", ".join(f"{x:.6g}" for x in path.p[0])
         off, turned = f"{np.linalg.norm(error[:3]):.4g} m", ""
         if path.rows == 6:
@@ -526,6 +601,44 @@ class Follower:
             f"off at best; change {self._key}{more}"
         )
 
+    def _check_held(self, q: np.ndarray, path: EndPath) -> None:
+        """Raise where closures hold some of the driven coordinates."""
+        assert self.loops is not None
+        names, rows = list(self.scene.rigid_units), self.loops.rows(q)[0]
+        every, followed = _rank(rows), _rank(rows[:, self.unknown])
+        if path.rows == 0 and followed < every:
+            held = ", ".join(names[k] for k in self.given)
+            raise InputError(
+                f"{self.scene.source}: closures: {every} independent equations hold "
+                f"{every - followed} of the driven coordinates ({held}); give as many more joints "
+                "passive = true, or leave out a closure"
+            )
+
+    def _check_idle(self, q: np.ndarray, path: EndPath) -> None:
+        """Raise where nothing moves some of the joints that follow."""
+        assert self.loops is not None
+        J, names = self.jacobian(q, path.rows)[0], list(self.scene.rigid_units)
+        if (found := _rank(J)) < len(self.unknown):
+            loose = np.abs(np.linalg.svd(J)[2][found:]).max(axis=0)
+            idle = ", ".join(names[k] for k, x in zip(self.unknown, loose, strict=True) if x > 1e-6)
+            raise InputError(
+                f"{self.scene.source}: closures: {found} independent equations leave "
+                f"{len(self.unknown) - found} of the joints that follow free ({idle}); let one of "
+                "them be driven, without passive = true and with a column in the table, or take "
+                "another kind of closure"
+            )
+
+    def _open(self, t: float, error: np.ndarray) -> InputError:
+        """Return which closure stays open by how much, from the equations' error (k,), m."""
+        assert self.loops is not None
+        name, far = self.loops.widest(error)
+        more = "motion.initial_joints, " if t == 0.0 else ""
+        return InputError(
+            f"{self.scene.source}: closures: at t = {t:.4g} s the loop of {name} cannot be closed: "
+            f"the joints that follow ({self._names}) leave it open by {far:.4g} m at best; change "
+            f"{more}closures.point, the arms' lengths, or {self._key}"
+        )
+
     def _singular(self, t: float) -> InputError:
         return InputError(
             f"{self.scene.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
@@ -535,12 +648,19 @@ class Follower:
 
     @property
     def _names(self) -> str:
-        return ", ".join(self.scene.driven[k] for k in self.unknown)
+        names = list(self.scene.rigid_units)
+        return ", ".join(names[k] for k in self.unknown)
 
     @property
     def _key(self) -> str:
         motion = self.scene.motion
         return "motion.start, motion.end" if motion.path == "line" else "the table motion.file"
+
+
+def _rank(J: np.ndarray) -> int:
+    """Return the rank of a derivative whose columns are of like size."""
+    sizes = np.linalg.svd(J, compute_uv=False)
+    return int((sizes > SINGULAR_VALUE_RATIO * sizes.max(initial=0.0)).sum())
 
 
 # -- which joints follow, and which the path's table prescribes ---------------------------------
@@ -557,12 +677,20 @@ def follower(scene: Scene) -> Follower:
 
 @lru_cache(maxsize=16)
 def _follower(scene: Scene, stamp: int) -> Follower:
-    chain, names = end_chain(scene), scene.driven
-    given = np.array([names.index(name) for name in prescribed_joints(scene)], dtype=int)
+    chain, names = end_chain(scene), tuple(scene.rigid_units)
+    springs = [one.name for one in scene.rods if not one.driven]
+    given = np.array([names.index(one) for one in (*prescribed_joints(scene), *springs)], dtype=int)
     unknown = np.array([k for k in range(len(names)) if k not in given], dtype=int)
     where = f'{scene.source}: motion.path = "{scene.motion.path}"'
     column = 'columns of joints in the table of motion.path = "points"'
     tables = 'joint tables, motion.path = "joints"'
+    if scene.closures:
+        if len(unknown) == 0:
+            raise InputError(
+                f"{scene.source}: closures: expected joints with passive = true, which follow from "
+                "the others; there are none"
+            )
+        return Follower(scene, chain, unknown, given, rigid_loops(scene))
     idle = ", ".join(names[k] for k in unknown if k not in chain.coordinates)
     if idle:
         raise InputError(

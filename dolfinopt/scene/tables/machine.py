@@ -50,7 +50,7 @@ PATHS = ("joints", "points", "line")  # of machines in space
 PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
-def _check_name(name: str) -> str:
+def check_joint_name(name: str) -> str:
     """Return `name` if it can be the column of a table."""
     if name == TIME:
         raise Refusal('expected another name: a column "t" means the time')
@@ -60,7 +60,7 @@ def _check_name(name: str) -> str:
 class Joint(Table):
     """A joint between the ground or an arm's outboard interface and the arm that it holds."""
 
-    name: Annotated[str, AfterValidator(_check_name)] = Field(
+    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
         description="unique name, the column of its coordinate in tables [-]"
     )
     type: JointType = Field(description="what moves: an angle, a distance, or nothing [-]")
@@ -85,6 +85,10 @@ class Joint(Table):
         default=(0.0, 0.0, 0.0),
         description="roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
         "frame, as in URDF [rad]",
+    )
+    passive: bool = Field(
+        default=False,
+        description="whether it has no drive and follows from the others by [[closures]] [-]",
     )
 
     rotor_inertia: Inertia | None = Field(
@@ -177,11 +181,12 @@ class Joint(Table):
             if other.child == self.child:
                 raise Refusal(
                     f"expected an arm that no other joint holds: {self.child} hangs on "
-                    f"{other.name}; closed loops in space are not simulated",
+                    f"{other.name}; a joint that closes a loop is one of [[closures]]",
                     (*at, "child"),
                 )
         if len(before) == len(scene.joints) - 1:
             _check_tree(scene)
+            _check_passive(scene)
             _check_machine(scene)
 
     def _check_interface(self, scene: Scene, at: Loc) -> None:
@@ -223,6 +228,18 @@ def _check_tree(scene: Scene) -> None:
         )
 
 
+def _check_passive(scene: Scene) -> None:
+    """Refuse joints without drives where no loop moves them."""
+    for i, joint in enumerate(scene.joints):
+        at = ("joints", i, "passive")
+        if joint.passive and not joint.moves:
+            raise Refusal("expected none with a fixed joint", at, ("joints", i, "type"))
+        if joint.passive and not scene.closures:
+            raise Refusal(
+                "expected false, the default, without [[closures]]: no loop moves the joint", at
+            )
+
+
 def _check_machine(scene: Scene) -> None:
     """Refuse what only a machine in the plane has, or what has no equations in space yet."""
     motion = scene.motion
@@ -235,6 +252,12 @@ def _check_machine(scene: Scene) -> None:
                 "expected an array of three numbers with [[joints]]", ("motion", key), ("joints",)
             )
     movable = scene.movable
+    if motion.path == "joints" and motion.initial_joints is not None and not scene.closures:
+        raise Refusal(
+            'expected none with motion.path = "joints", which does not use it without [[closures]]',
+            ("motion", "initial_joints"),
+            ("motion", "path"),
+        )
     if motion.initial_joints is not None and len(motion.initial_joints) != len(movable):
         names = ", ".join(joint.name for joint in movable)
         raise Refusal(f"expected {len(movable)} numbers, of {names}", ("motion", "initial_joints"))
@@ -345,8 +368,7 @@ class Closure(Table):
         """Refuse a loop of too few arms, and what a closed loop cannot be combined with."""
         if scene.is_spatial:
             raise Refusal(
-                "expected no [closure] with [[joints]]: closed loops are simulated in the plane; "
-                "leave the table out, and prescribe the joints that would follow",
+                "expected no [closure] with [[joints]]: in space loops are closed by [[closures]]",
                 (*at, "kind"),
                 ("joints",),
             )

@@ -153,7 +153,7 @@ class Motion(Table):
             raise Refusal("expected another point than motion.start", ("end",), ("start",))
         self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
         self.refuse_unused(self.path == "line", "path", "start", "end", "rpy")
-        self.refuse_unused(self.path in ("points", "line"), "path", "initial_joints")
+        self.refuse_unused(self.path in ("points", "line", "joints"), "path", "initial_joints")
         self.refuse_unused(tabulated, "path", "file")
         self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
         joints = self.path in ("joints", "rotation")

@@ -1,0 +1,75 @@
+"""Equations that close loops, against differences: plane and space, rigid and flexible bodies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import assert_close, change_of, changed, derivative, random_tree, stiffened
+from test_mechanism import machine_of
+
+from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
+from dolfinopt.multibody.machine import exponential
+from dolfinopt.multibody.mechanism import Mechanism
+
+pytestmark = pytest.mark.serial
+
+
+def equations_of(rng: np.random.Generator, d: int) -> tuple[Equation, ...]:
+    u, v = rng.normal(size=(2, d))
+    return (*map(Along, np.eye(d)), Facing(u, v, 0.7), Distance(0.3), Distance(0.0, 1))
+
+
+def mechanism_of(kind: str) -> Mechanism:
+    rng = np.random.default_rng(5)
+    if kind == "plane":
+        return machine_of("3 arms, stiffened").mechanism
+    tree = random_tree(rng, interfaces=2).mechanism()
+    bodies = [stiffened(rng, one) if one.num_modes else one for one in tree.bodies]
+    return replace(tree, bodies=tuple(bodies)) if kind == "stiffened" else tree
+
+
+@pytest.mark.parametrize("kind", ["plane", "space", "stiffened"])
+def test_derivatives_of_every_equation(kind: str) -> None:
+    """Rows, the change of their forces, and both by outboard modes and their stiffness."""
+    mechanism, rng = mechanism_of(kind), np.random.default_rng(8)
+    d = mechanism.dim.d
+    ends, rotation = ((1, 0), (2, 0)), np.eye(2)
+    if d == 3:
+        ends, rotation = ((2, 0), (4, 1)), exponential(rng.normal(size=3))
+    # Long rods: their derivatives of high order, which differences feel, stay small.
+    ties = [
+        Tie(f"tie {k}", ends[0], b, 2.0 + rng.normal(size=d), rotation, equations_of(rng, d))
+        for k, b in enumerate((ends[1], None))
+    ]
+    every = Loops.of(ties)
+    mixed = rng.normal(size=(every.count - 3, every.count))
+    loops = replace(every, weights=mixed, given=rng.normal(size=every.count))
+    rigid, size = mechanism.num_rigid, mechanism.num_rigid + mechanism.num_coordinates
+    y, virtual = rng.normal(scale=0.4, size=(2, 4, size))
+    weights, multipliers = rng.normal(size=(2, 4, loops.count))
+
+    def at(y: np.ndarray, one: Mechanism = mechanism):
+        return loops.at(one, y[:, :rigid], y[:, rigid:])
+
+    here = at(y)
+    H = here.hessian(multipliers)
+    assert_close(H, H.swapaxes(1, 2), 1e-12)
+    for c, unit in enumerate(np.eye(size)):
+        by = derivative(lambda t, unit=unit: at(y + t * unit).gap)
+        assert_close(here.jacobian[:, :, c], by, 1e-10, np.abs(here.jacobian).max())
+        by = derivative(lambda t, unit=unit: at(y + t * unit).work(multipliers))
+        assert_close(H[:, :, c], by, 1e-9, np.abs(H).max())
+    rates = derivative(lambda t: np.einsum("nmc,nc->nm", at(y + t * virtual).jacobian, virtual))
+    assert_close(here.acceleration(virtual), rates, 1e-9)
+    for k, by in enumerate(here.gradient(weights, multipliers, virtual)):
+        for name, gradient in by.items():
+            change = change_of(rng, mechanism.bodies[k], name)
+
+            def worth(t: float, k: int = k, name: str = name, x: np.ndarray = change) -> float:
+                there = at(y, changed(mechanism, k, name, t * x))
+                work = np.einsum("nc,nc->n", there.work(multipliers), virtual)
+                return float((weights * there.gap).sum() + work.sum())
+
+            assert_close(np.sum(gradient * change), derivative(worth), 1e-9, 10.0)
