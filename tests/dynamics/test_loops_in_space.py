@@ -49,6 +49,16 @@ SOFT = {
 }
 
 
+def compliant_boom() -> Any:
+    """Return the boom with a bearing and a gear that give way, and friction."""
+    tree = boom()
+    slew, luff = tree["joints"]
+    slew |= {"gear_stiffness": 1e5, "gear_damping": 50.0, "friction": [1.0, 0.5]}
+    luff |= {"bearing_stiffness": [2e7, 2e7, 2e7, 1e5, 1e5, 0.0],
+             "bearing_damping": [2e3, 2e3, 2e3, 10.0, 10.0, 0.0]}  # fmt: skip
+    return tree
+
+
 def free_motion(
     system: MachineSystem, steps: int, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
@@ -135,11 +145,12 @@ def test_flexible_slider_crank(tmp_path) -> None:
         (boom(), BOOM_TABLE, {"simulation": {"stiffening": True}}),
         (boom(), BOOM_TABLE, {"control": CONTROL}),
         (boom(), BOOM_TABLE, {"closures": [SPRING]}),
+        (compliant_boom(), BOOM_TABLE, {"control": CONTROL}),
         (five_bar(), "t,a,b\n0,2.0,1.1\n0.5,1.6,0.8\n",
          SOFT | {"motion": {"horizon": 0.5, "gravity": [0, -9.81, 2.0]},
                  "simulation": {"tolerance": 1e-2}}),
     ],
-    ids=["boom", "stiffened", "controlled", "spring", "five-bar"],
+    ids=["boom", "stiffened", "controlled", "spring", "compliant", "five-bar"],
 )  # fmt: skip
 def test_energy_and_gaps(tmp_path, tree: dict, table: str, changes: dict[str, Any]) -> None:
     result = do.Model(closed(tmp_path, table, tree, **changes)).simulate()
@@ -194,12 +205,13 @@ def test_a_spring_gives_way(tmp_path) -> None:
         pytest.param(boom(), BOOM_TABLE, {"objective": {"kind": "stress"}},
                      marks=pytest.mark.slow),
         (boom(), BOOM_TABLE, {"closures": [SPRING], "simulation": {"stiffening": True}}),
+        pytest.param(compliant_boom(), BOOM_TABLE, {"control": CONTROL}, marks=pytest.mark.slow),
         (four_bar(), "t,turn\n0,0.5\n0.3,2.5\n",
          SOFT | {"motion": {"horizon": 0.35, "gravity": [0, -9.81, 3.0]},
                  "simulation": {"stiffening": True},
                  "control": {"stiffness": [100.0], "damping": [2.0]}}),
     ],
-    ids=["compliance", "effort", "peak force", "stress", "spring", "pin"],
+    ids=["compliance", "effort", "peak force", "stress", "spring", "compliant", "pin"],
 )  # fmt: skip
 def test_gradient(tmp_path, tree: dict, table: str, changes: dict[str, Any]) -> None:
     """Remainders fall with the square of the step."""
