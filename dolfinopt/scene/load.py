@@ -51,6 +51,7 @@ from dolfinopt.scene.tables.arms import (
 )
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
 from dolfinopt.scene.tables.design import Law
+from dolfinopt.scene.tables.forces import Force
 from dolfinopt.scene.tables.machine import Joint
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import NEEDS, Objective, WorstBy
@@ -77,8 +78,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Arrays of tables of which --set knows single ones by their name.
-NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint}
+# Arrays of tables of which --set knows single ones by their name, or their number.
+NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint, "forces": Force}
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 

@@ -37,7 +37,8 @@ from dolfinopt.study.variants import asked_by, axis_of, changed
 
 # Tables and keys that do not change what a given design does, or that no given design outlives.
 TABLES = (
-    "motion", "control", "closure", "payload", "damping", "material", "arms", "interpolation",
+    "motion", "control", "closure", "payload", "forces", "damping", "material", "arms",
+    "interpolation",
 )  # fmt: skip
 RESULTS = (*QUANTITIES, "at [s]")
 LEAST = 10  # samples: fewer tell nothing of the scatter

@@ -479,7 +479,7 @@ def test_every_key_refuses_something():
     tried = {path.replace("arms.0.", "arms.") for path in paths}
     tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
     # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness.
-    elsewhere = ("arms.regions", "control", "closure", "joints", "arms.interfaces",
+    elsewhere = ("arms.regions", "control", "closure", "joints", "forces", "arms.interfaces",
                  "constraints.stiffness.")  # fmt: skip
     assert {info.key for info in describe_keys() if not info.key.startswith(elsewhere)} <= tried
 
@@ -571,8 +571,8 @@ def test_whatever_is_shown_is_short_and_printable():
         ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
         ("payload.x y", 'payload."x y"', None, "mass, inertia"),
         ("payload.", 'payload.""', None, "mass, inertia"),
-        ("source", "source", "closure", "name, material"),
-        ("_source", "_source", None, "name, material"),
+        ("source", "source", "forces", "name, material"),
+        ("_source", "_source", "forces", "name, material"),
         ("payload.1", "payload.1", None, "mass"),
     ],
 )  # fmt: skip
@@ -670,6 +670,7 @@ def test_described_defaults():
         *("arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm"),
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
+        "forces.arm",
     }
 
 
@@ -683,7 +684,7 @@ def test_described_defaults():
         ({"changes": [], "weight": 0}, ["scenarios.0.weight = 0", "a number >= 1e-09"]),
         ({"weight": 1.0}, ["missing key scenarios.0.changes"]),
         ({"changes": [], "wait": 1.0}, ["unknown key scenarios.0.wait", "scenarios.0.weight?"]),
-        ({"changes": ["arms.length=2"]}, ["motion, control, closure, payload, damping or"]),
+        ({"changes": ["arms.length=2"]}, ["motion, control, closure, payload, forces, damping or"]),
         ({"changes": ["material.poisson_ratio=0.2"]}, ["no material.poisson_ratio"]),
         ({"changes": ["payload.mas=2"]}, ["with --set payload.mas=2", "unknown key payload.mas"]),
         ({"changes": ["payload.mass=-2"]}, ["payload.mass = -2", "a number >= 0"]),

@@ -98,8 +98,8 @@ def check_used(scene: Scene) -> None:
         for number, one in enumerate(arm.interfaces, start=1):
             if not scene.used_interfaces & {(k, number) for k in sharing}:
                 raise Refusal(
-                    f'expected a joint with parent_interface = "{one.name}", or the payload '
-                    "there: nothing sits on it",
+                    f'expected a joint with parent_interface = "{one.name}", the payload or one '
+                    "of [[forces]] there: nothing sits on it",
                     ("arms", index, "interfaces", number - 1, "name"),
                     ("joints",),
                 )

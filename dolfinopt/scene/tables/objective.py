@@ -567,7 +567,7 @@ def need_of(scene: Scene, what: Need) -> list[str]:
 # -- `[[scenarios]]` -----------------------------------------------------------------------------
 
 # What may differ between scenarios: not the arms, which are one design, reduced once.
-TABLES = ("motion", "control", "closure", "payload", "damping", "material")
+TABLES = ("motion", "control", "closure", "payload", "forces", "damping", "material")
 
 
 class Scenario(Table):
@@ -575,7 +575,7 @@ class Scenario(Table):
 
     changes: tuple[str, ...] = Field(
         description='changes to the scene as "key=value", of motion, control, closure, payload, '
-        "damping or material [-]"
+        "forces, damping or material [-]"
     )
     weight: float = Field(
         default=1.0, ge=1e-9, le=1e9, description="weight in the sum of the scenarios [-]"
