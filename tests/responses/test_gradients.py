@@ -13,7 +13,7 @@ from remainders import hold_instants, taylor, wave
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, ObjectiveKind
+from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, POLES, ObjectiveKind
 
 WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
@@ -88,6 +88,7 @@ COMPLIANCE, DEVIATION, STRESS = (
 EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
 SETTLING, ORIENTATION = "objective.kind=settling", "objective.kind=orientation"
 BUCKLING = "objective.kind=buckling"
+DAMPING, PERIOD = "objective.kind=damping_ratio", "objective.kind=pole_frequency"
 IN_STROKES = ("motion.path=joints", "motion.file='FOLDER/strokes.csv'")
 STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
@@ -257,9 +258,16 @@ CASES = [
     case("pin", BENT, TRUST[0].replace("rod", "coupler"), slow=True),
     case("fork", DEVIATION, *PUSHED_FORK),
     case("fork", *EFFORT, *PUSHED_FORK, slow=True),
+    # Poles of the closed loop: of the residual's second derivatives all parts.
+    case("controlled", DAMPING, BENT, GRAVITY, "constraints.poles_at=[0.0,0.7,1.9]"),
+    case("controlled", PERIOD, *UNFORESEEN, slow=True),
+    case("controlled", DAMPING, GRAVITY, "control.limits=[150.0,200.0,150.0]",
+         "arms.joint_stiffness=3e4", "arms.joint_damping=3.0", "arms.rotor_inertia=2e-5",
+         "arms.gear_ratio=100.0", "constraints.damping_below=60.0", slow=True),
+    case("space", DAMPING, HELD, BENT, slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
-      for kind in get_args(ObjectiveKind)
+      for kind in get_args(ObjectiveKind) if kind not in POLES
       for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
 ]  # fmt: skip
 
