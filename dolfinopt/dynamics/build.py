@@ -37,8 +37,8 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Arm, Scene
-from dolfinopt.scene.tables.arms import interface_number
 from dolfinopt.scene.tables.forces import FORCE_COLUMNS, Force
+from dolfinopt.scene.tables.interfaces import interface_number
 
 
 def soft_joints(scene: Scene) -> dict[int, Arm]:

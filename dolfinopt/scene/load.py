@@ -214,7 +214,7 @@ def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
         if not isinstance(arm, dict) or not isinstance(mesh := arm.get("mesh"), str):
             continue
         kind, solid = Path(mesh).suffix.lower(), arm.get("cell_shape") in SOLID_SHAPES
-        meshed = kind == ".msh" and not (solid and key == "cell_shape")
+        meshed = kind in (".msh", ".inp") and not (solid and key == "cell_shape")
         if kind == ".geo" and key == "mesh_size" and not solid:
             meshed = f'{SIZE_PARAMETER}"' not in Path(mesh).read_text("utf-8", errors="replace")
         if meshed:

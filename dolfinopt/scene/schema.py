@@ -19,10 +19,11 @@ from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material, interface_number
+from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer
 from dolfinopt.scene.tables.forces import Force
+from dolfinopt.scene.tables.interfaces import interface_number
 from dolfinopt.scene.tables.machine import Closure, Control, Damping, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from dolfinopt.scene.tables.arms import OUTBOARD, refuse_unknown
 from dolfinopt.scene.tables.base import FileName, Loc, Refusal, Table, shown
+from dolfinopt.scene.tables.interfaces import OUTBOARD, refuse_unknown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
