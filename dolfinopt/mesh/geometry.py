@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -656,12 +656,14 @@ class Tetrahedra:
         points: (n, 3) in the arm's frame, m.
         cells: (m, 4) of positive volume.
         inboard, outboard: (k, 3) nodes of the interfaces' facets.
+        further: those of further interfaces by their names.
     """
 
     points: np.ndarray
     cells: np.ndarray
     inboard: np.ndarray
     outboard: np.ndarray
+    further: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
 
     kind: ClassVar[str] = "tetrahedra"
 
@@ -758,7 +760,7 @@ def _meshed(
     model.mesh.createGeometry()
     faces = [tag for _, tag in model.getEntities(2)]
     chosen = {}
-    for group, mark in zip((INBOARD, OUTBOARD), interfaces, strict=True):
+    for group, mark in zip(ENDS, interfaces, strict=True):
         chosen[group] = _faces_of(model, faces, points, triangles, mark)
     solid = model.geo.addVolume([model.geo.addSurfaceLoop(faces)])
     model.geo.synchronize()
@@ -812,7 +814,7 @@ def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahed
                 for face in interfaces[group]
             ]
         )
-        for group in (INBOARD, OUTBOARD)
+        for group in ENDS
     ]
     return Tetrahedra(points[used], cells.reshape(-1, 4), *facets)
 
@@ -858,8 +860,11 @@ def add_cells(model: Any, mesh: InterfaceMesh) -> None:
     model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
     model.addPhysicalGroup(dim, [solid], DESIGN)
     model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
-    for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
+    named = [(INBOARD, NAMES[INBOARD], mesh.inboard), (OUTBOARD, NAMES[OUTBOARD], mesh.outboard)]
+    if isinstance(mesh, Tetrahedra):
+        named += [(FURTHER + k, name, own) for k, (name, own) in enumerate(mesh.further.items())]
+    for group, name, facets in named:
         face = model.addDiscreteEntity(dim - 1)
         model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
         model.addPhysicalGroup(dim - 1, [face], group)
-        model.setPhysicalName(dim - 1, group, NAMES[group])
+        model.setPhysicalName(dim - 1, group, name)

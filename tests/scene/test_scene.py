@@ -478,8 +478,10 @@ def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
     tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness.
+    # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness,
+    # test_inp.
     elsewhere = ("arms.regions", "control", "closure", "joints", "forces", "arms.interfaces",
+                 "arms.inboard_bore", "arms.outboard_bore", "arms.mesh_scale",
                  "constraints.stiffness.")  # fmt: skip
     assert {info.key for info in describe_keys() if not info.key.startswith(elsewhere)} <= tried
 
@@ -562,7 +564,9 @@ def test_whatever_is_shown_is_short_and_printable():
         ("payload.mas", "payload.mas", "payload.mass", "mass, inertia"),
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
         ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
-        ("radius", "radius", "arms.interfaces.radius or motion.radius", "name, material"),
+        ("radius", "radius",
+         "arms.inboard_bore.radius or arms.outboard_bore.radius or arms.interfaces.radius or "
+         "motion.radius", "name, material"),
         ("tolerance", "tolerance",
          "reduction.tolerance or simulation.tolerance or optimizer.tolerance or part.tolerance",
          "name, mat"),
@@ -656,6 +660,9 @@ def test_every_key_is_described_with_a_unit():
         assert info.allowed and not info.allowed.endswith(" "), info
 
 
+BORE = ("point", "axis", "radius")
+
+
 def test_described_defaults():
     defaults = {info.key: info.default for info in describe_keys()}
     assert defaults["arms.cells"] == "[200, 12]"
@@ -671,6 +678,7 @@ def test_described_defaults():
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
         "forces.arm",
+        *(f"arms.{end}_bore.{key}" for end in ("inboard", "outboard") for key in BORE),
     }
 
 
