@@ -201,6 +201,8 @@ def test_least_damping_follows_the_control() -> None:
                    "constraints.damping_below=20.0")  # fmt: skip
         scene = controlled(*changes)
         result = do.Model(scene).simulate()
+        again = result.state_space(1.0)
+        assert again is not None and np.array_equal(again.A, state_space(result.trajectory, 1.0).A)
         poles = [
             poles_of(free_machine(result.trajectory, t)).values
             for t in scene.constraints.pole_instants(scene.motion)
