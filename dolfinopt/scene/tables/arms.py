@@ -208,14 +208,6 @@ class Arm(Table):
         le=1e9,
         description="length of the mesh file's unit, of a solid arm: 0.001 of a file in mm [m]",
     )
-    inboard_bore: Bore | None = Field(
-        default=None,
-        description="of a solid arm with a mesh file: the bore that is the inboard interface. It "
-        "and outboard_bore place the arm's frame, wherever the file has the arm",
-    )
-    outboard_bore: Bore | None = Field(
-        default=None, description="the bore that is the outboard interface"
-    )
     element: ElementName | None = Field(
         default=None,
         description='finite element: "incompatible" are quadrilaterals and hexahedra that bend '
@@ -355,6 +347,14 @@ class Arm(Table):
         default=(),
         description="in space: further outboard interfaces, each with six coordinates, on which "
         "joints or the payload sit; taken from the arm whose design this one shares alone",
+    )
+    inboard_bore: Bore | None = Field(
+        default=None,
+        description="of a solid arm with a mesh file: the bore that is the inboard interface. It "
+        "and outboard_bore place the arm's frame, wherever the file has the arm",
+    )
+    outboard_bore: Bore | None = Field(
+        default=None, description="the bore that is the outboard interface"
     )
 
     @model_validator(mode="after")
