@@ -336,7 +336,8 @@ class Poles:
         Returns:
             By the system's coordinates and their rates (3, 1, S), and by every body's integrals.
         """
-        used = np.flatnonzero(by_values)
+        # With no pole one of no weight: what follows has an instant at least.
+        used = np.flatnonzero(by_values) if by_values.any() else np.zeros(1, dtype=int)
         S, system = len(self.right), self.one.system
         weights = -by_values[used] * self.left[:, used]  # (S, k)
         v, s = self.right[:, used], self.values[used]

@@ -1,8 +1,8 @@
 """Meshes of Abaqus and CalculiX (.inp), by meshio, as a Gmsh model with the groups of an arm.
 
 Cells are tetrahedra (C3D4, C3D10) or hexahedra (C3D8, C3D20); nodes between corners are left out,
-sides become straight. Interfaces are node sets, or sets of shell or surface elements; element sets
-are regions.
+sides become straight. Interfaces are node sets, surfaces made of element sets' faces, or sets of
+shell elements; element sets are regions.
 """
 
 from __future__ import annotations
@@ -35,6 +35,11 @@ from dolfinopt.scene.load import Arm
 CELLS = {"tetra": 4, "tetra10": 4, "hexahedron": 8, "hexahedron20": 8}
 FACES = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4}
 KEYWORDS = ("*NODE", "*ELEMENT", "*NSET", "*ELSET")
+# Faces S1, S2, ... of cells by their corners, in Abaqus's order.
+SURFACES = {
+    4: [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]],
+    8: [[0, 1, 2, 3], [4, 7, 6, 5], [0, 4, 5, 1], [1, 5, 6, 2], [2, 6, 7, 3], [3, 7, 4, 0]],
+}
 # Elements of faces that meshio does not know, and others of as many nodes that it does.
 FACE_TYPES = {
     "CPS6": "STRI65", "CPE6": "STRI65", "CAX6": "STRI65", "M3D6": "STRI65", "SFM3D6": "STRI65",
@@ -49,7 +54,7 @@ def read_inp(gmsh: Any, arm: Arm) -> Entities:
     Raises:
         InputError: it holds no such cells, or an interface is neither a set nor a bore.
     """
-    mesh = _read(Path(str(arm.mesh)))
+    mesh, surfaces = _read(Path(str(arm.mesh)))
     blocks = [(block, CELLS[block.type]) for block in mesh.cells if block.type in CELLS]
     others = sorted({block.type for block in mesh.cells} - set(CELLS) - set(FACES))
     if not blocks or others:
@@ -68,7 +73,7 @@ def read_inp(gmsh: Any, arm: Arm) -> Entities:
     facets = {}
     for group, name in interface_names(arm).items():
         if group not in bores_of(arm):
-            facets[group] = _interface(mesh, every, group, name, arm)
+            facets[group] = _interface(mesh, surfaces, every, group, name, arm)
     used = np.unique(every)
     number = np.full(len(mesh.points), -1)
     number[used] = np.arange(len(used))
@@ -83,8 +88,11 @@ def read_inp(gmsh: Any, arm: Arm) -> Entities:
     )
 
 
-def _read(path: Path) -> Any:
-    """Return meshio's mesh of a file that reads no others."""
+Surfaces = dict[str, list[tuple[str, int]]]  # element sets and numbers of their cells' faces
+
+
+def _read(path: Path) -> tuple[Any, Surfaces]:
+    """Return meshio's mesh of a file that reads no others, and its surfaces."""
     try:
         import meshio
     except ImportError:
@@ -105,7 +113,7 @@ def _read(path: Path) -> Any:
         with tempfile.TemporaryDirectory() as folder:
             kept = Path(folder) / "mesh.inp"
             kept.write_text(_mesh_alone(text), encoding="latin-1")
-            return meshio.read(kept, file_format="abaqus")
+            return meshio.read(kept, file_format="abaqus"), _surfaces(text)
     except (Exception, SystemExit) as error:  # meshio raises whatever a line makes of it
         told = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"it cannot be read ({told}); expected *NODE and *ELEMENT") from None
@@ -128,6 +136,26 @@ def _mesh_alone(text: str) -> str:
     return "\n".join(kept) + "\n"
 
 
+def _surfaces(text: str) -> Surfaces:
+    """Return the surfaces of a file that are faces of element sets, by their names."""
+    found: Surfaces = {}
+    rows: list[tuple[str, int]] | None = None
+    for line in text.splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.startswith("*"):
+            name = re.search(r"(?i)NAME\s*=\s*\"?([^,\"]+)", line)
+            by_node = re.search(r"(?i)TYPE\s*=\s*NODE", line)
+            rows = None
+            if line.upper().startswith("*SURFACE,") and name and not by_node:
+                rows = found.setdefault(name[1].strip(), [])
+        elif rows is not None:
+            one, _, face = (part.strip() for part in line.partition(","))
+            if face[:1].upper() == "S" and face[1:].isdigit():
+                rows.append((one, int(face[1:])))
+    return found
+
+
 def _known_type(found: re.Match[str]) -> str:
     return found[1] + FACE_TYPES.get(found[2].upper(), found[2].upper())
 
@@ -145,15 +173,17 @@ def _regions(mesh: Any) -> dict[tuple[str, int], np.ndarray]:
     return found
 
 
-def _interface(mesh: Any, cells: np.ndarray, group: int, name: str, arm: Arm) -> np.ndarray:
-    """Return the facets of an interface: shells of a set of its name, or sides within its nodes."""
+def _interface(
+    mesh: Any, surfaces: Surfaces, cells: np.ndarray, group: int, name: str, arm: Arm
+) -> np.ndarray:
+    """Return the facets of an interface: a surface or shells of its name, or within its nodes."""
 
     def belongs(one: str) -> bool:
         known = further_of(arm).get(one.strip().casefold())
         return (known or group_named(one, *ENDS)) == group
 
     outer = boundary(cells)
-    faces = []
+    faces = [rows for one in surfaces if belongs(one) for rows in _of_surface(mesh, surfaces[one])]
     for one, members in mesh.cell_sets.items():
         for block, own in zip(mesh.cells, members, strict=True):
             if belongs(one) and block.type in FACES and own is not None and len(own):
@@ -167,7 +197,7 @@ def _interface(mesh: Any, cells: np.ndarray, group: int, name: str, arm: Arm) ->
             marked[np.asarray(members, dtype=int)] = True
     found = outer[marked[outer].all(axis=1)]
     if not len(found):
-        names = sorted({*mesh.point_sets, *mesh.cell_sets})
+        names = sorted({*mesh.point_sets, *mesh.cell_sets, *surfaces})
         held = ", ".join(map(repr, names[:8])) or "none"
         why = "holds the corners of no cell's side on the surface" if marked.any() else "is missing"
         key = "inboard_bore, outboard_bore" if group in ENDS else "axis and radius"
@@ -176,3 +206,19 @@ def _interface(mesh: Any, cells: np.ndarray, group: int, name: str, arm: Arm) ->
             f"nodes so (*NSET, NSET={name}), or state the bore (arms.{key})"
         )
     return np.asarray(found)
+
+
+def _of_surface(mesh: Any, rows: list[tuple[str, int]]) -> list[np.ndarray]:
+    """Return the facets of a surface, those of every element set and block."""
+    known = {name.casefold(): members for name, members in mesh.cell_sets.items()}
+    found = []
+    for name, face in rows:
+        for block, own in zip(mesh.cells, known.get(name.casefold(), []), strict=False):
+            corners = CELLS.get(block.type)
+            if corners is None or own is None or not len(own):
+                continue
+            if face > len(SURFACES[corners]):
+                raise InputError(f"its cells of set {name!r} have no face S{face}")
+            side = SURFACES[corners][face - 1]
+            found.append(np.asarray(block.data)[np.asarray(own, dtype=int)][:, side])
+    return found

@@ -8,14 +8,15 @@ both derivatives, the adjoint of the trajectory the second part.
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.state_space import Poles, damping_ratios, linearised, poles_of
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, integrals_of
-from dolfinopt.responses.measured import DAMPING_SHARPNESS
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
+from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.response import Analysis, Measured, p_norm, register
 from dolfinopt.scene.load import Scene
@@ -29,6 +30,7 @@ class PoleResponse(MotionResponse):
 
     lower = True
     natural = "maximize"
+    of_none: ClassVar[float] = np.inf  # the value where no pole counts
 
     @abstractmethod
     def of_poles(self, poles: np.ndarray) -> np.ndarray:
@@ -52,13 +54,15 @@ class PoleResponse(MotionResponse):
 
     def extreme(self, trajectory: Trajectory) -> float:
         """Return the least value of all poles that count."""
-        return float(np.min(self._values(trajectory)[1], initial=self.of_none))
+        return float(np.min(self._values(_seen(trajectory))[1], initial=self.of_none))
 
-    of_none = np.inf  # where no pole counts
+    def of_motion(self, trajectory: Trajectory) -> float:
+        """Return the smooth value of the poles at the scene's instants (root only)."""
+        return super().of_motion(_seen(trajectory))
 
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
-        """Return the smooth value."""
-        values = self._values(trajectory)[1]
+        """Return the smooth value of the poles at given instants."""
+        values = self._values(trajectory.at(trajectory.t[cases.indices]))[1]
         return self.smooth(values)[0] if len(values) else float(self.badness(self.of_none))
 
     def of_trajectory(self, trajectory: Trajectory) -> tuple[float, float]:
@@ -72,51 +76,56 @@ class PoleResponse(MotionResponse):
         self, analysis: Analysis, measured: Measured, limits: np.ndarray
     ) -> np.ndarray:
         """Return the smooth limits, scaled like the smooth value of this design."""
-        true = np.array(measured.values)
-        return np.asarray(self.badness(limits) * np.array(measured.smooth) / self.badness(true))
+        true, smooth = np.array(measured.values), np.array(measured.smooth)
+        return np.asarray(self.badness(limits) * smooth / self.badness(true))
 
     def cotangents(self, trajectory: Trajectory) -> list[ShapeIntegrals]:
         """Return the exact derivatives by the shape integrals of every body, of one motion."""
-        every, values = self._values(trajectory)
-        by_rates = np.zeros((3, len(every), trajectory.problem.num_coordinates))
-        own: list[ShapeIntegrals] | None = None
-        by_values = self.smooth(values)[1] if len(values) else values
-        first = 0
-        for k, (poles, counted) in enumerate(every):
-            by = np.zeros(len(poles.values), dtype=complex)
-            number = int(counted.sum())
-            part = by_values[first : first + number]
-            part = np.where(np.abs(part) > 1e-12 * np.abs(by_values).max(initial=0.0), part, 0.0)
-            by[counted] = part * self.by_poles(poles.values[counted])
-            first += number
-            if not by.any():
-                continue
-            rates, bodies = poles.gradient(by)
-            by_rates[:, k] = rates[:, 0]
-            own = bodies if own is None else [a + b for a, b in zip(own, bodies, strict=True)]
-        t = np.array([float(poles.one.t[0]) for poles, _ in every])
-        followed = trajectory.adjoint.gradient(t, by_rates)
-        return followed if own is None else [a + b for a, b in zip(followed, own, strict=True)]
+        seen = _seen(trajectory)
+        by_rates, own = self.derivatives(seen, self.load_cases(seen))
+        followed = trajectory.adjoint.gradient(seen.t, by_rates)
+        return [add_integrals(a, fields) for a, fields in zip(followed, own, strict=True)]
 
     def derivatives(
         self, trajectory: Trajectory, cases: LoadCases
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return nothing: `cotangents` has the instants that the response chooses itself."""
-        none = [0.0 * one for one in trajectory.mechanism.bodies]
-        return np.zeros((0, 0)), [integrals_of(one) for one in none]
+        """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
+        every, values = self._values(trajectory.at(trajectory.t[cases.indices]))
+        by_values = self.smooth(values)[1] if len(values) else values
+        # Poles far from the least one count for nothing, and cost as much.
+        least = NEGLIGIBLE_POLE_SHARE * np.abs(by_values).max(initial=0.0)
+        by_values = np.where(np.abs(by_values) > least, by_values, 0.0)
+        ends = np.cumsum([counted.sum() for _, counted in every])[:-1]
+        by_rates, bodies = [], []
+        for (poles, counted), by in zip(every, np.split(by_values, ends), strict=True):
+            weights = np.zeros(len(poles.values), dtype=complex)
+            weights[counted] = by * self.by_poles(poles.values[counted])
+            rates, own = poles.gradient(weights)
+            by_rates.append(rates)
+            bodies.append(own)
+        total = bodies[0]
+        for own in bodies[1:]:
+            total = [a + b for a, b in zip(total, own, strict=True)]
+        return np.concatenate(by_rates, axis=1), [integrals_of(one) for one in total]
 
     def _values(self, trajectory: Trajectory) -> tuple[list[tuple[Poles, np.ndarray]], np.ndarray]:
-        """Return the poles of all instants with which of them count, and the values of these."""
-        scene, system = trajectory.scene, trajectory.problem
+        """Return the poles at the instants with which of them count, and the values of these."""
+        system = trajectory.problem
         assert isinstance(system, MachineSystem)
         every, values = [], []
-        for t in scene.constraints.pole_instants(scene.motion):
+        for t in map(float, trajectory.t):
             seen = trajectory.at(np.array([t]))
             poles = poles_of(linearised(system, t, seen.unknowns))
-            counted = self.counts(poles.values, scene)
+            counted = self.counts(poles.values, trajectory.scene)
             every.append((poles, counted))
             values.append(self.of_poles(poles.values[counted]))
         return every, np.concatenate(values)
+
+
+def _seen(trajectory: Trajectory) -> Trajectory:
+    """Return a motion seen at the instants at which the scene asks for poles."""
+    scene = trajectory.scene
+    return trajectory.at(np.array(scene.constraints.pole_instants(scene.motion)))
 
 
 # -- damping ratio -------------------------------------------------------------------------------

@@ -128,7 +128,7 @@ def test_link_is_found_by_its_bores_wherever_it_lies(folder) -> None:
     assert same(again, link(folder, "link.msh"))
 
 
-def write_blocks(path: Path) -> None:
+def write_blocks(path: Path, surfaces: bool) -> None:
     """Write a bar of 6 x 2 x 2 hexahedra by hand, sets of nodes and of cells."""
     nx, n = 6, 2
     x, y, z = np.meshgrid(
@@ -153,12 +153,18 @@ def write_blocks(path: Path) -> None:
     side = number[2:4, 2, :]
     lines += ["*NSET, NSET=Side", ", ".join(map(str, side.ravel()))]
     lines += ["*ELSET, ELSET=PASSIVE_ROOT, GENERATE", "1, 4, 1", "*ELSET, ELSET=VOID", "13, 14"]
+    if surfaces:  # in place of the sets of nodes
+        lines = [line.replace("BOARD", "") if "NSET" in line else line for line in lines]
+        lines += ["*ELSET, ELSET=_last, GENERATE", "21, 24, 1"]
+        lines += ["*SURFACE, TYPE=ELEMENT, NAME=inboard", "PASSIVE_ROOT, S6"]
+        lines += ["*SURFACE, TYPE=ELEMENT, NAME=Outboard", "_last, S4"]
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_sets_are_interfaces_and_regions(tmp_path) -> None:
+@pytest.mark.parametrize("surfaces", [False, True])
+def test_sets_are_interfaces_and_regions(surfaces, tmp_path) -> None:
     """Hexahedra of CalculiX; a further interface, cells that stay solid and void."""
-    write_blocks(tmp_path / "bar.inp")
+    write_blocks(tmp_path / "bar.inp", surfaces)
     mesh = arm_mesh(COMM, Arm(
         mesh=str(tmp_path / "bar.inp"), cell_shape="hexahedron", name="a", length=0.3, height=0.04,
         thickness=0.04, interfaces=({"name": "side", "point": (0.125, 0.02, 0.0)},),

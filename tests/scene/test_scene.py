@@ -565,7 +565,7 @@ def test_whatever_is_shown_is_short_and_printable():
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
         ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
         ("radius", "radius",
-         "arms.inboard_bore.radius or arms.outboard_bore.radius or arms.interfaces.radius or "
+         "arms.interfaces.radius or arms.inboard_bore.radius or arms.outboard_bore.radius or "
          "motion.radius", "name, material"),
         ("tolerance", "tolerance",
          "reduction.tolerance or simulation.tolerance or optimizer.tolerance or part.tolerance",
