@@ -56,13 +56,9 @@ class PoleResponse(MotionResponse):
         """Return the least value of all poles that count."""
         return float(np.min(self._values(_seen(trajectory))[1], initial=self.of_none))
 
-    def of_motion(self, trajectory: Trajectory) -> float:
-        """Return the smooth value of the poles at the scene's instants (root only)."""
-        return super().of_motion(_seen(trajectory))
-
     def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
-        """Return the smooth value of the poles at given instants."""
-        values = self._values(trajectory.at(trajectory.t[cases.indices]))[1]
+        """Return the smooth value of the poles at the scene's instants, whatever the cases."""
+        values = self._values(_seen(trajectory))[1]
         return self.smooth(values)[0] if len(values) else float(self.badness(self.of_none))
 
     def of_trajectory(self, trajectory: Trajectory) -> tuple[float, float]:
@@ -89,8 +85,11 @@ class PoleResponse(MotionResponse):
     def derivatives(
         self, trajectory: Trajectory, cases: LoadCases
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
-        every, values = self._values(trajectory.at(trajectory.t[cases.indices]))
+        """Return those by coordinates, rates and accelerations at the scene's instants, and bodies.
+
+        Whatever the cases are.
+        """
+        every, values = self._values(_seen(trajectory))
         by_values = self.smooth(values)[1] if len(values) else values
         # Poles far from the least one count for nothing, and cost as much.
         least = NEGLIGIBLE_POLE_SHARE * np.abs(by_values).max(initial=0.0)
