@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+    from dolfinopt.dynamics.budget import Budget
     from dolfinopt.dynamics.state_space import StateSpace
     from dolfinopt.part.check import Check
     from dolfinopt.part.part import Part
@@ -110,6 +111,16 @@ class SimulationResult:
         nan where it was not asked for, see `Model.simulate`, and on other ranks than 0.
         """
         return max((float(v.stress.max()) for v in self.views if v.stress is not None), default=nan)
+
+    @property
+    def budget(self) -> Budget | None:
+        """What links, bearings, gears and control contribute to the largest deviation.
+
+        None where there is none, and but on rank 0.
+        """
+        from dolfinopt.dynamics.budget import deflection_budget
+
+        return None if self.trajectory is None else deflection_budget(self.trajectory)
 
     def to_frame(self) -> DataFrame | None:
         """Return deviation (m) and compliance of every arm (N m) every `simulation.sample`.

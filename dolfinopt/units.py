@@ -11,6 +11,7 @@ SUMMARY = {
     "max_deviation_time": "s",
     "max_rotation": "rad",
     "settling": "m",
+    "deflection_budget": "m, shares -",
     "stress": "Pa",
     "mass": "kg",
     "designed_mass": "kg",

@@ -198,7 +198,7 @@ def draw(
     from dolfinopt.plots.machine import machine_figure
     from dolfinopt.plots.style import save
 
-    title, closure, bodies = scene.name, trajectory.closure, trajectory.mechanism.bodies
+    title, closure, bodies = scene.name, trajectory.closure, trajectory.mechanism.arms
     if arms := designed(views):
         masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
         save(design_figure(arms, title, masses), folder / "design.png")
@@ -218,7 +218,13 @@ def draw(
 
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:
-    """Print the run's warnings, and its figures in one line."""
+    """Print what the deviation comes from, the run's warnings, and its figures in one line."""
+    from dolfinopt.output import budget
+
+    optimised, parts = summary["kkt"] is not None, summary["deflection_budget"]
+    if parts is not None:
+        for line in [budget.sentence(parts), *([] if optimised else budget.table(parts))]:
+            click.echo(line)
     warn(summary["warnings"])
     found = summary["reduction"]
     if found["error_estimate"] is not None:
@@ -233,7 +239,6 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         )
         click.echo(f'simulation.stiffening = "auto": on, {reason}')
     ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
-    optimised = summary["kkt"] is not None
     if optimised:
         ending = f"{_counted(summary)} ({ending}), {_sought(summary)}"
     click.echo(

@@ -20,7 +20,7 @@ from dolfinopt.dynamics.measured import (
 )
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.inverse_dynamics import largest_change
-from dolfinopt.multibody.machine import family_of, rotor_inertia
+from dolfinopt.multibody.machine import family_of, friction_of
 from dolfinopt.multibody.mechanism import (
     AppliedForce,
     Closure,
@@ -36,15 +36,17 @@ from dolfinopt.multibody.motion import (
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
-from dolfinopt.scene.load import Arm, Scene
+from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.forces import FORCE_COLUMNS, Force
 from dolfinopt.scene.tables.interfaces import interface_number
+from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
 
 
-def soft_joints(scene: Scene) -> dict[int, Arm]:
-    """Return the arms with a spring between drive and arm, by their joint's rigid coordinate."""
-    pairs = zip(scene.joint_columns, scene.arms, strict=True)
-    return {k: arm for k, arm in pairs if k is not None and arm.joint_stiffness > 0.0}
+def soft_joints(scene: Scene) -> dict[int, JointParts]:
+    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
+    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
+    return dict(sorted(found.items()))
 
 
 def is_machine(scene: Scene) -> bool:
@@ -146,10 +148,10 @@ def _drives(scene: Scene) -> Drives:
     free = np.zeros(count, dtype=bool)
     free[last:] = True
     rotors, soft = np.zeros(count), soft_joints(scene)
-    for k, arm in soft.items():
-        rotors[k] = rotor_inertia(arm)
+    for k, one in soft.items():
+        rotors[k] = one.rotor
         if k < last:
-            free[k], stiffness[k], damping[k] = True, arm.joint_stiffness, arm.joint_damping
+            free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
     control, driven = scene.control, slice(first, last)
     if control is not None:
         free[driven] = True
@@ -159,11 +161,13 @@ def _drives(scene: Scene) -> Drives:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
     motors = list(soft) if control else []
+    friction = friction_of(scene, [one if one.stiffness else None for one in joint_parts(scene)])
     springs = Springs(
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
-        stiffness=np.array([soft[k].joint_stiffness for k in motors]),
-        damping=np.array([soft[k].joint_damping for k in motors]),
+        stiffness=np.array([soft[k].stiffness for k in motors]),
+        damping=np.array([soft[k].damping for k in motors]),
         rotor=rotors[motors],
+        friction=friction.of(np.array(motors, dtype=int)),
     )
     table = _table_of_forces(scene)
     return Drives(
@@ -172,10 +176,12 @@ def _drives(scene: Scene) -> Drives:
         damping=damping[rows],
         limits=limits[rows],
         driven=(rows >= first) & (rows < last),
-        rigid_feed_forward=control is not None and control.feed_forward == "rigid",
+        rigid_feed_forward=control is not None and control.feed_forward != "none",
+        winding=control is not None and control.feed_forward == "elastic",
         table=None if table is None else lambda t: table(t)[:, rows],
         springs=springs,
         rotors=None if control else rotors[rows],
+        friction=friction.of(rows) if friction.acts and not control else None,
     )
 
 

@@ -95,10 +95,14 @@ class ElasticSystem:
         """That of `initial_state`: every time grid asks for it."""
         q, found = static_equilibrium(self)
         if not found.all():
+            bearings = bool(self.mechanism.bearings)
             raise ConvergenceError(
-                "the mechanism finds no static equilibrium at t = 0: the arms are too soft for "
-                "gravity, or for the acceleration that a tabulated motion begins with; raise "
-                "material.young_modulus or interpolation.floor, lower motion.gravity, or let the "
+                "the mechanism finds no static equilibrium at t = 0: the arms "
+                + ("or their bearings " if bearings else "")
+                + "are too soft for gravity, or for the acceleration that a tabulated motion "
+                "begins with; raise "
+                + ("bearing_stiffness, " if bearings else "")
+                + "material.young_modulus or interpolation.floor, lower motion.gravity, or let the "
                 "motion begin at rest"
             )
         return q

@@ -78,11 +78,13 @@ class MachineInstants:
         machine: the system.
         desired: motion (n) of the rigid coordinates.
         ahead: (n, R) feed-forward forces.
+        winding: (n, R) how far drives are asked to be ahead of their joints, rad; or None.
     """
 
     machine: MachineSystem
     desired: RigidMotion
     ahead: np.ndarray
+    winding: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return n."""
@@ -90,7 +92,8 @@ class MachineInstants:
 
     def __getitem__(self, part: slice | np.ndarray) -> MachineInstants:
         """Return it at some of the instants."""
-        return MachineInstants(self.machine, self.desired[part], self.ahead[part])
+        winding = None if self.winding is None else self.winding[part]
+        return MachineInstants(self.machine, self.desired[part], self.ahead[part], winding)
 
     def split(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (n, R), (n, N), (n, m) of coordinates or their derivatives (n, S)."""
@@ -109,6 +112,11 @@ class MachineInstants:
             here = here.copy()
             here[:, joints] = self.motors(y)
         return here
+
+    def motor_speeds(self, yd: np.ndarray) -> np.ndarray:
+        """Return those of motors behind springs (n, M), as their joints would have them."""
+        springs = self.machine.drives.springs
+        return self.desired.qd[:, self.machine.drives.free[springs.joints]] + self.motors(yd)
 
     def spring_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return the moments (n, M) with which arms pull on their motors' springs, N m."""
@@ -130,7 +138,18 @@ class MachineInstants:
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
-        return self.machine.drives.force(self.ahead, self.at_drives(y), self.at_drives(yd))
+        return self.machine.drives.force(self.ahead, *self._errors(y, yd))
+
+    def passing(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
+        """Return du / d(wanted force) (n, R), see `Drives.passing`."""
+        return self.machine.drives.passing(self.ahead, *self._errors(y, yd))
+
+    def _errors(self, y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far the drives are from where they are asked to be, and the rate (n, R)."""
+        error, rate = self.at_drives(y), self.at_drives(yd)
+        if self.winding is not None:
+            error = error - self.winding
+        return error, rate
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return the forces of all drives (n, 1 + arms), N and N m.
@@ -150,6 +169,8 @@ class MachineInstants:
         forces[:, free] = self.drive_forces(y, yd)
         if rotors is not None:
             forces[:, free] += rotors * self.desired.qdd[:, free]
+        if (friction := machine.drives.friction) is not None:
+            forces[:, free] += friction.force(self.desired.qd[:, free])
         return forces
 
     def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
@@ -166,6 +187,8 @@ class MachineInstants:
         rigid[:, springs.joints] += drives[:, springs.joints] + pulled
         wanted = self.desired.qdd[:, machine.drives.free[springs.joints]]
         motors = springs.rotor * (wanted + self.motors(ydd)) - pulled - drives[:, springs.joints]
+        if springs.friction.acts:
+            motors += springs.friction.force(self.motor_speeds(yd))
         out = np.concatenate([rigid, rows, np.zeros_like(multipliers), motors], axis=1)
         if machine.closure is None:
             return out
@@ -190,7 +213,7 @@ class MachineInstants:
         free = machine.drives.free
         tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, free)
         matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
-        passing = machine.drives.passing(self.ahead, self.at_drives(y), self.at_drives(yd))
+        passing = self.passing(y, yd)
         springs, every = machine.drives.springs, machine.drive_columns
         motors = every[springs.joints]
         matrix[:, every, 0, every] += passing * machine.drives.stiffness
@@ -200,6 +223,8 @@ class MachineInstants:
                 matrix[:, rows, order, springs.joints] += sign * value
                 matrix[:, rows, order, motors] -= sign * value
         matrix[:, motors, 2, motors] += springs.rotor
+        if springs.friction.acts:
+            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_speeds(yd))
         if machine.closure is not None:
             here = interface_place(machine.mechanism, motion, q, second=True)
             assert here.hessian is not None
@@ -301,14 +326,20 @@ class MachineSystem:
         """Return the machine at instants t (n,), s."""
         desired = self.motion(t)
         ahead = np.zeros((len(t), self.ends[0]))
+        winding = None
         if self.drives.rigid_feed_forward:
             ahead += self.feed_forward(desired)
             springs = self.drives.springs
-            wanted = desired.qdd[:, self.drives.free[springs.joints]]
-            ahead[:, springs.joints] += springs.rotor * wanted
+            if self.drives.winding:
+                winding = np.zeros_like(ahead)
+                winding[:, springs.joints] = ahead[:, springs.joints] / springs.stiffness
+            columns = self.drives.free[springs.joints]
+            ahead[:, springs.joints] += springs.rotor * desired.qdd[:, columns]
+            if springs.friction.acts:
+                ahead[:, springs.joints] += springs.friction.force(desired.qd[:, columns])
         if self.drives.table is not None:
             ahead += self.drives.table(t)
-        return MachineInstants(self, desired, ahead)
+        return MachineInstants(self, desired, ahead, winding)
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
@@ -366,6 +397,8 @@ class MachineSystem:
             + ("weak or soft" if limited else "soft")
             + " for gravity, or the loop cannot be closed; raise "
             + ("control.limits, " if limited else "")
+            + ("gear_stiffness, " if len(self.drives.springs.joints) else "")
+            + ("bearing_stiffness, " if self.mechanism.bearings else "")
             + "control.stiffness or material.young_modulus, or leave feed-forward on, "
             'control.feed_forward = "rigid"'
         )
@@ -391,10 +424,8 @@ class MachineSystem:
         of_forces = np.zeros_like(motion.q)
         of_forces[:, self.drives.free] = of_rigid
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
-        at_drives = instants.at_drives
-        passing = self.drives.passing(instants.ahead, at_drives(y), at_drives(yd))
-        pushed = -passing * at_drives(multipliers)
-        total = self.with_feed_forward(total, instants.desired, pushed)
+        pushed = -instants.passing(y, yd) * instants.at_drives(multipliers)
+        total = self.with_feed_forward(total, instants, pushed)
         if self.closure is None:
             return total
         # -J' f . multipliers, by which the interface moves in their direction, and the gap's part.
@@ -406,17 +437,23 @@ class MachineSystem:
         return [add_integrals(a, part) for a, part in zip(total, parts, strict=True)]
 
     def with_feed_forward(
-        self, total: list[ShapeIntegrals], desired: RigidMotion, weights: np.ndarray
+        self, total: list[ShapeIntegrals], instants: MachineInstants, weights: np.ndarray
     ) -> list[ShapeIntegrals]:
-        """Add the derivative of sum_n weights_n . u_ff_n by every body's integrals.
+        """Add the derivative of sum_n weights_n . u_n by every body through what is known ahead.
 
         Args:
             total: to which it is added.
-            desired: motion at n instants.
-            weights: (n, R) of the feed-forward forces of the free coordinates.
+            instants: n of them.
+            weights: (n, R) of the free coordinates' forces.
         """
         if not self.drives.rigid_feed_forward:
             return total
+        if self.drives.winding:
+            springs = self.drives.springs
+            turned = self.drives.stiffness[springs.joints] / springs.stiffness
+            weights = weights.copy()
+            weights[:, springs.joints] *= 1.0 + turned
+        desired = instants.desired
         of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.closure, weights)
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)

@@ -243,19 +243,19 @@ class Trajectory:
         return (np.conj(along) * (x + 1j * y - self.closure.point)).real
 
     @property
-    def motor_joints(self) -> tuple[int, ...]:
-        """Arms whose motors move by themselves, behind springs and under control."""
+    def motor_columns(self) -> tuple[int, ...]:
+        """Rigid coordinates whose motors move by themselves, behind springs and under control."""
         if not isinstance(self.problem, MachineSystem):
             return ()
         drives = self.problem.drives
-        return tuple(int(k) - 1 for k in drives.free[drives.springs.joints])
+        return tuple(map(int, drives.free[drives.springs.joints]))
 
     @cached_property
     def motors(self) -> np.ndarray | None:
-        """Angles of these motors as their joints would have them (n, M), rad; None without."""
-        if not isinstance(self.problem, MachineSystem) or not self.motor_joints:
+        """Angles of these motors as their joints would have them (n, M), rad, m; None without."""
+        if not isinstance(self.problem, MachineSystem) or not self.motor_columns:
             return None
-        columns = 1 + np.array(self.motor_joints)
+        columns = list(self.motor_columns)
         return self.desired.q[:, columns] + self.problem.at(self.t).motors(self.unknowns[0])
 
     @cached_property
@@ -631,11 +631,10 @@ class _Machine:
         given = weights.copy()
         given[:, drives.free] = 0.0
         by, bodies = self._of_prescribed(given)
-        passing = drives.passing(instants.ahead, instants.at_drives(y), instants.at_drives(yd))
-        passed = passing * weights[:, drives.free]
+        passed = instants.passing(y, yd) * weights[:, drives.free]
         by[0][:, system.drive_columns] -= passed * drives.stiffness
         by[1][:, system.drive_columns] -= passed * drives.damping
-        return by, system.with_feed_forward(bodies, instants.desired, passed)
+        return by, system.with_feed_forward(bodies, instants, passed)
 
     def _of_prescribed(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return the part of drives on a given motion: inverse dynamics, less the closure's."""

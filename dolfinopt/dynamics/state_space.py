@@ -121,7 +121,8 @@ def free_machine(trajectory: Trajectory, t: float) -> Linearised:
     seen = trajectory.at(np.array([t]))
     if isinstance(problem, MachineSystem) and scene.control is not None:
         return linearised(problem, t, seen.unknowns)
-    system = build_system(_without_gains(scene), list(problem.mechanism.bodies))
+    bodies = list(problem.mechanism.bodies[: len(scene.arms)])  # bearings follow from the scene
+    system = build_system(_without_gains(scene), bodies)
     assert isinstance(system, MachineSystem)
     # Drives that nothing controls are where the motion has them; so are motors before springs.
     rates = np.zeros((3, 1, system.num_coordinates))
@@ -212,8 +213,10 @@ def coordinate_names(system: MachineSystem, scene: Scene) -> list[str]:
     """Return the names of all unknowns of a machine."""
     rigid = list(scene.rigid_units)
     names = [rigid[int(k)] for k in system.drives.free]
-    for arm, part in zip(scene.arms, system.mechanism.slices, strict=True):
-        names += [f"{arm.name} q{k + 1}" for k in range(part.stop - part.start)]
+    arms = [arm.name for arm in scene.arms]
+    bearings = [joint.name for joint in system.mechanism.joints[len(arms) :]]
+    for name, part in zip([*arms, *bearings], system.mechanism.slices, strict=True):
+        names += [f"{name} q{k + 1}" for k in range(part.stop - part.start)]
     names += [f"multiplier {k + 1}" for k in range(system.ends[2] - system.ends[1])]
     joints = system.drives.free[system.drives.springs.joints]
     return names + [f"motor of {rigid[int(k)]}" for k in joints]

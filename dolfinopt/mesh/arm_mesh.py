@@ -25,7 +25,7 @@ from dolfinopt.mesh.gmsh_session import (
     gmsh_on_root,
     mesh_geo,
 )
-from dolfinopt.mesh.hollow import Hull, Wall, box_hull, tube_hull, wall_of
+from dolfinopt.mesh.hollow import Hull, Wall, box_hull, rib_stations, tube_hull, wall_of
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
@@ -463,7 +463,7 @@ def _problem(comm: MPI.Comm, own: np.ndarray, taken: np.ndarray, distance: np.nd
 def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     """Mesh the wall of a hollow arm, `arms.max_wall` thick (collective).
 
-    Its ends over `arms.solid_ends` are flanges, rings that stay as thick as that.
+    Its ends over `arms.solid_ends` are flanges, and `arms.ribs` rings: they stay as thick as that.
     """
     limits = arm.wall_limits
     with gmsh_on_root(comm) as gmsh:
@@ -478,8 +478,12 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         # As exact as the hull: the ends' faces stay where they are whatever the thickness.
         mesh.mesh.geometry.x[:] = hull.points(limits[1])[wall.nodes]
         x, ends = mesh.centroid[:, 0], hull.outer[[0, -1], 0, 0]
-        ends = np.minimum(x - ends[0], ends[1] - x) < arm.solid_ends
-        return replace(mesh, wall=wall, passive=ends)
+        thick = np.minimum(x - ends[0], ends[1] - x) < arm.solid_ends
+        if arm.ribs:
+            row = wall.cells // hull.shape[1]
+            for middle in rib_stations(hull, arm.ribs):
+                thick |= (row == middle - 1) | (row == middle)
+        return replace(mesh, wall=wall, passive=thick)
 
 
 def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:

@@ -221,7 +221,10 @@ def inverse_dynamics(
         pulls = [links[i].joint.at_interface(loads.joints[i])[0][0] for i in on_ground]
         drives.insert(0, np.sum(pulls, axis=0))
     forces = np.stack(drives, axis=1) if drives else np.zeros((len(q), 0))
-    return elastic_rows(links, loads), forces + tree.rotors * motion.qdd
+    forces = forces + tree.rotors * motion.qdd
+    if tree.friction is not None:
+        forces = forces + tree.friction.force(motion.qd)
+    return elastic_rows(links, loads), forces
 
 
 def elastic_residual(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.dimension import series
+from dolfinopt.multibody.joints import Friction, bearing_body, with_bearings
 from dolfinopt.multibody.mechanism import GROUND, Joint, JointHardware, Mechanism, Site, plane_chain
 from dolfinopt.multibody.motion import (
     RigidMotion,
@@ -23,6 +24,7 @@ from dolfinopt.paths.tables import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.interfaces import interface_number
+from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
 
 # -- rigid bodies ----------------------------------------------------------------------------
 
@@ -265,13 +267,36 @@ def build_spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mecha
     carried = {(k, 0): _carried(scene, k) for k in range(len(bodies))}
     if end[1]:
         carried[end] = _payload(scene)
-    return spatial_mechanism(
+    mechanism = spatial_mechanism(
         bodies,
         joints_of(scene),
         {site: one for site, one in carried.items() if one is not None},
         gravity if len(gravity) == 3 else (0.0, 0.0, 0.0),
         end,
     )
+    return _with_parts(mechanism, scene)
+
+
+def _with_parts(mechanism: Mechanism, scene: Scene) -> Mechanism:
+    """Put bearings and friction into the joints of a scene's mechanism."""
+    parts = joint_parts(scene)
+    bearings = {
+        k: bearing_body(np.array(one.bearing[0]), np.array(one.bearing[1]), scene.dimension)
+        for k, one in enumerate(parts)
+        if one.bearing is not None
+    }
+    friction = friction_of(scene, [one if one.stiffness == 0.0 else None for one in parts])
+    mechanism = with_bearings(mechanism, bearings)
+    return replace(mechanism, friction=friction) if friction.acts else mechanism
+
+
+def friction_of(scene: Scene, parts: Sequence[JointParts | None]) -> Friction:
+    """Return the friction (R,) of all rigid coordinates by the parts of every arm's joint."""
+    found = Friction.none(scene.num_rigid)
+    for k, one in zip(scene.joint_columns, parts, strict=True):
+        if k is not None and one is not None and one.friction is not None:
+            found.viscous[k], found.coulomb[k], found.speed[k] = one.friction
+    return found
 
 
 def joints_of(scene: Scene) -> tuple[Joint, ...]:
@@ -279,8 +304,8 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     index = {arm.name: k for k, arm in enumerate(scene.arms)}
     coordinates = {joint.name: i for i, joint in enumerate(scene.movable)}
     by_child = {index[joint.child]: joint for joint in scene.joints}
-    joints = []
-    for k, arm in enumerate(scene.arms):
+    joints, parts = [], joint_parts(scene)
+    for k in range(len(scene.arms)):
         one = by_child[k]
         parent, interface = GROUND, 0
         if one.parent != scenes.GROUND:
@@ -296,7 +321,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
                 axis=axis / np.linalg.norm(axis),
                 origin=np.array(one.origin, dtype=float),
                 rotation=roll_pitch_yaw(one.rpy),
-                rotor=rotor_inertia(arm),
+                rotor=_rigid_rotor(parts[k]),
                 interface=interface,
             )
         )
@@ -360,28 +385,24 @@ def check_joint_motion(scene: Scene) -> None:
 
 def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     """Put the bodies on the scene's base, with what sits at their joints and its payload."""
-    return plane_chain(
+    mechanism = plane_chain(
         bodies,
         scene.payload.mass,
         scene.payload.moment,
         (scene.motion.gravity[0], scene.motion.gravity[1]),
         scene.motion.joint_height,
         hardware=[
-            JointHardware(arm.joint_mass, arm.joint_inertia, reflected_inertia(arm))
-            for arm in scene.arms
+            JointHardware(arm.joint_mass, arm.joint_inertia, _rigid_rotor(parts))
+            for arm, parts in zip(scene.arms, joint_parts(scene), strict=True)
         ],
         cart_mass=scene.motion.cart_mass,
     )
+    return _with_parts(mechanism, scene)
 
 
-def reflected_inertia(arm: Arm) -> float:
-    """Return the rotor's inertia as the arm's joint feels it, kg m2: none behind a spring."""
-    return 0.0 if arm.joint_stiffness > 0.0 else rotor_inertia(arm)
-
-
-def rotor_inertia(arm: Arm) -> float:
-    """Return the inertia of the rotor that drives an arm's inboard joint, geared, kg m2."""
-    return arm.rotor_inertia * arm.gear_ratio**2
+def _rigid_rotor(parts: JointParts) -> float:
+    """Return the rotor's inertia that moves with the joint: none behind a gear's spring."""
+    return 0.0 if parts.stiffness > 0.0 else parts.rotor
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from dolfinopt.multibody.body_motion import (
     Scale,
 )
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
+from dolfinopt.multibody.joints import Friction
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -66,15 +67,18 @@ class Springs:
         joints: (M,) places of their joints among the free rigid coordinates.
         stiffness, damping: (M,) N m/rad, N m s/rad.
         rotor: (M,) inertia of the motors as the joints feel it, kg m2.
+        friction: of the motors, as the joints feel it.
     """
 
     joints: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
     rotor: np.ndarray
+    friction: Friction
 
 
-NO_SPRINGS = Springs(np.zeros(0, dtype=int), *np.zeros((3, 0)))
+NOTHING = np.zeros(0)
+NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, NOTHING, Friction.none(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +95,13 @@ class Drives:
         limits: (R,) N, N m; inf without.
         driven: (R,) True where a drive acts; others follow from a closed loop.
         rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
+        winding: whether motors behind springs are asked to turn ahead of their joints by what the
+            springs give under u_ff.
         table: of instants t (n,), s, forces (n, R) that are added; or None.
         springs: between drives and arms, where a drive is controlled.
         rotors: (R,) inertia of rotors on the desired motion, before springs, which their motors
             move as well, kg m2; or None.
+        friction: (R,) of these motors; or None.
     """
 
     free: np.ndarray
@@ -106,6 +113,8 @@ class Drives:
     table: Callable[[np.ndarray], np.ndarray] | None = None
     springs: Springs = NO_SPRINGS
     rotors: np.ndarray | None = None
+    friction: Friction | None = None
+    winding: bool = False
 
     def force(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return u (n, R) from u_ff, q - q_d and its rate, each (n, R)."""
@@ -281,6 +290,9 @@ class Mechanism:
         cart: its mass, kg, of the first rigid coordinate; None without one.
         scales: of every body's elastic rows, forces and moments, or none.
         forces: given ones on interfaces.
+        bearings: the bodies whose joints sit on bearings, see `joints.with_bearings`: the last
+            bodies, massless, in this order.
+        friction: of the joints' coordinates, or None.
     """
 
     bodies: tuple[ShapeIntegrals, ...]
@@ -292,6 +304,8 @@ class Mechanism:
     cart: float | None = None
     scales: tuple[Scale, ...] = ()
     forces: tuple[AppliedForce, ...] = ()
+    bearings: tuple[int, ...] = ()
+    friction: Friction | None = None
 
     def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
         """Return it at some of the instants."""
@@ -326,6 +340,22 @@ class Mechanism:
         """Each body's place in the vector of all elastic coordinates."""
         ends = np.cumsum([0, *(body.num_modes for body in self.bodies)])
         return tuple(slice(a, b) for a, b in pairwise(ends))
+
+    @property
+    def num_arms(self) -> int:
+        """Number of bodies that are no bearings."""
+        return len(self.bodies) - len(self.bearings)
+
+    @property
+    def arms(self) -> tuple[ShapeIntegrals, ...]:
+        """The bodies that are no bearings."""
+        return self.bodies[: self.num_arms]
+
+    @property
+    def bearing_columns(self) -> slice:
+        """Place of the bearings' coordinates among all elastic ones: the last ones."""
+        first = self.num_coordinates
+        return slice(first - sum(one.num_modes for one in self.bodies[self.num_arms :]), first)
 
     @property
     def num_coordinates(self) -> int:
@@ -477,30 +507,31 @@ class Mechanism:
         return np.stack(norms, axis=-1)
 
     def deflections(self, q: np.ndarray) -> np.ndarray:
-        """Return the largest deflection of every body in q (n, N), over its length (bodies,).
+        """Return the largest deflection of every arm in q (n, N), over its length (arms,).
 
         That of its outboard interfaces in its own frame.
         """
-        lengths = [np.linalg.norm(one.points, axis=1).max() for one in self.constants]
+        own = self.constants[: self.num_arms]
+        lengths = [np.linalg.norm(one.points, axis=1).max() for one in own]
         pairs = zip(self._interfaces(q, False), lengths, strict=True)
         return np.array([largest / length if length else 0.0 for largest, length in pairs])
 
     def rotations(self, q: np.ndarray) -> np.ndarray:
-        """Return the largest rotation of every body's interfaces in q (n, N), rad (bodies,)."""
+        """Return the largest rotation of every arm's interfaces in q (n, N), rad (arms,)."""
         return np.array(list(self._interfaces(q, True)))
 
     def _interfaces(self, q: np.ndarray, turned: bool) -> Iterator[float]:
-        """Yield the largest displacement, or rotation, of every body's interfaces in q (n, N)."""
+        """Yield the largest displacement, or rotation, of every arm's interfaces in q (n, N)."""
         d, b = self.dim.d, self.dim.b
-        for part, body in zip(self.slices, self.bodies, strict=True):
+        for part, body in zip(self.slices, self.arms):
             # Of each interface: displacements, then rotations, of which the plane has one.
             every = (q[:, part] @ body.outboard.T).reshape(-1, b)
             own = every[:, d:] if turned else every[:, :d]
             yield float(np.linalg.norm(own, axis=1).max(initial=0.0))
 
     def compliance(self, q: np.ndarray) -> np.ndarray:
-        """Return q_e' K_ee q_e of every body (n, bodies), N m; eq. (7) of the paper; q (n, N)."""
-        pairs = zip(self.bodies, (q[:, part] for part in self.slices), strict=True)
+        """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper; q (n, N)."""
+        pairs = zip(self.arms, (q[:, part] for part in self.slices))
         return np.stack([np.einsum("nk,nk->n", e @ body.K, e) for body, e in pairs], axis=1)
 
     def stiffness(self) -> np.ndarray:

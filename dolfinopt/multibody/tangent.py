@@ -191,7 +191,12 @@ def linearise(
     places = _places(tree, keep, rigid)
     loads = inward_pass(tree, links, driven=len(places.rigid) > 0)
     motions, ends = _outward_derivatives(tree, links, places)
-    return _inward_derivatives(tree, links, loads, places, motions, ends)
+    found = _inward_derivatives(tree, links, loads, places, motions, ends)
+    if tree.friction is not None and len(places.rigid):
+        own = np.arange(len(places.rigid))
+        slopes = tree.friction.slope(motion.qd)[:, places.rigid]
+        found.drives[:, own, places.size + own] += slopes
+    return found
 
 
 _Derivatives = dict[int, np.ndarray]  # of what moves

@@ -28,6 +28,7 @@ RUN_FILES = (
     "history.csv",
     "trajectory.npz",
     "trajectory.csv",
+    "budget.csv",
     "design.npz",
     "design.xdmf",
     "design.vtu",

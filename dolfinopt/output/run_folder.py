@@ -16,6 +16,7 @@ import numpy as np
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.loop import Result
+from dolfinopt.output.budget import write_budget
 from dolfinopt.output.design import write_design, write_fields
 from dolfinopt.output.folders import remove_stale_parts
 from dolfinopt.output.summary import summarise, write_summary
@@ -115,6 +116,7 @@ def write_simulation(
         if paraview:
             write_fields(folder, views)
         write_trajectory(folder, one.trajectory, one.initial_deviation)
+        write_budget(folder, summary["deflection_budget"])
         if pictures is not None:
             since = time.perf_counter()
             pictures(views)

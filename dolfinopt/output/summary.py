@@ -21,6 +21,7 @@ from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
+from dolfinopt.output.budget import budget_of
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -80,6 +81,7 @@ def summarise(
             **_figures(run.evaluation),
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),
             **_of_responses(run),
@@ -229,7 +231,7 @@ def _contacts(found: Contacts) -> dict[str, Any]:
 def _first_frequencies(run: Simulated, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
     """Return those of flexible arms by name, Hz; of a body from a file, what its modes tell."""
     found = {}
-    bodies = () if run.trajectory is None else run.trajectory.mechanism.bodies
+    bodies = () if run.trajectory is None else run.trajectory.mechanism.arms
     for arm, body in zip(run.scene.arms, bodies, strict=False):
         own = by_arm[arm.name].frequency if arm.name in by_arm else None
         value = body.first_frequency if own is None else own
@@ -289,7 +291,7 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         return dict(zip(scene.driven, map(float, values[columns]), strict=True))
 
     peak, rms = trajectory.drives
-    bodies = trajectory.mechanism.bodies
+    bodies = trajectory.mechanism.arms
     found = {
         "max_rotation": trajectory.max_rotation,
         "settling": trajectory.settling,

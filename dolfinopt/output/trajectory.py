@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.disk import read_arrays, write_arrays, write_text
+from dolfinopt.multibody.joints import moves
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.joint_parts import joint_parts
 
+BEHIND = "; behind them the bearings', m and rad"
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
 
 if TYPE_CHECKING:
@@ -41,13 +44,13 @@ def write_trajectory(
     if initial is not None and len(initial):
         even = np.linspace(0.0, scene.motion.horizon, len(initial))
         arrays["initial_deviation"] = _between(even, initial, trajectory.t)
-    rigid = ", ".join(scene.rigid_units.values())
+    rigid, bearings = ", ".join(scene.rigid_units.values()), trajectory.mechanism.bearings
     units = {
         "t": "s",
         "q_r": rigid,
         "q_r_desired": rigid,
-        "q_motors": ", ".join(["rad"] * len(trajectory.motor_joints)),
-        "q_e": "m or rad: times V is a displacement in m",
+        "q_motors": ", ".join(_motor_units(trajectory).values()),
+        "q_e": "m or rad: times V is a displacement in m" + BEHIND * bool(bearings),
         "deviation": "m",
         "compliance": "N m",
         "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
@@ -112,8 +115,16 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     """Return the driven coordinates that may leave the desired motion: control, or soft joints."""
     if scene.control is not None:
         return scene.driven
-    soft = {arm.name for arm in scene.arms if arm.joint_stiffness > 0.0}
+    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    names = list(scene.rigid_units)
+    soft = {names[k] for k, one in pairs if k is not None and one.stiffness > 0.0}
     return tuple(name for name in scene.driven if name in soft)
+
+
+def _motor_units(trajectory: Trajectory) -> dict[str, str]:
+    """Return the unit of every motor's coordinate behind a gear by its joint's name."""
+    units = list(trajectory.scene.rigid_units.items())
+    return dict(units[k] for k in trajectory.motor_columns)
 
 
 def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
@@ -123,15 +134,18 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     units = {"t": "s", **{f"deviation_{axis}": "m" for axis in axes}, "deviation": "m"}
     units |= {"compliance": "N m"}
     units |= {f"q_r_{name}": unit for name, unit in scene.rigid_units.items()}
-    for arm, part in zip(scene.arms, slices, strict=True):
+    for arm, part in zip(scene.arms, slices):
         # Of normalised modes: a unit of their own, which times the mode is a displacement.
         units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
+    mechanism = trajectory.mechanism
+    for place, body in zip(mechanism.bearings, mechanism.bodies[mechanism.num_arms :], strict=True):
+        name = scene.joint_names[place]
+        units |= {f"q_bearing_{name}_{along}": unit for along, unit in moves(body)}
     units |= {f"compliance_{arm.name}": "N m" for arm in scene.arms}
     units |= {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
     if trajectory.is_machine:
         units |= {f"q_r_desired_{name}": unit for name, unit in scene.rigid_units.items()}
-        names = [trajectory.scene.arms[k].name for k in trajectory.motor_joints]
-        units |= {f"q_motor_{name}": "rad" for name in names}
+        units |= {f"q_motor_{name}": unit for name, unit in _motor_units(trajectory).items()}
     if scene.closure is not None:
         names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
         units |= {f"closure_force_{name}": "N" for name in names}

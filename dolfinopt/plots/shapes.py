@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.mechanism import Closure, Mechanism
+from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.output.views import ArmView
 
 # Shares of the arms' reach.
@@ -68,16 +70,13 @@ def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.nd
         place (n, arms + 1), m: the origins of the frames, then the end-effector; and swing
         (n, arms) = exp(i angle from +x) of the frames.
     """
-    place = [q_r[:, 0] + 1j * mechanism.origin[1]]
-    swing = []
-    turn = np.ones(len(q_r), dtype=complex)  # of the outboard tangent of the arm before
-    for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies)):
-        q = q_e[:, part]
-        tip = complex(*body.outboard_point) + q @ (body.outboard[0] + 1j * body.outboard[1])
-        swing.append(turn * np.exp(1j * q_r[:, k + 1]))
-        place.append(place[-1] + swing[-1] * tip)
-        turn = swing[-1] * np.exp(1j * (q @ body.outboard[2]))
-    return np.stack(place, axis=1), np.stack(swing, axis=1)
+    # Interfaces move linearly with the coordinates, as the material does that is drawn.
+    linear = replace(mechanism, bodies=tuple(map(linear_part, mechanism.bodies)))
+    posed = Posed(linear, q_r, q_e)
+    frames = [posed.body(k)[1:] for k in range(mechanism.num_arms)]
+    places = [place for place, _ in frames] + [posed.interface(*mechanism.end)[0]]
+    place = np.stack([x + 1j * y for x, y in places], axis=1)
+    return place, np.stack([R[0, 0] + 1j * R[1, 0] for _, R in frames], axis=1)
 
 
 def plane(points: np.ndarray) -> np.ndarray:

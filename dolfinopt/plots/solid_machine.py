@@ -378,7 +378,8 @@ class SolidStage:
             mesh.point_data["Normals"] = self.rest[i][1] @ film.frames.rotation[frame, i].T
         draw_skeleton(studio, film.machine, film.frames, frame)
         # The rigid machine as lines, and the path up to this frame.
-        rigid, bodies = film.rigid, [i for i, _ in film.machine.mechanism.way]
+        rigid, mechanism = film.rigid, film.machine.mechanism
+        bodies = [i for i, _ in mechanism.way if i < mechanism.num_arms]
         places = [p for i in bodies for p in (rigid.held[frame, i], rigid.origin[frame, i])]
         draw_path(studio, np.array([*places[1:], rigid.end[frame]]), GREY, 1.0)
         if (n := film.at[frame]) > 0:

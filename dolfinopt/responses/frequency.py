@@ -175,7 +175,8 @@ def _tree(analysis: Analysis) -> FrozenTree:
             for place, owner in enumerate(scene.owners)
         ]
         motion = family_of(scene).motion(np.array([0.5 * scene.motion.duration]), scene)
-        return FrozenTree(family_of(scene).build(scene, bodies), motion, scene.objective.attached)
+        rigid = family_of(scene).build(scene, bodies).rigid  # its bearings, too
+        return FrozenTree(rigid, motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)
 

@@ -221,6 +221,7 @@ class ComplianceResponse(MotionResponse):
         """Return 2 w_j K q_j, and the second moments of q by K."""
         q = trajectory.q_e[cases.indices]
         by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
+        by_q[:, trajectory.mechanism.bearing_columns] = 0.0
         return trajectory.by_unknowns(by_q), [{"K": Q} for Q in second_moments(trajectory, cases)]
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
@@ -248,7 +249,7 @@ def _load_case_moments(response: MotionResponse, trajectory: Trajectory) -> list
         parts = [
             # Of its stiffness; rigid arms and bodies from files have no gradient.
             weight * factors(scene, one.scene, index).stiffness * part
-            for index, part in enumerate(response.load_case_moments(one))
+            for index, part in enumerate(response.load_case_moments(one)[: len(scene.arms)])
         ]
         total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
     return total
@@ -264,7 +265,7 @@ def _cotangents(response: MotionResponse, trajectory: Trajectory) -> list[ShapeI
     for weight, one in zip(weights, others, strict=True):
         parts = [
             cotangents_of_scene(by_body, factors(scene, one.scene, index), weight)
-            for index, by_body in enumerate(response.cotangents(one))
+            for index, by_body in enumerate(response.cotangents(one)[: len(scene.arms)])
         ]
         total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
     return total

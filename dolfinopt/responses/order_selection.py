@@ -265,8 +265,8 @@ def _distance(
     parts = zip(few.mechanism.slices, many.mechanism.slices, strict=True)
     for place, (a, b) in enumerate(parts):
         q, richer = few.q_e[:, a], many.q_e[:, b]
-        owner = scene.owners[place]
-        if owner is None:  # rigid, or from a file: the same body in both
+        owner = scene.owners[place] if place < len(scene.owners) else None
+        if owner is None:  # rigid, from a file, or a bearing: the same body in both
             K = many.mechanism.bodies[place].K
             errors.append(_norm(K, q - richer))
             sizes.append(_norm(K, richer))

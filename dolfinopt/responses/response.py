@@ -262,13 +262,13 @@ def by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:
 
     Args:
         scene: with the arms.
-        parts: one an arm, from the cart outwards.
+        parts: one an arm, from the cart outwards; what is behind them, of bearings, has no design.
 
     Returns:
         A sum a design, by the index of the arm that owns it.
     """
     total: dict[int, T] = {}
-    for owner, part in zip(scene.owners, parts, strict=True):
+    for owner, part in zip(scene.owners, parts):
         if owner is not None:
             total[owner] = total[owner] + part if owner in total else part  # type: ignore[operator]
     return total

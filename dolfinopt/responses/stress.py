@@ -264,7 +264,7 @@ def loads_gradient(
     if motion.scene is not scene:
         total = [
             cotangents_of_scene(by, factors(scene, motion.scene, index), 1.0)
-            for index, by in enumerate(total)
+            for index, by in enumerate(total[: len(scene.arms)])
         ]
     return by_owner(scene, total)
 

@@ -36,6 +36,7 @@ from dolfinopt.scene.messages import (
 )
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.tables.arms import (
+    GEAR_KEYS,
     MATERIAL_VALUES,
     MAX_ARMS,
     MAX_CELLS,
@@ -46,6 +47,7 @@ from dolfinopt.scene.tables.arms import (
     SIZE_KEYS,
     SIZE_PARAMETER,
     SOLID_SHAPES,
+    SPRING_KEYS,
     WALL_KEYS,
     Arm,
 )
@@ -386,6 +388,10 @@ def _replaced(arm: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         yield MATERIAL_VALUES
     if "pattern" in arm:
         yield PATTERN_KEYS
+    if "gear_stiffness" in arm:
+        yield SPRING_KEYS
+    if "joint_stiffness" in arm:
+        yield GEAR_KEYS
     if arm.get("rigid") is True or "sid" in arm:
         yield ("regions",)
     if arm.get("hollow") is False:

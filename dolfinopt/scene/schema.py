@@ -225,6 +225,12 @@ class Scene(Table):
         return len(self.movable) if self.is_spatial else 1 + len(self.arms)
 
     @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Name of every arm's inboard joint; in the plane the arm's."""
+        names = {joint.child: joint.name for joint in self.joints}
+        return tuple(names.get(arm.name, arm.name) for arm in self.arms)
+
+    @property
     def joint_columns(self) -> tuple[int | None, ...]:
         """Place of every arm's inboard joint among the rigid coordinates; None of a fixed one."""
         if not self.is_spatial:

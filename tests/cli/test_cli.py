@@ -36,7 +36,8 @@ def optimised(folder):
 def test_optimize_writes_every_file(optimised):
     """And --overwrite knows them all."""
     expected = """checkpoint.npz design.npz design.png design.vtu design.xdmf deviation.png
-        history.csv history.png machine.png stress.png summary.json trajectory.csv trajectory.npz"""
+        history.csv history.png machine.png stress.png summary.json trajectory.csv trajectory.npz
+        budget.csv"""
     assert {path.name for path in optimised.iterdir()} == set(expected.split()) <= set(RUN_FILES)
 
 

@@ -138,6 +138,15 @@ def soft_two_arm() -> Trajectory:
     return trajectory_of(controlled(*changes, "simulation.stiffening=true"))
 
 
+def geared_two_arm() -> Trajectory:
+    """Return arms on gears and bearings, with friction, whose drives nothing controls."""
+    keys = {"gear_stiffness": 3e4, "gear_damping": 30.0, "rotor_inertia": 2e-5, "gear_ratio": 100.0,
+            "bearing_stiffness": [1e7, 1e7, 0, 0, 0, 0], "friction": [5.0, 2.0]}  # fmt: skip
+    changes = [f"arms.{key}={value}" for key, value in keys.items()]
+    changes += ["motion.cart_mass=5.0"]  # a cart without mass before a bearing has no acceleration
+    return trajectory_of(scene_from_dict(two_arm("arms.cells=[16,2]", *changes)))
+
+
 def slider(**tables) -> Trajectory:
     return trajectory_of(scene_from_dict(loop_tree(**tables, simulation={"tolerance": 1e-6})))
 
@@ -146,6 +155,7 @@ MACHINES = {
     "open, two arms": (open_two_arm, 0.8),
     "closed, two arms": (lambda: trajectory_of(controlled("motion.gravity=[0,-9.81]")), 0.8),
     "closed, motors behind springs": (soft_two_arm, 0.5),
+    "open, gears, bearings and friction": (geared_two_arm, 0.7),
     "open, slider-crank": (slider, 0.03),
     "closed, slider-crank": (
         lambda: slider(control={"stiffness": [2e3], "damping": [20.0]}), 0.07

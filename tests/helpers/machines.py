@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
-from dolfinopt.multibody.end_effector import _frames, interface_place, outboard
+from dolfinopt.multibody.dimension import product
+from dolfinopt.multibody.end_effector import Posed, interface_place, outboard
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
@@ -173,14 +175,11 @@ def imbalance(result: SimulationResult) -> float:
     """
     trajectory = result.trajectory
     assert trajectory is not None
-    grid, mechanism = trajectory.solution.time_grid, trajectory.mechanism
+    grid = trajectory.solution.time_grid
     nodes, weights = np.polynomial.legendre.leggauss(6)
     h = np.diff(grid)[:, None]
     t = grid[:-1, None] + 0.5 * h * (nodes + 1.0)
-    motion, _, qd, _, forces = states(trajectory, t.ravel())
-    power = (forces * motion.qd).sum(axis=1)
-    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
-        power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
+    power = _power(trajectory, t.ravel())
     work = np.cumsum((0.5 * h * weights * power.reshape(t.shape)).sum(axis=1))
     stored = sum(energies(trajectory, grid))
     return float(np.abs(work - (stored[1:] - stored[0])).max() / np.abs(stored).max())
@@ -200,6 +199,57 @@ def states(
     return instants.motion(y, yd, ydd), q, qd, qdd, instants.forces(y, yd, ydd)
 
 
+def _power(trajectory: Trajectory, t: np.ndarray) -> np.ndarray:
+    """Return the drives' power less what dampers and friction take (n,), W."""
+    mechanism = trajectory.mechanism
+    motion, _, qd, _, forces = states(trajectory, t)
+    speeds, parts = motion.qd.copy(), drive_trains(trajectory, t)
+    speeds[:, parts.columns] = parts.speeds
+    power = (forces * speeds).sum(axis=1) - parts.dissipated
+    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
+        power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
+    if mechanism.friction is not None:
+        power -= (mechanism.friction.force(motion.qd) * motion.qd).sum(axis=1)
+    return power
+
+
+@dataclass(frozen=True, eq=False)
+class DriveTrains:
+    """Gears and motors: rigid coordinates, motors' speeds (n, M), power lost and energies (n,)."""
+
+    columns: np.ndarray
+    speeds: np.ndarray
+    dissipated: np.ndarray
+    kinetic: np.ndarray
+    strain: np.ndarray
+
+
+def drive_trains(trajectory: Trajectory, t: np.ndarray) -> DriveTrains:
+    """Return what gears and motors do: under control by themselves, or on the desired motion."""
+    none = np.zeros(len(t))
+    system = trajectory.problem
+    if not isinstance(system, MachineSystem):
+        return DriveTrains(np.zeros(0, dtype=int), np.zeros((len(t), 0)), none, none, none)
+    drives, springs, instants = system.drives, system.drives.springs, system.at(t)
+    y, yd = (trajectory.solution.sample(t, k) for k in range(2))
+    if drives.rotors is None:  # under control
+        own, k, c = springs.joints, springs.stiffness, springs.damping
+        rotor, friction = springs.rotor, springs.friction
+        speeds = instants.motor_speeds(yd)
+        twist, rate = (x[:, own] - instants.motors(x) for x in (y, yd))
+    else:
+        own = np.flatnonzero(drives.driven)
+        k, c, rotor = drives.stiffness[own], drives.damping[own], drives.rotors[own]
+        friction = None if drives.friction is None else drives.friction.of(own)
+        speeds = instants.desired.qd[:, drives.free[own]]
+        twist, rate = y[:, own], yd[:, own]
+    lost = rate**2 @ c
+    if friction is not None:
+        lost = lost + (friction.force(speeds) * speeds).sum(axis=1)
+    kinetic, strain = 0.5 * speeds**2 @ rotor, 0.5 * twist**2 @ k
+    return DriveTrains(drives.free[own], speeds, lost, kinetic, strain)
+
+
 def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return kinetic and strain energy and gravity's potential, (n,) each, J.
 
@@ -208,25 +258,28 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     motion, q, qd, qdd, _ = states(trajectory, t)
     mechanism = trajectory.mechanism
-    rigid = np.arange(1 + len(mechanism.bodies))
+    d, rigid = mechanism.dim.d, np.arange(mechanism.num_rigid)
     tangent = linearise(mechanism, motion, q, qd, qdd, None, rigid).dense()
     size = tangent.shape[1]
     speeds = np.concatenate([motion.qd, qd], axis=1)
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
     strain = np.zeros(len(t))
-    origins, rotations, _ = _frames(mechanism, motion, q)
-    moment = np.zeros(len(t), dtype=complex)  # first moment of all masses
+    posed = Posed(mechanism, motion.q, q)
+    moment = np.zeros((d, len(t)))  # first moment of all masses
     for k, (part, body) in enumerate(zip(mechanism.slices, mechanism.bodies, strict=True)):
         e = q[:, part]
         strain += 0.5 * np.einsum("ni,ij,nj->n", e, body.K, e)
         own = body.moment + e @ body.C.T
         if body.is_stiffened:
-            own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:2], e)
-        moment = moment + body.mass * origins[k] + rotations[k] * (own[:, 0] + 1j * own[:, 1])
-    for (k, _), load in mechanism.loads.items():
-        moment = moment + load.mass * origins[1 + k]
-    potential = -(np.conj(complex(*mechanism.gravity[:, 0])) * moment).real
-    return kinetic, strain, potential
+            own = own - 0.5 * np.einsum("ni,pij,nj->np", e, body.K0[:d], e)
+        _, place, R = posed.body(k)
+        moment = moment + body.mass * place + product(R, own.T)
+    for site, load in mechanism.loads.items():
+        place, R = posed.interface(*site)
+        moment = moment + load.mass * place + product(R, load.c)
+    potential = -mechanism.gravity[:, 0] @ moment
+    parts = drive_trains(trajectory, t)
+    return kinetic + parts.kinetic, strain + parts.strain, potential
 
 
 def gaps(result: SimulationResult) -> np.ndarray:

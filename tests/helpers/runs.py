@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -97,9 +98,14 @@ def demo(name: str) -> ModuleType:
     return module
 
 
+OF_A_PROCESS = re.compile("PMIX_|ORTE_|OMPI_(MCA_(pmix|ess|orte)|APP_|UNIVERSE|COMM_)")
+
+
 def environment() -> dict[str, str]:
-    """Return the environment as it was before this process began MPI, which misleads mpirun."""
-    return dict(os.environ)
+    """Return the environment without what the beginning of MPI adds to it: it misleads mpirun."""
+    # A worker of pytest-xdist has it from the process that distributes the tests, if that has read
+    # a file that imports MPI.
+    return {name: value for name, value in os.environ.items() if not OF_A_PROCESS.match(name)}
 
 
 def command(*words: object, ranks: int = 0) -> list[str]:

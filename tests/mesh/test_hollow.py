@@ -74,10 +74,36 @@ def test_ends_are_flanges():
     assert arm.uniform()[inner] == pytest.approx(0.2)
 
 
+def test_ribs_are_rings_at_even_distances():
+    """Two cells long; the station between them is as thick as the largest wall, its next is not."""
+    arm = solid_arm(
+        MPI.COMM_SELF,
+        cells=(12, 3, 2),
+        hollow=True,
+        wall=0.001,
+        max_wall=0.003,
+        passive=0.0,
+        ribs=2,
+    )
+    x, wall = arm.mesh.centroid[:, 0], arm.mesh.wall
+    at = wall.hull.outer[:, 0, 0]
+    cell = 0.5 / 12
+    near = np.abs(x[:, None] - [0.5 / 3, 1.0 / 3]).min(axis=1) < cell
+    assert np.array_equal(arm.mesh.passive, near)
+    thickness = wall.thickness(MPI.COMM_SELF, arm.uniform())
+    ribs = np.isclose(at[:, None], [0.5 / 3, 1.0 / 3]).any(axis=1)
+    assert ribs.sum() == 2 and thickness[ribs] == pytest.approx(0.003)
+    assert thickness[np.abs(at[:, None] - at[ribs]).min(axis=1) > 1.5 * cell] == pytest.approx(
+        0.001
+    )
+
+
 @pytest.mark.serial
 @pytest.mark.parametrize(
     "changes, words",
     [
+        (("arms.link1.ribs=2",), ("arms.0.ribs", "2", "hollow = true")),
+        ((*HOLLOW, "arms.link1.ribs=20"), ("ribs", "20", "at most", "4 from rib to rib")),
         (("arms.link1.wall=0.002",), ("arms.0.wall", "0.002", "hollow = true")),
         (("arms.link1.hollow=true",), ("wall", "number > 0")),
         ((*HOLLOW, "arms.link1.max_wall=0.01"), ("max_wall", "0.01", "less than half")),

@@ -1,4 +1,7 @@
-"""Rigid robots against Pinocchio (Carpentier et al. 2019, doi:10.1109/SII.2019.8700380)."""
+"""Robots, rigid and on bearings, against Pinocchio (Carpentier et al. 2019).
+
+doi:10.1109/SII.2019.8700380.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import numpy as np
 import pytest
 
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.joints import bearing_body, with_bearings
 from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
@@ -89,3 +93,49 @@ def test_rigid_robot(name):
     data = model.createData()
     expected = np.array([pin.rnea(model, data, *row) for row in zip(q, qd, qdd)])
     assert np.abs(found - expected).max() < 1e-10
+
+
+@pytest.mark.parametrize("name", ["six axes", "scara"])
+def test_bearings_are_joints_of_their_own(name):
+    """Each bearing as three prismatic joints and a revolute one: forces on all of them."""
+    rng = np.random.default_rng(3)
+    model, indices = pin.Model(), []
+    bodies, joints, bearings, movable = [], [], {}, 0
+    own_rows, spring_rows = [], []  # Pinocchio's places of the robot's joints and of the bearings'
+    for i, (kind, parent, axis, origin, rpy) in enumerate(ROBOTS[name]):
+        mass, centre, inertia = uneven_box(rng)
+        axis, R, turn = np.array(axis, dtype=float), roll_pitch_yaw(rpy), i % 3
+        bodies.append(rigid_spatial_body(mass, centre, inertia))
+        coordinate = None if kind == "fixed" else movable
+        movable += kind != "fixed"
+        joints.append(Joint(str(i), kind, parent, coordinate, axis, np.array(origin), R))
+        stiffness = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0])
+        stiffness[3 + turn] = 4.0
+        bearings[i] = bearing_body(stiffness, 0.1 * stiffness, 3)
+        last, place = 0 if parent == GROUND else indices[parent], pin.SE3(R, np.array(origin))
+        unit = np.eye(3)
+        for k in range(4):
+            along = unit[k] if k < 3 else unit[turn]
+            made = pin.JointModelPrismaticUnaligned if k < 3 else pin.JointModelRevoluteUnaligned
+            last = model.addJoint(last, made(along), place, f"{i} {k}")
+            spring_rows.append(model.joints[last].idx_v)
+            place = pin.SE3.Identity()
+        if kind != "fixed":
+            made = pin.JointModelPrismaticUnaligned if kind == "prismatic" else (
+                pin.JointModelRevoluteUnaligned
+            )  # fmt: skip
+            last = model.addJoint(last, made(axis), place, str(i))
+            own_rows.append(model.joints[last].idx_v)
+        indices.append(last)
+        model.appendBodyToJoint(last, pin.Inertia(mass, centre, inertia_tensor(inertia)), place)
+    model.gravity.linear = np.array([0.3, -0.2, -9.81])
+    rigid = spatial_mechanism(bodies, joints, {}, (0.3, -0.2, -9.81), (len(bodies) - 1, 0))
+    machine = with_bearings(rigid, bearings)
+    rates = rng.normal(size=(3, 20, model.nv))
+    own, springs = rates[..., own_rows], rates[..., spring_rows]
+    rows, forces = inverse_dynamics(machine, RigidMotion(*own), *springs)
+    inertia = rows - springs[0] @ machine.stiffness() - 0.1 * springs[1] @ machine.stiffness()
+    data = model.createData()
+    expected = np.array([pin.rnea(model, data, *row) for row in zip(*rates)])
+    assert np.abs(forces - expected[:, own_rows]).max() < 1e-9
+    assert np.abs(inertia - expected[:, spring_rows]).max() < 1e-9

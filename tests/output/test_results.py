@@ -18,7 +18,7 @@ from dolfinopt.output.views import gather_views
 WORLD = MPI.COMM_WORLD
 SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01")
 PARAVIEW = {"design.vtu", "design.xdmf"}
-FILES = {"design.npz", "summary.json", "trajectory.csv", "trajectory.npz"}
+FILES = {"budget.csv", "design.npz", "summary.json", "trajectory.csv", "trajectory.npz"}
 
 
 @pytest.fixture(scope="module")

@@ -63,3 +63,12 @@ def test_part_without_a_strut_has_a_hole_less(truss):
             points = np.vstack([one.points for one in left.runs])
             apart = np.linalg.norm(points[:, None] - points * MIRROR, axis=2).min(axis=1)
             assert apart.max() < 1e-9
+
+
+def test_truss_of_thick_members_is_heavier_than_a_part_of_thin_ones(truss):
+    """Flanges and struts are as thick as they must be, whatever the part's area is."""
+    part, made = truss
+    least = 0.016  # m: two flanges alone are half of the arm's height
+    heavy = trusses_of({0: replace(part, domain=replace(part.domain, minimum_member=least))}, 0)[0]
+    assert heavy.shape.area > 1.05 * made.shape.area
+    assert heavy.thinnest is None or heavy.thinnest > 0.9 * least

@@ -19,6 +19,7 @@ from dolfinopt.part.part import Curves, make_parts
 from dolfinopt.part.plane.curves import MIRROR, Arc, Spline, direction
 from dolfinopt.part.plane.free_outline import free_outline
 from dolfinopt.part.plane.layouts import trusses_of
+from dolfinopt.part.plane.part import make_part
 from dolfinopt.responses.constraints import EXCESS
 
 pytestmark = pytest.mark.serial
@@ -271,6 +272,29 @@ def test_cutter_and_smallest_member_of_a_scara_robot(scara):
         assert part.thinnest >= 0.99 * scene.part.minimum_member  # steps end a little within
         deep, _ = deepest_left(part.shape, scene.part.tool_radius, size)
         assert deep <= 1.5 * size  # the raster's own
+
+
+def test_corners_at_the_arms_own_edge_have_no_hooks(design):
+    """Levels of a density turn there in the last cell; what is optimised comes straight to it."""
+
+    def wedges(x, y):
+        return np.abs(y) < 0.002 + 0.5 * np.minimum(x, 1.0 - x)
+
+    part = make_part(design(wedges))
+    outline, cell = free_outline(part), part.domain.cell
+    ends = [
+        run.points[:: -1 if last else 1]
+        for run in outline.runs
+        for last in (False, True)
+        if run.corners[last] and abs(abs(run.points[-last, 1]) - 0.03) < 1e-9
+    ]
+    assert len(ends) == 4
+    for points in ends:
+        reach = np.linalg.norm(points - points[0], axis=1)
+        along = points[np.argmax(reach > cell)] - points[0]
+        assert abs(along[1] / along[0]) == pytest.approx(0.5, rel=0.2)
+        off = np.cross(points[reach < cell] - points[0], along / np.linalg.norm(along))
+        assert np.abs(off).max() < 0.05 * cell
 
 
 def test_trusses_between_bores_have_their_material_there(scara):

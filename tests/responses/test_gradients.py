@@ -94,6 +94,14 @@ STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
 JOINT = ("arms.arm2.joint_mass=0.5", "arms.arm2.joint_inertia=0.01")
 SOFT = ("arms.arm2.joint_stiffness=2e4", "arms.arm2.joint_damping=50.0")
+GEARS = ("arms.gear_stiffness=3e4", "arms.gear_damping=30.0", "arms.rotor_inertia=2e-5",
+         "arms.gear_ratio=100.0")  # fmt: skip
+BEARINGS = "arms.bearing_stiffness=[1e6,2e6,0,0,0,5e4]"
+WOUND = "control.feed_forward=elastic"
+STIFF = "joints.bearing_stiffness=[1e7,2e7,3e7,1e5,2e5,0]"
+IN_SPACE = ("joints.gear_stiffness=3e4", "joints.gear_damping=30.0", "joints.rotor_inertia=2e-5",
+            "joints.gear_ratio=100.0", STIFF, "joints.friction=[5.0,3.0]",
+            "joints.bearing_damping=[100,100,100,20,20,0]")  # fmt: skip
 CRANK = "control={stiffness=[2e3], damping=[20.0]}"
 MATERIAL = '"material.density=3100.0", "material.young_modulus=50e9"'
 TWO = (
@@ -198,6 +206,11 @@ CASES = [
     case("controlled", GRAVITY, "arms.joint_stiffness=3e4", "arms.joint_damping=30.0",
          "arms.rotor_inertia=2e-5", "arms.gear_ratio=100.0"),
     case("two_arm", DEVIATION, *JOINT, *SOFT),
+    case("two_arm", COMPLIANCE, BENT, GRAVITY, BEARINGS, ranks=True),
+    case("two_arm", COMPLIANCE, TWO, BEARINGS, slow=True),
+    case("controlled", DEVIATION, GRAVITY, *GEARS, BEARINGS, WOUND, "arms.friction=[5.0,3.0]"),
+    case("controlled", *EFFORT, GRAVITY, *GEARS, WOUND, "arms.friction=[5.0,3.0]"),
+    case("two_arm", *EFFORT, GRAVITY, BEARINGS, *SOFT, "arms.friction=[5.0,3.0]", slow=True),
     case("controlled", *EFFORT, GRAVITY),
     case("controlled", *EFFORT, GRAVITY, "control.limits=[150.0,200.0,150.0]",
          "control.forces='FOLDER/drives.csv'", *SOFT),
@@ -210,6 +223,8 @@ CASES = [
     case("slider", CRANK, "control.stiffness=[0.0]", GRAVITY),
     case("slider", *EFFORT, GRAVITY),
     case("slider", *EFFORT, CRANK),
+    case("slider", *EFFORT, CRANK, WOUND, "arms.crank.gear_stiffness=3e3",
+         "arms.rod.gear_stiffness=0", "arms.friction=[0.1,0.5]"),
     case("slider", *EFFORT, CRANK, "control.limits=[40.0]"),
     case("slider", *PEAK, GRAVITY),
     case("pin", slow=True),
@@ -221,7 +236,13 @@ CASES = [
     case("space", "objective.kind=tip_deflection", slow=True),
     case("space", FREQUENCY, slow=True),
     case("fork", DEVIATION),
+    case("fork", DEVIATION, BENT, STIFF, *(f"joints.{name}.{key}" for name in ("swing", "slide")
+         for key in ("gear_stiffness=3e4", "gear_damping=30.0", "friction=[5.0,3.0]"))),
+    case("space", DEVIATION, *IN_SPACE, HELD, slow=True),
+    case("space", *EFFORT, *IN_SPACE, HELD.replace("{", "{feed_forward='elastic',"), slow=True),
+    case("space", STRESS, *IN_SPACE, TWO_IN_SPACE, slow=True),
     case("fork", FREQUENCY),
+    case("fork", FREQUENCY, STIFF),
     # Settling in every rest.
     case("two_arm", SETTLING, *IN_STROKES, "constraints.settling_after=0.05"),
     case("two_arm", SETTLING, "motion.dwells=[[0.5,0.7],[1.0,1.2]]"),

@@ -315,12 +315,17 @@ BAD_VALUES = [
     ("arms.0.section", ["oval"], '"box" | "tube"'),
     ("arms.0.hull", ["absent.msh"], "found neither /"),
     ("arms.0.wall arms.0.min_wall arms.0.max_wall", [0.01], "only with hollow = true"),
+    ("arms.0.ribs", [2], "only with hollow = true"),
     ("arms.0.passive", [0.5], "less than half of length = 1.0 [m]"),
     ("arms.0.passive", [0.26], "volume_fraction = 0.5 can be met"),
     ("arms.0.joint_stiffness arms.0.joint_damping arms.0.joint_mass arms.0.joint_inertia "
      "arms.0.rotor_inertia arms.0.passive damping.stiffness_proportional objective.stress_margin "
      "design.filter_radius optimizer.tolerance", [-1e-9], "a number >= 0"),
     ("arms.0.gear_ratio", [0.0], "a number >= 0.001"),
+    ("arms.0.gear_stiffness arms.0.gear_damping", [-1e-9], "a number >= 0"),
+    ("arms.0.bearing_stiffness arms.0.bearing_damping", [[1e6, 1e6, 1e6]], "six numbers >= 0"),
+    ("arms.0.friction", [[1.0]], "two numbers >= 0"),
+    ("arms.0.friction_speed", [0.0], "a number >= 1e-06"),
     ("motion.path", ["circle"], '"arc" | "line" | "points" | "joints"'),
     ("motion.radius", [0.0], LENGTHS),
     ("motion.flattening simulation.rho_inf", [-0.1, 1.01], "a number >= 0 and <= 1"),

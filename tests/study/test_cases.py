@@ -183,6 +183,7 @@ def test_files_and_outcomes(plan, done):
     assert {path.name for path in made.folder.iterdir()} == {
         "checkpoint.npz", "design.npz", "history.csv", "summary.json", "trajectory.csv",
         "trajectory.npz",
+        "budget.csv",
     }  # fmt: skip
     assert made.iterations == 3 and len(made.history()) == 4
     t, distance = made.deviation()

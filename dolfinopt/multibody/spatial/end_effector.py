@@ -77,28 +77,32 @@ class Frames:
 
 
 def body_frames(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> Frames:
-    """Return the frames of all bodies.
+    """Return the frames of all bodies but bearings, which are points.
 
     Args:
-        mechanism: b bodies.
+        mechanism: b bodies besides bearings.
         q_r: (n, joints) rigid coordinates; rad or m.
         q_e: (n, N) elastic coordinates.
     """
     posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
     origin, rotation, outboard, axes, held = [], [], [], [], []
-    for i, joint in enumerate(joints):
+    parents = []
+    for i, joint in enumerate(joints[: mechanism.num_arms]):
+        # A bearing hangs where the joint it holds would without it.
+        below = joint if joint.parent < mechanism.num_arms else joints[joint.parent]
+        parents.append(below.parent)
         _, place, R = posed.body(i)
         R = np.broadcast_to(R if R.ndim == 3 else R[..., None], (3, 3, len(q_r)))
         origin.append(place.T)
         rotation.append(R.transpose(2, 0, 1))
         outboard.append(posed.interface(i, 0)[0].T)
         axes.append(rotation[-1] @ joint.axis)
-        held.append(posed.interface(joint.parent, joint.interface)[0].T)
+        held.append(posed.interface(below.parent, below.interface)[0].T)
     return Frames(
         origin=np.stack(origin, axis=1),
         rotation=np.stack(rotation, axis=1),
         outboard=np.stack(outboard, axis=1),
-        parents=tuple(joint.parent for joint in joints),
+        parents=tuple(parents),
         axes=np.stack(axes, axis=1),
         held=np.stack(held, axis=1),
         end=posed.interface(*mechanism.way[-1])[0].T,

@@ -203,7 +203,12 @@ class Spline:
         """Return the piece between two parameters, first < last."""
         ends = self.breaks
         inner = ends[(ends > first + 1e-12) & (ends < last - 1e-12)]
-        knots = np.concatenate([[first] * 4, inner, [last] * 4])
+        return self.over(np.concatenate([[first], inner, [last]]))
+
+    def over(self, breaks: np.ndarray) -> Spline:
+        """Return the piece from the first to the last of some breaks, its own there among them."""
+        first, last = breaks[[0, -1]]
+        knots = np.concatenate([[first] * DEGREE, breaks, [last] * DEGREE])
         # It is a spline of these knots itself: interpolation in as many points gives it exactly.
         t = np.array([knots[k + 1 : k + 4].mean() for k in range(len(knots) - 4)])
         t = np.clip(t, first, last)  # a mean of equal numbers may differ from them

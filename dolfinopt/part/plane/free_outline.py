@@ -1,8 +1,8 @@
 """The free outline of a part as variables: normal moves of control points, smooth along it.
 
-Closed free loops are periodic uniform cubic B-splines, open free runs uniform ones that keep two
-control points at either end, so that their ends and directions stay. Control points stand about a
-cell apart. They move along the outward normals by s = F x with
+Closed free loops are periodic uniform cubic B-splines, open free runs uniform ones whose ends stay,
+and with them, where they go on smoothly into what stays, their directions. Control points stand
+about a cell apart. They move along the outward normals by s = F x with
 
     F = (W + r^2 K)^-1 W,
 
@@ -45,6 +45,8 @@ SPACING = 1.2  # of control points, cells of the design
 REACH = 2.0  # length r over which moves are smooth, cells
 LEAST_POINTS = 8  # control points of a closed run; an open one has 3 more than it has spans
 SAMPLES = 8  # points for every control point that a run is fitted to
+HOOK = 1.5  # length next to a corner at the arm's edge that becomes straight, cells
+FLAT = np.radians(10.0)  # least angle there
 STIFF = 1e-4  # of second differences of control points, where they are fitted
 FAIR = 1.0  # the same where a part has the stairs of its cells, which fade
 WORN = 0.15  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
@@ -63,6 +65,7 @@ STEEP = 0.2  # most that curvature counts above the tool's in one rounding, time
 EVENLY = 20  # roundings after which control points are looked at for crowds
 PEAKS = 4  # places for every control point where curvature is looked at
 BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
+Tangents = tuple[np.ndarray | None, ...]  # directions at both ends of a line
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
 
 
@@ -99,10 +102,21 @@ class Run:
     Attributes:
         points: (n, 2) control points, m.
         closed: whether it is a whole loop.
+        corners: whether an open one begins, and ends, in a corner of the material.
     """
 
     points: np.ndarray
     closed: bool
+    corners: tuple[bool, bool] = (False, False)
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """Which control points (n,) stay: an open run's ends, and those beside smooth ones."""
+        found = np.zeros(len(self.points), dtype=bool)
+        if not self.closed:
+            found[: 2 - self.corners[0]] = True
+            found[len(found) - 2 + self.corners[1] :] = True
+        return found
 
     @property
     def pieces(self) -> list[Piece]:
@@ -151,7 +165,12 @@ class Run:
         )
         if self.closed:
             return Run(fitted_closed(line[:-1], _length(line) / n, False), True)
-        return Run(_fitted_open(line, _length(line) / (n - DEGREE)), False)
+        p = self.points
+        tangents = tuple(
+            None if corner else step
+            for corner, step in zip(self.corners, (p[1] - p[0], p[-1] - p[-2]), strict=True)
+        )
+        return replace(self, points=_fitted_open(line, _length(line) / (n - DEGREE), tangents))
 
     def sharper(self, radius: float) -> np.ndarray:
         """Return how far (n,) control points would move outwards, m, to round concave corners.
@@ -179,10 +198,11 @@ class Run:
         np.maximum.at(bend, beside, -(d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3)
         spacing = sum(0.5 * np.linalg.norm(self.points - end, axis=1) for end in ends)
         s = 0.25 * spacing**2 * np.clip(bend - 1.0 / radius, 0.0, STEEP / spacing)
+        s[self.held] = 0.0
         if not self.closed:
-            s[[0, 1, -2, -1]] = 0.0
             # What turns beside a held end cannot be mended by the one control point that moves.
-            s[[2, -3]] = np.minimum(s[[2, -3]], s[[3, -4]])
+            first, *_, last = np.flatnonzero(~self.held)
+            s[[first, last]] = np.minimum(s[[first, last]], s[[first + 1, last - 1]])
         return np.asarray(s)
 
     def filter(self, reach: float) -> np.ndarray:
@@ -196,9 +216,7 @@ class Run:
             np.add.at(W, i, 0.5 * length)
             np.add.at(K, (i, i), 1.0 / length)
             np.add.at(K, (i, j), -1.0 / length)
-        moves = np.ones(n, dtype=bool)
-        if not self.closed:
-            moves[[0, 1, -2, -1]] = False
+        moves = ~self.held
         F = np.zeros((n, n))
         A = (np.diag(W) + reach**2 * K)[np.ix_(moves, moves)]
         F[np.ix_(moves, moves)] = np.linalg.solve(A, np.diag(W[moves]))
@@ -446,7 +464,7 @@ class FreeOutline:
                 own = s[block]
                 s[block] = np.maximum(own, 0.5 * np.maximum(np.roll(own, 1), np.roll(own, -1)))
             else:
-                s[block][[0, 1, -2, -1]] = 0.0
+                s[block][run.held] = 0.0
         return self.moved(self._symmetric(s))
 
     def _as_large(self, area: float) -> FreeOutline:
@@ -572,20 +590,12 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
     fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]
     for loop in map(_with_fillets, fixed):
         found: list[Piece | int] = []
-        line = np.empty((0, 2))
-        first = next(k for k, piece in enumerate(loop) if not piece.free)
-        loop = (*loop[first:], *loop[:first])  # no run goes on beyond the last piece
-        for piece, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
-            if not piece.free:
-                found.append(piece)
-                continue
-            own = piece.curve.at(piece.curve.parameters(chord))
-            line = np.vstack([line, own[1:]]) if len(line) else own
-            smooth = direction(piece.curve, 1.0) @ direction(after.curve, 0.0) > np.cos(KINK)
-            if not (after.free and smooth):
-                found.append(len(runs))
-                runs.append(Run(_fitted_open(line, SPACING * cell, FAIR), False))
-                line = np.empty((0, 2))
+        for one in _without_hooks(_lines(loop, chord), HOOK * cell, arm.boundary):
+            found.append(one if isinstance(one, Piece) else len(runs))
+            if isinstance(one, _Line):
+                points = _fitted_open(one.points, SPACING * cell, one.tangents, FAIR)
+                first, last = one.tangents
+                runs.append(Run(points, False, (first is None, last is None)))
         loops.append(tuple(found))
     tool = part.outline.tool_radius
     for ring in _free_rings(shape, tool, chord, len(fixed)):
@@ -603,6 +613,81 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
             break
         made = made.widened()
     return made
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A free run between pieces that stay: points, and directions at its ends but in corners."""
+
+    points: np.ndarray
+    tangents: Tangents
+
+
+def _lines(loop: tuple[Piece, ...], chord: float) -> list[Piece | _Line]:
+    """Return a loop's pieces that stay, and one line for all free ones between two of them."""
+    found: list[Piece | _Line] = []
+    first = next(k for k, piece in enumerate(loop) if not piece.free)
+    loop = (*loop[first:], *loop[:first])  # no line goes on beyond the last piece
+    line, tangent = np.empty((0, 2)), None
+    for piece, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+        a, b = direction(piece.curve, 1.0), direction(after.curve, 0.0)
+        smooth = a @ b > np.cos(KINK)
+        if not piece.free:
+            found.append(piece)
+            tangent = a if smooth else None
+            continue
+        own = piece.curve.at(piece.curve.parameters(chord))
+        line = np.vstack([line, own[1:]]) if len(line) else own
+        if not (after.free and smooth):
+            found.append(_Line(line, (tangent, b if smooth else None)))
+            line, tangent = np.empty((0, 2)), b if smooth else None
+    return found
+
+
+def _without_hooks(loop: list[Piece | _Line], size: float, edge: Geometry) -> list[Piece | _Line]:
+    """Return a loop whose lines come straight to corners on straight pieces, over a length, m."""
+    # Levels of a density turn towards the arm's own edge in the last cell; the corner moves there.
+    loop = list(loop)
+    for k, line in enumerate(loop):
+        for turned, near in ((False, k - 1), (True, (k + 1) % len(loop))):
+            beside = loop[near]
+            line = loop[k]
+            if not isinstance(line, _Line) or line.tangents[turned] is not None:
+                continue
+            if not isinstance(beside, Piece) or not isinstance(beside.curve, Line):
+                continue
+            points = line.points[::-1] if turned else line.points
+            if (straight := _straight(points, beside.curve, size, edge)) is None:
+                continue
+            loop[k] = replace(line, points=straight[::-1] if turned else straight)
+            ends = [beside.curve.start, beside.curve.end]
+            ends[0 if turned else 1] = straight[0]
+            loop[near] = replace(beside, curve=Line(*ends))
+    return loop
+
+
+def _straight(points: np.ndarray, side: Line, size: float, edge: Geometry) -> np.ndarray | None:
+    """Return points that come straight from where they cross a side; None if nowhere."""
+    # They begin on the side; over `size` (m) they become straight, and their beginning moves by at
+    # most twice as much, on the arm's own `edge`.
+    import shapely
+
+    s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    if s[-1] < 4.0 * size:
+        return None
+    near, far = (np.array([np.interp(at, s, c) for c in points.T]) for at in (size, 2.5 * size))
+    d, along = near - far, side.end - side.start
+    sine = d[0] * along[1] - d[1] * along[0]
+    if abs(sine) < np.sin(FLAT) * np.linalg.norm(d) * np.linalg.norm(along):
+        return None
+    gap = side.start - near
+    place = near + (gap[0] * along[1] - gap[1] * along[0]) / sine * d
+    share = (place - side.start) @ along / (along @ along)
+    moved = np.linalg.norm(place - points[0])
+    on_edge = shapely.distance(shapely.Point(place), edge) < 1e-3 * size
+    if moved > 2.0 * size or not on_edge or not -1.0 < share < 2.0 or d @ (place - near) <= 0.0:
+        return None
+    return np.vstack([place, near, points[s > size]])
 
 
 def _with_fillets(loop: tuple[Piece, ...]) -> tuple[Piece, ...]:
@@ -663,8 +748,14 @@ def fitted_closed(
     return np.linalg.solve(A, basis.T @ points / SAMPLES)
 
 
-def _fitted_open(line: np.ndarray, spacing: float, stiff: float = STIFF) -> np.ndarray:
+def _fitted_open(
+    line: np.ndarray,
+    spacing: float,
+    tangents: Tangents,
+    stiff: float = STIFF,
+) -> np.ndarray:
     """Return control points (n, 2) of a clamped spline along a line, its ends and directions."""
+    # `tangents`: directions at its ends, None where they are free.
     n = max(6, round(_length(line) / spacing) + DEGREE)
     knots = _curves_of(n, False)[0][0]
     points = _resampled(line, SAMPLES * n)
@@ -674,10 +765,12 @@ def _fitted_open(line: np.ndarray, spacing: float, stiff: float = STIFF) -> np.n
     right = basis.T @ points / SAMPLES
     found = np.empty((n, 2))
     step = _length(line) * knots[DEGREE + 1] / DEGREE
-    for end, ahead, row in ((0, 1, 1), (-1, -2, -2)):
-        along = points[ahead] - points[end]
-        found[end], found[row] = points[end], points[end] + step * along / np.linalg.norm(along)
-    held, inner = np.array([0, 1, n - 2, n - 1]), np.arange(2, n - 2)
+    for end, beside, along, sign in zip((0, -1), (1, -2), tangents, (1.0, -1.0), strict=True):
+        found[end] = points[end]
+        if along is not None:
+            found[beside] = points[end] + sign * step * along / np.linalg.norm(along)
+    inner = np.arange(1 + (tangents[0] is not None), n - 1 - (tangents[1] is not None))
+    held = np.setdiff1d(np.arange(n), inner)
     rest = right[inner] - A[np.ix_(inner, held)] @ found[held]
     found[inner] = np.linalg.solve(A[np.ix_(inner, inner)], rest)
     return found
@@ -702,7 +795,8 @@ def mirrored(runs: Sequence[Run]) -> tuple[list[Run], np.ndarray]:
             points = 0.5 * (run.points + (run.points * MIRROR)[turned])
             found[k] = replace(run, points=points)
         else:
-            found[twin] = replace(run, points=(run.points * MIRROR)[turned])
+            points = (run.points * MIRROR)[turned]
+            found[twin] = replace(run, points=points, corners=run.corners[::-1])
         done |= {k, twin}
         # A twin may have had two control points more or less.
         starts = np.cumsum([0, *(len(one.points) for one in found)])

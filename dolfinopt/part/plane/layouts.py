@@ -1,9 +1,9 @@
 """Other layouts of a part: trusses between its interfaces, and parts without one of their struts.
 
 The curves of a part move, but no hole comes or goes by that. A truss has flanges along the arm's
-own edges and struts to and fro between them, as much material as the part, and bays that are so
-many times as long as high. A strut is what lies between two holes that come close to each other:
-without it these two are one.
+own edges and struts to and fro between them, as much material as the part, or more where members
+may not be thinner, and bays that are so many times as long as high. A strut is what lies between
+two holes that come close to each other: without it these two are one.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ MOST = 0.5  # of a hole's area that may be added where two are joined
 
 
 def trusses_of(parts: Mapping[int, PlanePart], number: int) -> dict[int, PlanePart]:
-    """Return a truss in place of every part, with its interfaces and its area.
+    """Return a truss in place of every part, with its interfaces and its area, or more.
 
     Args:
         parts: of the densities, by their place in the chain.
@@ -78,7 +78,8 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     fillet = max(FILLET * domain.cell, drawn.tool_radius)
 
     def polygon(flange: float) -> Polygon:
-        holes = _windows(arm, stays, span, flange, slope, fewest, domain.symmetric)
+        widths = flange, max(STRUT * flange, domain.minimum_member)
+        holes = _windows(arm, stays, span, widths, slope, fewest, domain.symmetric)
         rounded = holes.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
         least = SMALLEST_HOLE * domain.cell**2
         kept = [one for one in polygons_of(rounded) if one.area > least]
@@ -88,13 +89,17 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
         return polygon(flange).area / drawn.area - 1.0
 
     thin, thick = max(domain.minimum_member, 0.5 * domain.cell), 0.45 * domain.height
-    if missing(thin) > 0.0 or missing(thick) < 0.0:
+    if missing(thick) < 0.0:
         raise ConvergenceError(f"arm {domain.name!r}: no room for a truss of the part's area")
-    flange = brentq(missing, thin, thick, xtol=AREA * domain.cell)
+    # The thinnest one weighs more than a part whose members are thinner than they should be.
+    excess, flange = missing(thin), thin
+    if excess <= 0.0:
+        flange = brentq(missing, thin, thick, xtol=AREA * domain.cell)
     found = replace(drawn, polygon=polygon(flange), islands=0, islands_area=0.0, filled=0)
+    area = domain.volume * (1.0 + max(excess, 0.0))
     for close in CLOSE:
         try:
-            shape = make_shape(found, max(part.tolerance, close * domain.cell))
+            shape = make_shape(found, max(part.tolerance, close * domain.cell), area=area)
             break
         except InputError as error:
             problem = ConvergenceError(str(error))
@@ -130,17 +135,18 @@ def _windows(
     arm: Geometry,
     stays: Geometry,
     span: tuple[float, float],
-    flange: float,
+    widths: tuple[float, float],
     slope: float,
     fewest: int,
     symmetric: bool,
 ) -> Geometry:
     """Return the holes of a truss with sharp corners."""
-    # Material may be in `arm` and must be in `stays`; a flange (m) runs along all edges, bores and
-    # ends included; bays go from one end of the span to the other; the slope is the length of a
-    # bay over its height.
+    # Material may be in `arm` and must be in `stays`; `widths` are those of flanges and struts, m;
+    # a flange runs along all edges, bores and ends included; bays go from one end of the span to
+    # the other; the slope is the length of a bay over its height.
     import shapely
 
+    flange, strut = widths
     inside = arm.buffer(-flange, join_style="mitre").difference(stays)
     parts = polygons_of(inside)
     if not parts:
@@ -157,7 +163,7 @@ def _windows(
     lines = [shapely.LineString([(x[k], ends[k][k % 2]) for k in range(bays + 1)])]
     if symmetric:
         lines.append(shapely.LineString([(x[k], ends[k][1 - k % 2]) for k in range(bays + 1)]))
-    struts = shapely.union_all(lines).buffer(0.5 * STRUT * flange, join_style="mitre")
+    struts = shapely.union_all(lines).buffer(0.5 * strut, join_style="mitre")
     return inside.difference(struts)
 
 

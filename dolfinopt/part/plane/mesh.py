@@ -25,7 +25,7 @@ from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, TRIANGLE, gmsh
 from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
 
 CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner
-FOLDED = 1e-3  # area of a triangle over the median's below which it counts as folded
+FOLDED = 1e-3  # shape of a triangle, 1 where it is equilateral, below which it counts as folded
 # Gauss points on [0, 1] and weights, exact for polynomials of degree nine.
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(5), (1.0, 0.0)))
 
@@ -94,9 +94,8 @@ class BodyMesh:
 
     @property
     def is_folded(self) -> bool:
-        """Whether a triangle is turned over, or next to nothing beside the others."""
-        areas = np.sort(triangle_areas(self.points, self.triangles))
-        return bool(areas[0] <= FOLDED * areas[len(areas) // 2])
+        """Whether a triangle is turned over, or as good as flat."""
+        return bool(self.quality.min() <= FOLDED)
 
     def labelled(self, label: str) -> np.ndarray:
         """Return which sides (k,) belong to pieces of a label."""

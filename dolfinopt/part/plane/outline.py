@@ -253,6 +253,7 @@ def _scattered(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 AREA = 1e-4  # relative: up to which the level is sought
+CLOSE = 1e-5  # the same of the polygon: curves that are few make up for what is missing
 LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leaves at one level
 CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
 STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
@@ -519,12 +520,14 @@ def _at_level(
     )
     slope = (rough(-place - step) - rough(-place + step)) / (2.0 * step)
     slope = max(slope, 0.1 / (high - low))
-    return search(lambda number: at(-number), _excess, place, slope, span, AREA)
+    return search(lambda number: at(-number), _excess, place, slope, span, CLOSE)
 
 
 def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline:
     """Return the outline at the level of `found`, moved so that it has the volume's area."""
     most = 2.0 * found.domain.cell
     slope = max(float(found.polygon.length), found.domain.length) / found.domain.volume
-    moved = search(lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), AREA)
+    moved = search(
+        lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), CLOSE
+    )
     return min(found, moved, key=_off)

@@ -1,7 +1,8 @@
 """An outline in straight lines and arcs: flanges and struts as one would draw them.
 
-Free runs of the outline become lines within a distance of it, the lines on both sides of a strut
-parallel, those of a flange parallel to the arm's own edge, and all corners between them fillets.
+Free runs of the outline become as few lines as stay, with a fillet at every corner, within a
+distance of it; the lines on both sides of a strut become parallel, those of a flange parallel to
+the arm's own edge.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, direction
+from dolfinopt.part.plane.curves import KINK, Arc, Line, Piece, Shape, direction
+from dolfinopt.part.plane.domain import Edge
+from dolfinopt.part.plane.gauge import polygon_of
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.trace import (
     AXIS,
+    FILLET,
     Run,
     common,
     crosses,
@@ -29,13 +34,18 @@ from dolfinopt.part.plane.trace import (
 )
 
 SPACING = 0.2  # of points along the outline, cells
-ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 0.1)  # shares of the distance, one attempt after the other
+SHARES = (0.9, 0.6, 0.4, 0.25, 0.15, 0.08)  # of the distance, one attempt after the other
+LEVELS = (1.0, 0.5, 0.2, 0.08)  # shares of the distance for lines to choose from
+SPREAD = np.linspace(0.0, 1.0, 10)[:, None]  # of a fillet's radii to choose from, logarithmic
+GROWN = 1.1  # radius of a fillet that may be needed where sides move, over its least
+GAP = 8.0  # between lines that follow each other, cells
+CURVED = 0.02  # price of a corner that is the whole distance off, in corners
+PARALLEL = 0.3  # of the distance, by which sides turn to be parallel
 STEPS, SAME_AREA = 8, 1e-7  # of the area's correction; relative
 FACING = 6.0  # width of struts and flanges whose sides become parallel, cells
 OVERLAP = 0.5  # of two sides beside each other, shares of the shorter one
 SHARPEST = np.radians(150.0)  # turn of a corner
 NO_TURN = np.radians(0.05)  # turn that needs no fillet
-BEND = np.radians(1.0)  # turn of lines whose corner is where they cross
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +55,8 @@ class _Side:
     point: np.ndarray  # (2,) on a free line, m
     along: np.ndarray  # (2,) its unit direction
     ends: np.ndarray  # (2, 2) about where it begins and ends, m
-    run: Run | None = None  # on a curve of the arm; None of free lines
+    run: Run | None = None  # on a curve of the arm, or a circle; None of free lines
+    radii: tuple[float, float] | None = None  # of the fillet at its start: least, best, m
 
     @property
     def length(self) -> float:
@@ -99,44 +110,112 @@ def simple_shape(outline: Outline, distance: float, area: float) -> Shape | None
 
     Args:
         outline: whose polygon they follow.
-        distance: of the sides from it, about, m.
+        distance: of the curves from it, at most, m.
         area: to be enclosed, m2.
     """
+    plain = replace(outline, centres=outline.centres[:0])  # the tool's arcs come anew
+    rings = [_merged(ring, 2.0 * distance) for ring in trace(plain, outline.tolerance)]
+    places = [(i, k) for i, ring in enumerate(rings) for k, run in enumerate(ring) if not run.edge]
+    if not places:
+        return None
+    runs = [rings[i][k].points for i, k in places]
+    tree, owner = cKDTree(np.vstack(runs)), np.repeat(np.arange(len(runs)), [*map(len, runs)])
+    attempt = np.zeros(len(places), dtype=int)
+    sides: dict[tuple[int, int], list[_Side]] = {}
+    stays: dict[tuple[int, int], bool] = {}
+    changed = np.arange(len(places))
+    while len(changed):
+        for n in changed:  # a free run that failed follows the outline more closely
+            i, k = places[n]
+            sides[i, k] = []
+            while not sides[i, k]:
+                if attempt[n] == 2 * len(SHARES):
+                    return None
+                share = SHARES[attempt[n] // 2]
+                sides[i, k] = _free_sides(rings[i], k, share * distance, outline)
+                stays[i, k] = attempt[n] % 2 == 1
+                attempt[n] += 1
+        chains = [
+            [side for k, run in enumerate(ring) for side in sides.get((i, k)) or [_own(run)]]
+            for i, ring in enumerate(rings)
+        ]
+        turns = {id(side) for key, some in sides.items() if not stays[key] for side in some}
+        chains = _parallel(chains, PARALLEL * distance, FACING * outline.domain.cell, turns)
+        shape = _with_area(chains, outline, area)
+        if shape is None:
+            return None
+        faults = _faults(shape, outline, distance)
+        near = tree.query_ball_point(faults, distance) if len(faults) else []
+        nearest = tree.query(faults)[1] if len(faults) else []
+        at_fault = [owner[[one, *some]] for one, some in zip(nearest, near, strict=True)]
+        changed = np.unique(np.concatenate(at_fault)) if at_fault else []
+    exact = abs(shape.area - area) <= SAME_AREA * area
+    boundary: Any = polygon_of(shape, 0.05 * outline.tolerance).boundary
+    apart = float(boundary.hausdorff_distance(outline.polygon.boundary))
+    return replace(shape, apart=apart) if exact else None
+
+
+def _merged(ring: Sequence[Run], speck: float) -> list[Run]:
+    """Return the runs of a ring; free ones in a row, with specks of edges, are one."""
+
+    def is_free(k: int) -> bool:
+        run, beside = ring[k].edge, (ring[k - 1].edge, ring[(k + 1) % len(ring)].edge)
+        size = np.linalg.norm(ring[k].points[-1] - ring[k].points[0])
+        return run is None or (
+            run.label == "" and None in beside and len(ring) > 3 and bool(size < speck)
+        )
+
+    free = [is_free(k) for k in range(len(ring))]
+    first = next((k for k in range(len(ring)) if not free[k]), 0)
+    found: list[Run] = []
+    for k in (*range(first, len(ring)), *range(first)):
+        if free[k] and found and found[-1].edge is None:
+            points = np.vstack([found[-1].points, ring[k].points[1:]])
+            found[-1] = Run(points, None)
+        else:
+            found.append(Run(ring[k].points, None) if free[k] else ring[k])
+    return found
+
+
+def _faults(shape: Shape, outline: Outline, distance: float) -> np.ndarray:
+    """Return places (n, 2) where a shape crosses itself, leaves the outline, or is too sharp, m."""
     import shapely
 
-    tolerance = outline.tolerance
-    plain = replace(outline, centres=outline.centres[:0])  # the tool's arcs come anew
-    rings = trace(plain, tolerance)
-    best: tuple[float, Shape] | None = None
-    for share in ATTEMPTS:
-        chains = [_sides(ring, share * distance, outline) for ring in rings]
-        chains = _parallel(chains, share * distance, FACING * outline.domain.cell)
-        chains = [_crossed(chain, outline.rounding) for chain in chains]
+    loops = [np.vstack([loop, loop[:1]]) for loop in shape.polygons(0.05 * outline.tolerance)]
+    mine, there = shapely.MultiLineString(loops), outline.polygon.boundary
+    corners = shapely.get_coordinates(mine)
+    nodes = shapely.get_coordinates(shapely.union_all(mine))
+    crossings = nodes[cKDTree(corners).query(nodes)[0] > 1e-3 * outline.chord]
+    found = [
+        crossings,
+        corners[shapely.distance(shapely.points(corners), there) > distance],
+        (own := shapely.get_coordinates(there))[
+            shapely.distance(shapely.points(own), mine) > distance
+        ],
+    ]
+    for loop in shape.loops:
+        for before, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+            a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
+            arc = after.curve if isinstance(after.curve, Arc) and after.free else None
+            free = before.free or after.free
+            if (free and _cross(a, b) < -np.sin(KINK)) or (
+                arc is not None and arc.sweep < 0.0 and arc.radius < outline.tool_radius
+            ):
+                found.append(after.curve.start[None])
+    places = np.vstack(found)
+    return (
+        np.column_stack([places[:, 0], np.abs(places[:, 1])])
+        if outline.domain.symmetric
+        else places
+    )
 
-        def at(offset: float, chains: Any = chains, share: float = share) -> Shape | None:
-            return _built(chains, offset, share * distance, outline)
 
-        shape = _with_area(at, area)
-        if shape is None or abs(shape.area - area) > SAME_AREA * area:
-            continue
-        if not shape.is_simple(0.05 * tolerance):
-            continue
-        outer, *holes = shape.polygons(0.05 * tolerance)
-        found = shapely.Polygon(outer, holes).boundary
-        shape = replace(shape, apart=float(found.hausdorff_distance(outline.polygon.boundary)))
-        if shape.concave_radius >= outline.tool_radius:
-            return shape
-        if best is None or shape.concave_radius > best[0]:
-            best = shape.concave_radius, shape
-    return None if best is None else best[1]
-
-
-def _with_area(at: Any, area: float) -> Shape | None:
+def _with_area(chains: Sequence[Sequence[_Side]], outline: Outline, area: float) -> Shape | None:
     """Return the shape whose offset encloses an area, by secants."""
     offset, excess, slope = 0.0, 0.0, 0.0
     shape: Shape | None = None
     for step in range(STEPS):
-        shape = at(offset)
+        shape = _built(chains, offset, outline)
         if shape is None:
             return None
         before, excess = excess, shape.area - area
@@ -153,47 +232,122 @@ def _with_area(at: Any, area: float) -> Shape | None:
     return shape
 
 
-def _sides(ring: Sequence[Run], distance: float, outline: Outline) -> list[_Side]:
-    """Return the sides of a ring of runs, free ones straight within a distance, m."""
-    found: list[_Side] = []
-    for k, run in enumerate(ring):
-        ends = run.points[[0, -1]]
-        beside = ring[k - 1].edge, ring[(k + 1) % len(ring)].edge
-        speck = (
-            len(ring) > 3 and None in beside and np.linalg.norm(ends[1] - ends[0]) < 2 * distance
-        )
-        if run.edge is not None and run.edge.label == "" and speck:
-            continue
-        if run.edge is not None:
-            step = ends[1] - ends[0]
-            size = np.linalg.norm(step)
-            d = step / size if size > 0.0 else np.array([1.0, 0.0])
-            if isinstance(run.edge.curve, Line):  # exactly its own
-                own = direction(run.edge.curve, 0.0)
-                d = own if own @ d > 0.0 else -own
-                found.append(_Side(run.edge.curve.start, d, ends, run))
-            else:
-                found.append(_Side(ends[0], d, ends, run))
-            continue
-        spacing = SPACING * outline.domain.cell
-        points = resampled(run.points, spacing)
-        if len(ring) == 1:
-            breaks = _straight(points, distance)
-            long = int(np.argmax(np.diff(breaks)))
-            points = np.vstack([points[breaks[long] : -1], points[: breaks[long] + 1]])
-        breaks = _straight(points, distance)
-        lines = [_line(points[a : b + 1]) for a, b in pairwise(breaks)]
-        for end, other in zip((0, -1), beside, strict=True):
-            if other is not None and other.label == AXIS:  # at a right angle
-                up = np.array([0.0, 1.0 if end == 0 else -1.0])
-                upright = _Side(points[end], up, points[[end, end]])
-                near = lines[0 if end == 0 else -1].along
-                if np.arccos(np.clip(near @ up, -1.0, 1.0)) > np.radians(10.0):
-                    lines.insert(0 if end == 0 else len(lines), upright)
-                else:
-                    lines[end] = replace(lines[end], along=up)
-        found += lines
+def _own(run: Run) -> _Side:
+    """Return the side along a curve of the arm."""
+    ends = run.points[[0, -1]]
+    step = ends[1] - ends[0]
+    size = np.linalg.norm(step)
+    d = step / size if size > 0.0 else np.array([1.0, 0.0])
+    if run.edge is None or not isinstance(run.edge.curve, Line):
+        return _Side(ends[0], d, ends, run)
+    own = direction(run.edge.curve, 0.0)  # exactly
+    return _Side(run.edge.curve.start, own if own @ d > 0.0 else -own, ends, run)
+
+
+# -- free runs: as few lines as stay within a distance -------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """A line along some points of a run, which it is known to be near to."""
+
+    side: _Side
+    first: int
+    last: int
+    begin: float = -np.inf  # positions between which fillets may be, m
+    end: float = np.inf
+
+    def position(self, place: np.ndarray) -> float:
+        """Return how far along the line a place is, m."""
+        return float((place - self.side.point) @ self.side.along)
+
+    @property
+    def middle(self) -> int:
+        """Number of a point about its middle."""
+        return (self.first + self.last) // 2
+
+
+def _free_sides(ring: Sequence[Run], k: int, distance: float, outline: Outline) -> list[_Side]:
+    """Return the fewest lines within a distance, m, of a free run; none where there are none."""
+    least = outline.rounding
+    points = resampled(ring[k].points, SPACING * outline.domain.cell)
+    if len(ring) == 1:
+        if (circle := _circle(points, distance, least)) is not None:
+            return [circle]
+        longest = max(_stretches(points, distance), key=lambda one: one.side.length)
+        points = np.vstack([points[longest.middle : -1], points[: longest.middle + 1]])
+        n, half = len(points) - 1, longest.last - longest.middle
+        cut = longest.position(points[0])
+        first = [replace(longest, first=-half, last=half, begin=cut)]
+        last = [replace(longest, first=n - half, last=n + half, end=cut)]
+        return [one.side for one in _fewest(points, first, last, distance, least)][1:]
+    stretches = _stretches(points, distance)
+    before, after = ring[k - 1], ring[(k + 1) % len(ring)]
+    first = [one for one in stretches if one.first == 0]
+    last = [one for one in stretches if one.last == len(points) - 1]
+    if before.edge is not None and before.edge.label == AXIS:  # at a right angle
+        first = _upright(points, False, distance)
+    else:
+        taken = [_taken(_own(before), one.side, points[0], least) for one in first]
+        first = [
+            replace(one, begin=one.position(points[0]) + take)
+            for one, take in zip(first, taken, strict=True)
+        ]
+    if after.edge is not None and after.edge.label == AXIS:
+        last = _upright(points, True, distance)
+    else:
+        taken = [_taken(one.side, _own(after), points[-1], least) for one in last]
+        last = [
+            replace(one, end=one.position(points[-1]) - take)
+            for one, take in zip(last, taken, strict=True)
+        ]
+    return [one.side for one in _fewest(points, first, last, distance, least)]
+
+
+def _upright(points: np.ndarray, at_end: bool, distance: float) -> list[_Stretch]:
+    """Return upright lines at the end of a run on the axis of symmetry."""
+    x = points[::-1, 0] if at_end else points[:, 0]
+    width = np.maximum.accumulate(x) - np.minimum.accumulate(x)
+    up = np.array([0.0, -1.0 if at_end else 1.0])
+    found = []
+    for level in LEVELS:
+        reach = int(np.searchsorted(width, 2.0 * level * distance)) - 1
+        near = x[: reach + 1]
+        place = np.array([0.5 * (near.min() + near.max()), 0.0])
+        n = len(points) - 1
+        first, last = (n - reach, n + reach) if at_end else (-reach, reach)
+        far = points[n - reach if at_end else reach]
+        tip = np.array([place[0], far[1]])
+        ends = np.array([tip, place] if at_end else [place, tip])
+        side = _Side(place, up, ends)
+        found.append(_Stretch(side, first, last, *((-np.inf, 0.0) if at_end else (0.0, np.inf))))
     return found
+
+
+def _circle(points: np.ndarray, distance: float, least: float) -> _Side | None:
+    """Return the circle within a distance of a closed run, m; None where there is none."""
+    x, y = points[:-1].T
+    answer = np.linalg.lstsq(np.column_stack([x, y, np.ones_like(x)]), x * x + y * y, rcond=None)[0]
+    centre = 0.5 * answer[:2]
+    away = np.linalg.norm(points - centre, axis=1)
+    radius = 0.5 * float(away.min() + away.max())
+    if radius < least or np.ptp(away) > 2.0 * distance:
+        return None
+    edge = Edge(Arc(centre, radius, 0.0, 2.0 * np.pi), FILLET)
+    return _Side(points[0], np.array([1.0, 0.0]), points[[0, -1]], Run(points, edge))
+
+
+def _stretches(points: np.ndarray, distance: float) -> list[_Stretch]:
+    """Return lines within shares of a distance, m, of points (n, 2) that go as far as they can."""
+    found: dict[tuple[int, int], _Stretch] = {}
+    n = len(points) - 1
+    for level in LEVELS:
+        ahead = _straight(points, level * distance)
+        back = [n - k for k in reversed(_straight(points[::-1], level * distance))]
+        for breaks in (ahead, back):
+            for a, b in pairwise(breaks):
+                found.setdefault((a, b), _Stretch(_line(points[a : b + 1]), a, b))
+    return sorted(found.values(), key=lambda one: one.middle)
 
 
 def _straight(points: np.ndarray, distance: float) -> list[int]:
@@ -234,11 +388,116 @@ def _bend(points: np.ndarray) -> float:
     return float(np.abs(_cross(points - side.point, side.along)).max())
 
 
-def _parallel(chains: list[list[_Side]], distance: float, width: float) -> list[list[_Side]]:
+def _fewest(
+    points: np.ndarray,
+    first: Sequence[_Stretch],
+    last: Sequence[_Stretch],
+    distance: float,
+    least: float,
+) -> list[_Stretch]:
+    """Return the fewest lines, with fillets, along points from one of `first` to one of `last`."""
+    # The shortest path over pairs of lines that follow each other: their fillet is near the points
+    # between their middles, and begins on either line where the one before has ended.
+    if through := [one for one in first if one.last >= len(points) - 1]:
+        return through[:1]
+    most = GAP / SPACING
+    known = {(one.first, one.last) for one in (*first, *last)}
+    between = [s for s in _stretches(points, distance) if (s.first, s.last) not in known]
+    lines = sorted([*first, *between, *last], key=lambda one: one.middle)
+    reached: dict[int, list[_Path]] = {id(a): [_Path(0.0, a.begin, (a,))] for a in first}
+    for k, a in enumerate(lines):
+        paths = _better(reached.get(id(a), []))
+        for b in lines[k + 1 :] if paths else ():
+            if a.first < b.first and a.last < b.last and b.first - a.last < most:
+                near = points[max(a.middle, 0) : b.middle + 1]
+                if (fillets := _fillets(a.side, b.side, near, distance, least)) is not None:
+                    found = [ahead for path in paths for ahead in _ahead(path, a, b, fillets)]
+                    reached.setdefault(id(b), []).extend(found)
+    ends = [path for one in last for path in reached.get(id(one), ()) if path.place <= one.end]
+    return list(min(ends, key=lambda path: path.price).lines) if ends else []
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """Lines one after the other, and how far the last is taken by the fillet at its beginning."""
+
+    price: float  # the fewer curves, the better; then the closer
+    place: float  # m
+    lines: tuple[_Stretch, ...]
+
+
+def _better(paths: list[_Path]) -> list[_Path]:
+    """Return the paths of which no other one is cheaper and takes less."""
+    found: list[_Path] = []
+    for path in sorted(paths, key=lambda path: (path.price, path.place)):
+        if not found or path.place < found[-1].place - 1e-12:
+            found.append(path)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Fillets:
+    """Arcs between two lines along points."""
+
+    corner: np.ndarray  # (2,) m
+    tangent: float  # of half the turn
+    radii: np.ndarray  # (n,) m, increasing
+    off: np.ndarray  # (n,) largest distance from the points, over the one that is allowed
+
+
+def _ahead(path: _Path, a: _Stretch, b: _Stretch, fillets: _Fillets) -> list[_Path]:
+    """Return what becomes of a path that goes on from a line to the next one."""
+    room = a.position(fillets.corner) - path.place
+    radii, off = fillets.radii, fillets.off
+    fits = np.flatnonzero(off <= 1.0)
+    best = float(radii[np.argmin(off)])
+    chosen = [(float(radii[fits[0]]), best, 2.0), (best, best, 2.0)]
+    touching = room / fillets.tangent  # no line is left between two arcs
+    k = int(np.searchsorted(radii, touching))
+    on_axis = a.begin == 0.0
+    if (len(path.lines) > 1 or on_axis) and 0 < k < len(radii) and off[k - 1 : k + 1].max() <= 1.0:
+        chosen.append((touching, touching, 1.0))
+    found = []
+    for radius, wanted, curves in chosen:
+        reach = radius * fillets.tangent
+        if reach <= room * (1.0 + 1e-12):
+            price = path.price + curves + CURVED * np.interp(wanted, radii, off) ** 2
+            side = replace(b.side, radii=(radius, max(wanted, GROWN * radius)))
+            lines = (*path.lines, replace(b, side=side))
+            found.append(_Path(float(price), b.position(fillets.corner) + reach, lines))
+    return found
+
+
+def _fillets(
+    a: _Side, b: _Side, points: np.ndarray, distance: float, least: float
+) -> _Fillets | None:
+    """Return fillets with which two lines stay within a distance of points; None without one."""
+    turn = float(np.arctan2(_cross(a.along, b.along), a.along @ b.along))
+    if not NO_TURN < abs(turn) < SHARPEST:
+        return None
+    corner = a.point + _cross(b.point - a.point, b.along) / np.sin(turn) * a.along
+    tangent = float(np.tan(0.5 * abs(turn)))
+    along_a, along_b = (points - corner) @ a.along, (points - corner) @ b.along
+    most = min(-along_a[0], along_b[-1]) / tangent
+    if most <= (low := least if turn < 0.0 else 0.1 * most):
+        return None
+    radii = low * (most / low) ** SPREAD
+    centre = corner - radii * (tangent * a.along + np.sign(turn) * _right(a.along))
+    off = np.abs(np.hypot(*(points.T[:, None] - centre.T[:, :, None])) - radii)
+    off_a, off_b = (np.abs(_cross(points - corner, one.along)) for one in (a, b))
+    off = np.where(along_a <= -radii * tangent, off_a, off)
+    worst = np.where(along_b >= radii * tangent, off_b, off).max(axis=1) / distance
+    return _Fillets(corner, tangent, radii[:, 0], worst) if worst.min() <= 1.0 else None
+
+
+def _parallel(
+    chains: list[list[_Side]], distance: float, width: float, turns: set[int]
+) -> list[list[_Side]]:
     """Return the sides with those parallel that face each other over material and nearly are."""
     places = [(i, k) for i, chain in enumerate(chains) for k in range(len(chain))]
     sides = [chains[i][k] for i, k in places]
-    free = [n for n, one in enumerate(sides) if one.run is None and one.length > 0.0]
+    # Those whose ids are not in `turns` stay, as those of the arm's own curves.
+    free = [n for n, one in enumerate(sides) if id(one) in turns and one.length > 0.0]
     found = [list(chain) for chain in chains]
     done: set[int] = set()
     for n in sorted(free, key=lambda n: -sides[n].length):
@@ -257,9 +516,9 @@ def _parallel(chains: list[list[_Side]], distance: float, width: float) -> list[
         other = sides[best[1]]
         # Of two free ones the mean, the longer counting more; the arm's own stays.
         d = one.length * one.along - other.length * other.along
-        d = -other.along if other.run is not None else d / np.linalg.norm(d)
+        d = -other.along if best[1] not in free else d / np.linalg.norm(d)
         for number, along_ in ((n, d), (best[1], -d)):
-            if sides[number].run is None:
+            if number in free:
                 i, k = places[number]
                 found[i][k] = replace(sides[number], along=along_)
                 done.add(number)
@@ -280,13 +539,11 @@ def _facing(one: _Side, other: _Side, distance: float) -> float | None:
     return gap if gap > 0.0 else None
 
 
-def _built(
-    chains: Sequence[Sequence[_Side]], offset: float, distance: float, outline: Outline
-) -> Shape | None:
+def _built(chains: Sequence[Sequence[_Side]], offset: float, outline: Outline) -> Shape | None:
     """Return the shape of the sides, free ones moved outwards; None where they do not close."""
     loops: list[list[Piece]] = []
     for chain in chains:
-        pieces = _loop([side.moved(offset) for side in chain], distance, outline)
+        pieces = _loop([side.moved(offset) for side in chain], outline)
         if pieces is None:
             return None
         if outline.domain.symmetric:
@@ -310,22 +567,34 @@ class _Corner:
     fillet: Arc | None
 
 
-def _loop(sides: list[_Side], distance: float, outline: Outline) -> list[Piece] | None:
+def _loop(sides: list[_Side], outline: Outline) -> list[Piece] | None:
     """Return the pieces around a ring: the sides and the fillets between them."""
     if len(sides) == 1:
         run = sides[0].run
         if run is None or run.edge is None:
             return None
-        return [Piece(piece_along(run, run.points[0], run.points[-1]), run.edge.label)]
+        free = run.edge.label == FILLET
+        curve = piece_along(run, run.points[0], run.points[-1])
+        return [Piece(curve, "" if free else run.edge.label, free)]
     n = len(sides)
     points = [_crossing(sides[k - 1], sides[k], NO_TURN) for k in range(n)]
     if n < 3 and all(side.run is None for side in sides):
         return None
+    radii = [side.radii or (outline.rounding, outline.rounding) for side in sides]
+    turns = [_turn(sides[k - 1], sides[k], points[k]) for k in range(n)]
+    need = [
+        0.0 if turn > 0.0 and side.radii is None else r[0] * np.tan(min(0.5 * abs(turn), 1.5))
+        for side, r, turn in zip(sides, radii, turns, strict=True)
+    ]
     corners = []
-    size = [np.linalg.norm(points[(k + 1) % n] - points[k]) for k in range(n)]
-    for k in range(n):  # between the side before and this one
-        room = [_room(sides, size, points, j, outline.rounding) for j in (k - 1, k)]
-        corners.append(_corner(sides[k - 1], sides[k], points[k], room, distance, outline.rounding))
+    for k in range(n):  # what both fillets of a side do not need they share
+        reach = np.inf
+        for j in (k - 1, k):
+            both = need[j] + need[(j + 1) % n]
+            size = float(np.linalg.norm(points[(j + 1) % n] - points[j]))
+            share = need[k] + 0.5 * (size - both) if size >= both else need[k] * size / both
+            reach = min(reach, share)
+        corners.append(_corner(sides[k - 1], sides[k], points[k], reach, radii[k]))
     found = []
     for k, side in enumerate(sides):
         first, last = corners[k], corners[(k + 1) % n]
@@ -339,39 +608,6 @@ def _loop(sides: list[_Side], distance: float, outline: Outline) -> list[Piece] 
     return found
 
 
-def _crossed(sides: list[_Side], least: float) -> list[_Side]:
-    """Return sides each of which meets the next one, without those that are too short."""
-    # Between two concave corners a side must be long enough for two fillets of the least radius.
-    sides = list(sides)
-    while True:
-        n = len(sides)
-        points = [_crossing(sides[k - 1], sides[k], BEND) for k in range(n)]
-        turns = [_turn(sides[k - 1], sides[k], points[k]) for k in range(n)]
-        worst, lacks = -1, 1e-9
-        for k, side in enumerate(sides):
-            if side.run is not None or n < 4:
-                continue
-            a, b = turns[k], turns[(k + 1) % n]
-            reach = float((points[(k + 1) % n] - points[k]) @ side.along)
-            after, end = sides[(k + 1) % n], points[(k + 1) % n]
-            need = _taken(sides[k - 1], side, points[k], least)
-            need += _taken(side, after, end, least)
-            round_ = sides[k - 1].arc is not None or after.arc is not None
-            both = BEND < abs(a + b) < SHARPEST and a * b > 0.0
-            if (both or round_ or reach <= 0.0 or _beside_axis(sides, k)) and need - reach > lacks:
-                worst, lacks = k, need - reach
-        if worst < 0:
-            return _through(sides, points)
-        if (other := _beside_axis(sides, worst)) is None:
-            del sides[worst]
-            continue
-        # The arc's centre lies on the axis.
-        need = 1.001 * least * np.tan(0.5 * max(abs(turns[worst]), abs(turns[(worst + 1) % n])))
-        step = (need - other.point[1]) / other.along[1]
-        place = other.point + step * other.along
-        sides[worst] = replace(sides[worst], point=place)
-
-
 def _taken(before: _Side, after: _Side, point: np.ndarray, least: float) -> float:
     """Return the length of a free line that the least fillet at its corner takes, m."""
     turn = _turn(before, after, point)
@@ -382,28 +618,6 @@ def _taken(before: _Side, after: _Side, point: np.ndarray, least: float) -> floa
     found = _round_corner(before, after, point, least)
     place = found.end if after.arc is not None else found.start
     return float(np.linalg.norm(place - point))
-
-
-def _through(sides: list[_Side], points: list[np.ndarray]) -> list[_Side]:
-    """Return the sides, free ones through the points at which they begin and end."""
-    found = []
-    for k, side in enumerate(sides):
-        step = points[(k + 1) % len(sides)] - points[k]
-        size = np.linalg.norm(step)
-        if side.run is None and side.along[0] != 0.0 and size > 0.0:
-            side = replace(side, point=points[k], along=step / size)
-        found.append(side)
-    return found
-
-
-def _beside_axis(sides: list[_Side], k: int) -> _Side | None:
-    """Return the free line between which and the axis an upright one is, None of other ones."""
-    ends = sides[k - 1], sides[(k + 1) % len(sides)]
-    for one, other in (ends, ends[::-1]):
-        on_axis = one.run is not None and one.run.edge is not None and one.run.edge.label == AXIS
-        if on_axis and sides[k].along[0] == 0.0 and other.run is None and other.along[1] != 0.0:
-            return other
-    return None
 
 
 def _turn(before: _Side, after: _Side, point: np.ndarray) -> float:
@@ -441,30 +655,10 @@ def _on_circle(
     return min(both, key=lambda one: float(np.linalg.norm(one - place)))
 
 
-def _room(
-    sides: list[_Side], size: list[Any], points: list[np.ndarray], k: int, least: float
-) -> tuple[float, float]:
-    """Return the length of a side, and what a least fillet at either end takes of it, summed."""
-    n = len(sides)
-    k %= n
-    take = 0.0
-    for j in (k, (k + 1) % n):
-        turn = _turn(sides[j - 1], sides[j], points[j])
-        take += least * np.tan(-0.5 * turn) if -SHARPEST < turn < 0.0 else 0.0
-    return float(size[k]), take
-
-
 def _corner(
-    before: _Side,
-    after: _Side,
-    point: np.ndarray,
-    room: list[tuple[float, float]],
-    distance: float,
-    least: float,
+    before: _Side, after: _Side, point: np.ndarray, reach: float, radii: tuple[float, float]
 ) -> _Corner:
-    """Return the corner of two sides: a fillet as large as there is room for."""
-    # They meet at `point`; `room` is `_room` of both. The fillet is at most `distance` away from
-    # the point if it is larger than the least; concave ones have at least the radius `least` (m).
+    """Return the corner of two sides at a point: a fillet that takes at most `reach` of them."""
     turn = _turn(before, after, point)
     if (before.run is not None and after.run is not None) or abs(turn) < NO_TURN:
         return _Corner(point, point, None)
@@ -472,16 +666,9 @@ def _corner(
     if own and turn > 0.0:  # the arm's own edge ends there
         return _Corner(point, point, None)
     if before.arc is not None or after.arc is not None:
-        return _round_corner(before, after, point, least)
+        return _round_corner(before, after, point, radii[0])
     tangent = np.tan(0.5 * abs(turn))
-    own_need = least * tangent if turn < 0.0 else 0.0
-    # What both fillets of a side do not need they share.
-    reach = min(
-        own_need + 0.5 * (length - need) if length >= need else own_need * length / need
-        for length, need in room
-    )
-    radius = distance / (1.0 / np.cos(0.5 * turn) - 1.0)
-    radius = min(reach / tangent, max(radius, least) if turn < 0.0 else radius)
+    radius = min(reach / tangent, radii[1])
     if radius <= 0.0:
         return _Corner(point, point, None)
     side = 1.0 if turn > 0.0 else -1.0

@@ -216,10 +216,8 @@ def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarr
 
 
 def _corners(points: np.ndarray, on: np.ndarray, reach: float, apart: float) -> np.ndarray:
-    """Return (n,) True where a free polygon has a corner: it turns by `CORNER` within 2 `reach`.
-
-    None is nearer than `apart` to where it comes to another curve.
-    """
+    """Return (n,) True where a free polygon has a corner: it turns by `CORNER` within 2 `reach`."""
+    # None is nearer than `apart` to where it comes to another curve.
     step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     total = step.sum()
     here = np.cumsum(step) - step
@@ -562,6 +560,7 @@ def with_area(
     )
     if length == 0.0:
         return change(shape)
+    shape = Shape(tuple(tuple(map(_bendable, loop)) for loop in shape.loops))
     offset, slope = 0.0, length  # curves with ends that stay gain less than that
     moved = change(shape)
     for _ in range(STEPS):
@@ -574,6 +573,15 @@ def with_area(
         gained = (missing - (area - moved.area)) / step
         slope = gained if gained > 0.1 * slope else slope
     return replace(moved, offset=offset)
+
+
+def _bendable(piece: Piece) -> Piece:
+    """Return a piece with control points that can move, where its ends would hold them all."""
+    curve, held = piece.curve, 2 * sum(piece.fixed)
+    if not (piece.free and isinstance(curve, Spline) and held >= len(curve.points)):
+        return piece
+    more = np.union1d(curve.breaks, np.linspace(0.0, 1.0, held + 1))
+    return replace(piece, curve=curve.over(more))
 
 
 def _offset(shape: Shape, distance: float) -> Shape:
@@ -617,13 +625,16 @@ ENOUGH = 0.98  # share of the tool's radius for which no other attempt is made
 ARCS = 0.25  # share of the tolerance for arcs in place of splines
 
 
-def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
+def make_shape(
+    outline: Outline, tolerance: float, arcs: bool = False, area: float | None = None
+) -> Shape:
     """Return the curves of an outline.
 
     Args:
         outline: whose polygon they follow.
         tolerance: largest distance of the free curves from it, m.
         arcs: lines and arcs in place of splines.
+        area: to be enclosed, m2; None: that of the design.
 
     Raises:
         InputError: curves on both sides of a neck meet.
@@ -635,7 +646,8 @@ def make_shape(outline: Outline, tolerance: float, arcs: bool = False) -> Shape:
     best: Shape | None = None
     for share, finer in ATTEMPTS:
         finest = share * tolerance * (1.0 - ARCS if arcs else 1.0)
-        shape = with_area(_follow(outline, finest, finer), outline.domain.volume, change)
+        wanted = outline.domain.volume if area is None else area
+        shape = with_area(_follow(outline, finest, finer), wanted, change)
         if shape.distance > tolerance or not shape.is_simple(0.1 * share * tolerance):
             continue
         if shape.concave_radius >= ENOUGH * outline.tool_radius:

@@ -20,6 +20,23 @@ from dolfinopt.scene.tables.interfaces import (
     check_interfaces,
     in_frame,
 )
+from dolfinopt.scene.tables.joint_parts import (
+    FRICTION_SPEED,
+    PART_KEYS,
+    BearingDamping,
+    BearingStiffness,
+    Friction,
+    FrictionSpeed,
+    GearDamping,
+    GearRatio,
+    GearStiffness,
+    JointDamping,
+    JointStiffness,
+    RotorInertia,
+    check_parts,
+    check_plane_bearing,
+    check_springs,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -120,7 +137,8 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 SectionName = Literal["box", "tube"]
 WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
-WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall")
+WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall", "ribs")
+RIB_LENGTH, RIB_PITCH = 2, 4  # cells along a hollow arm: of a rib; from one to the next at least
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
 ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
@@ -133,8 +151,10 @@ MESH_FILES = (".geo", ".msh", ".inp", *STEP_FILES)
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = (
     "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
-    "joint_damping",
+    "joint_damping", *PART_KEYS,
 )  # fmt: skip
+SPRING_KEYS = "joint_stiffness", "joint_damping"  # the same spring by either pair of keys
+GEAR_KEYS = "gear_stiffness", "gear_damping"
 SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
 BORE_KEYS = ("mesh_scale", "inboard_bore", "outboard_bore")
@@ -257,6 +277,12 @@ class Arm(Table):
         description="largest thickness of the wall, also that of the flanges, rings over passive "
         "at both ends; default: twice wall [m]",
     )
+    ribs: int | None = Field(
+        default=None,
+        ge=0,
+        description="rings of a hollow arm at even distances between its ends, two cells long and "
+        "as thick as max_wall; default: none [-]",
+    )
     design: str | None = Field(
         default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
     )
@@ -296,28 +322,16 @@ class Arm(Table):
         le=1e9,
         description="moment of inertia at the outboard interface [kg m2]",
     )
-    rotor_inertia: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e9,
-        description="moment of inertia of the rotor that drives this arm's inboard joint [kg m2]",
-    )
-    gear_ratio: float = Field(
-        default=1.0,
-        ge=1e-3,
-        le=1e6,
-        description="revolutions of the rotor per revolution of the inboard joint [-]",
-    )
-    joint_stiffness: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e15,
-        description="spring between the drive and this arm, at its inboard joint; 0: none, the "
-        "arm follows the drive exactly [N m/rad]",
-    )
-    joint_damping: float = Field(
-        default=0.0, ge=0, le=1e15, description="damper beside that spring [N m s/rad]"
-    )
+    rotor_inertia: RotorInertia = 0.0
+    gear_ratio: GearRatio = 1.0
+    gear_stiffness: GearStiffness = 0.0
+    gear_damping: GearDamping = 0.0
+    joint_stiffness: JointStiffness = 0.0
+    joint_damping: JointDamping = 0.0
+    bearing_stiffness: BearingStiffness = None
+    bearing_damping: BearingDamping = None
+    friction: Friction = None
+    friction_speed: FrictionSpeed = FRICTION_SPEED
     sid: FileName | None = Field(
         default=None, description="standard input data file (SID) in place of a geometry [-]"
     )
@@ -433,6 +447,13 @@ class Arm(Table):
                 f"2 (ny + nz), found {around}",
                 ("cells",),
             )
+        if self.ribs and RIB_PITCH * (self.ribs + 1) > self.cells[0]:
+            raise Refusal(
+                f"expected at most {max(0, self.cells[0] // RIB_PITCH - 1)} with "
+                f"{self.cells[0]} cells along the arm, {RIB_PITCH} from rib to rib",
+                ("ribs",),
+                ("cells",),
+            )
         self._check_wall()
         return self
 
@@ -497,12 +518,8 @@ class Arm(Table):
         for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
                 raise Refusal("expected only with rigid = true", (key,), ("rigid",))
-        if self.joint_damping > 0.0 and self.joint_stiffness == 0.0:
-            raise Refusal(
-                "expected 0 without arms.joint_stiffness, beside whose spring the damper acts",
-                ("joint_damping",),
-                ("joint_stiffness",),
-            )
+        check_springs(self)
+        check_parts(self, "arms")
         return self
 
     @property
@@ -663,7 +680,9 @@ class Arm(Table):
     @property
     def passive_share(self) -> float:
         """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
-        return 0.0 if self.cells is None else 2.0 * self.passive_columns / self.cells[0]
+        if self.cells is None:
+            return 0.0
+        return (2.0 * self.passive_columns + RIB_LENGTH * (self.ribs or 0)) / self.cells[0]
 
     @property
     def fixed_shares(self) -> tuple[float, float]:
@@ -720,6 +739,7 @@ class Arm(Table):
             raise Refusal("expected a name that no other arm has", (*at, "name"))
         if not scene.is_spatial:
             self._check_files(before, at)
+            check_plane_bearing(self, at)
         if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "

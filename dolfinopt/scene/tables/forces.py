@@ -89,7 +89,7 @@ class Force(Table):
             expected = "an array of three numbers" if scene.is_spatial else "a number"
             raise Refusal(f"expected {expected} {where}", (*at, "moment"))
         if not self.feed_forward and (
-            scene.control is None or scene.control.feed_forward != "rigid"
+            scene.control is None or scene.control.feed_forward == "none"
         ):
             raise Refusal(
                 "expected true, the default, without a feed-forward: "

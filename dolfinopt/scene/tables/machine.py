@@ -10,6 +10,20 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, shown
 from dolfinopt.scene.tables.interfaces import OUTBOARD, check_used, refuse_unknown
+from dolfinopt.scene.tables.joint_parts import (
+    FRICTION_SPEED,
+    PART_KEYS,
+    BearingDamping,
+    BearingStiffness,
+    Friction,
+    FrictionSpeed,
+    GearDamping,
+    GearStiffness,
+    Inertia,
+    Ratio,
+    check_parts,
+    joint_parts,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -20,6 +34,8 @@ Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
 Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
 LIMITS = ("position_limits", "velocity_limit", "effort_limit")
+OF_MOTORS = ("rotor_inertia", "gear_ratio")
+OF_BEARINGS = ("bearing_stiffness", "bearing_damping")
 GROUND = "ground"
 TIME = "t"  # column of a table of joint coordinates
 PATHS = ("joints", "points", "line")  # of machines in space
@@ -64,6 +80,23 @@ class Joint(Table):
         "frame, as in URDF [rad]",
     )
 
+    rotor_inertia: Inertia | None = Field(
+        default=None,
+        description="moment of inertia of the rotor that drives the joint, about its own axis; "
+        "default: arms.rotor_inertia of the arm that it holds [kg m2]",
+    )
+    gear_ratio: Ratio | None = Field(
+        default=None,
+        description="revolutions of the rotor per revolution of the joint, radians per metre of a "
+        "prismatic one; default: arms.gear_ratio of the arm that it holds [-]",
+    )
+    gear_stiffness: GearStiffness = 0.0
+    gear_damping: GearDamping = 0.0
+    bearing_stiffness: BearingStiffness = None
+    bearing_damping: BearingDamping = None
+    friction: Friction = None
+    friction_speed: FrictionSpeed = FRICTION_SPEED
+
     position_limits: tuple[Coordinate, Coordinate] | None = Field(
         default=None,
         description="least and largest coordinate, as in URDF; told where the motion exceeds them "
@@ -93,6 +126,15 @@ class Joint(Table):
                 raise Refusal("expected none with a fixed joint", (key,), ("type",))
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
             raise Refusal("expected the least first, then the largest", ("position_limits",))
+        return self
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Joint:
+        others = [key for key in (*OF_MOTORS, *PART_KEYS) if key not in OF_BEARINGS]
+        for key in others if not self.moves else ():
+            if getattr(self, key) != type(self).model_fields[key].default:
+                raise Refusal("expected none with a fixed joint", (key,), ("type",))
+        check_parts(self, "joints")
         return self
 
     @model_validator(mode="after")
@@ -208,14 +250,8 @@ def _check_machine(scene: Scene) -> None:
             ("objective", "elbow_angle"),
             ("joints",),
         )
+    _check_joint_parts(scene)
     for k, arm in enumerate(scene.arms):
-        if arm.joint_stiffness > 0.0:
-            raise Refusal(
-                "expected 0 with [[joints]]: springs of drives are simulated in the plane; leave "
-                "it out, [control] has stiffness and damping of the drives",
-                ("arms", k, "joint_stiffness"),
-                ("joints",),
-            )
         if arm.flexible and not arm.is_solid:
             raise Refusal(
                 "expected three integers (along, over the height, over the thickness) with "
@@ -223,6 +259,35 @@ def _check_machine(scene: Scene) -> None:
                 ("arms", k, "cells"),
                 ("joints",),
             )
+
+
+def _check_joint_parts(scene: Scene) -> None:
+    """Refuse parts of joints that arms state in space, and those that are stated twice."""
+    joints = {joint.child: (i, joint) for i, joint in enumerate(scene.joints)}
+    for k, arm in enumerate(scene.arms):
+        i, joint = joints[arm.name]
+        for key in PART_KEYS:
+            if getattr(arm, key) != type(arm).model_fields[key].default:
+                raise Refusal(
+                    f"expected none with [[joints]]: state joints.{i}.{key}, of the joint "
+                    f"{joint.name} that holds the arm",
+                    ("arms", k, key),
+                    ("joints",),
+                )
+        if arm.joint_stiffness > 0.0 and not joint.moves:
+            raise Refusal(
+                f"expected 0: the joint {joint.name} that holds the arm is fixed",
+                ("arms", k, "joint_stiffness"),
+                ("joints", i, "type"),
+            )
+        for mine, its in (("joint_stiffness", "gear_stiffness"), ("rotor_inertia",) * 2):
+            if getattr(arm, mine) > 0.0 and getattr(joint, its):
+                raise Refusal(
+                    f"expected only one of joints.{i}.{its} and arms.{k}.{mine}, which mean the "
+                    "same joint",
+                    ("joints", i, its),
+                    ("arms", k, mine),
+                )
 
 
 # -- `[closure]` ---------------------------------------------------------------------------------
@@ -308,11 +373,20 @@ class Closure(Table):
         """Refuse springs between drive and arm at joints that have no drive."""
         first = len(scene.arms) - self.dependent
         for index in range(first, len(scene.arms)):
-            if scene.arms[index].joint_stiffness > 0.0:
+            for key in ("joint_stiffness", "gear_stiffness"):
+                if getattr(scene.arms[index], key) > 0.0:
+                    raise Refusal(
+                        f"expected 0: the joint of {scene.arms[index].name} follows from the "
+                        "others in the closed loop and has no drive",
+                        ("arms", index, key),
+                        (*at, "kind"),
+                    )
+        for index, arm in enumerate(scene.arms):
+            if arm.bearing_stiffness is not None:
                 raise Refusal(
-                    f"expected 0: the joint of {scene.arms[index].name} follows from the others in "
-                    "the closed loop and has no drive",
-                    ("arms", index, "joint_stiffness"),
+                    "expected none with [closure]: bearings that give way are simulated in open "
+                    "chains; leave it out",
+                    ("arms", index, "bearing_stiffness"),
                     (*at, "kind"),
                 )
 
@@ -333,7 +407,7 @@ class Closure(Table):
 
 # -- `[control]` ---------------------------------------------------------------------------------
 
-FeedForward = Literal["rigid", "none"]
+FeedForward = Literal["rigid", "elastic", "none"]
 Gain = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; N s/m, N m s/rad
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 Factor = Annotated[float, Field(ge=0, le=1e6)]
@@ -345,7 +419,8 @@ class Control(Table):
     feed_forward: FeedForward = Field(
         default="rigid",
         description="forces known in advance: inverse dynamics of the machine with rigid arms of "
-        "the current design, or none [-]",
+        'the current design, its rotors and friction included; "elastic" also asks motors behind '
+        "gear_stiffness to turn ahead of their joints by what the gears give; or none [-]",
     )
     stiffness: tuple[Gain, ...] = Field(
         description="proportional gain of every driven coordinate, the cart first, then the joints "
@@ -372,6 +447,11 @@ class Control(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
+        if self.feed_forward == "elastic" and not any(one.stiffness for one in joint_parts(scene)):
+            raise Refusal(
+                'expected "rigid": no joint has a gear that gives way; state gear_stiffness',
+                (*at, "feed_forward"),
+            )
         names = scene.driven
         for key in ("stiffness", "damping", "limits"):
             values = getattr(self, key)

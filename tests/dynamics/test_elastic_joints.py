@@ -1,0 +1,290 @@
+"""Bearings, gears, motors and friction in joints: against another program, energy, limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from machines import (
+    GAINS,
+    Tree,
+    apart,
+    energies,
+    fork,
+    imbalance,
+    machine,
+    reference,
+    simulated,
+    two_arm,
+    with_keys,
+)
+from mpi4py import MPI
+from remainders import built_of
+from scipy.linalg import eigh
+
+from dolfinopt.dynamics.build import build_system
+from dolfinopt.responses.response import bodies_in
+from dolfinopt.scene.load import scene_from_dict
+
+pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
+
+EARTH = {"gravity": [0.0, -9.81]}
+GEARS = [
+    {"gear_stiffness": 2e4, "gear_damping": 10.0, "gear_ratio": 100.0, "rotor_inertia": 2e-5,
+     "friction": [3.0, 4.0]},
+    {"gear_stiffness": 1e4, "gear_damping": 5.0, "gear_ratio": 100.0, "rotor_inertia": 1e-5,
+     "friction": [2.0, 3.0]},
+]  # fmt: skip
+SPRINGS = {
+    "plane": [[2e6, 3e6, 0.0, 0.0, 0.0, 3e4], [1e6, 2e6, 0.0, 0.0, 0.0, 2e4]],
+    "space": [[2e6, 3e6, 4e6, 3e4, 4e4, 0.0], [1e6, 2e6, 3e6, 1e4, 8e4, 2e4]],
+}
+
+
+def robot(kind: str, folder) -> Tree:
+    """Return the two links of `tests/reference`, their motors alone controlled."""
+    parts = [
+        gear | {"bearing_stiffness": k, "bearing_damping": [1e-4 * x for x in k]}
+        for gear, k in zip(GEARS, SPRINGS[kind], strict=True)
+    ]
+    bar, file = {"height": 0.05, "thickness": 0.04}, folder / "table.csv"
+    upper = {"name": "upper", "rigid": True, "length": 0.5, "mass": 3.0, **bar}
+    fore = {"name": "fore", "length": 0.4, "passive": 0.0, **bar}
+    tree: Tree = {
+        "name": kind,
+        "material": {"young_modulus": 7e14, "poisson_ratio": 0.33, "density": 2700.0},
+        "payload": {"mass": 2.0},
+        "control": {"stiffness": [4e4, 2e4], "damping": [800.0, 300.0], "feed_forward": "none"},
+        "simulation": {"tolerance": 1e-5, "sample": 0.01, "stiffening": False},
+        "design": {"initial": 1.0},
+        "damping": {"stiffness_proportional": 1e-6},
+        "objective": {"kind": "deviation"},
+        "motion": {"path": "joints", "file": str(file), "horizon": 0.6},
+    }
+    if kind == "plane":
+        file.write_text("t,upper,fore\n0,0.4,-0.9\n0.4,1.3,-0.2\n")
+        arms = [upper | {"inertia": 0.08} | parts[0], fore | {"cells": [8, 2]} | parts[1]]
+        base = {"base": "fixed", "joint_height": 0.0, **EARTH}
+        return with_keys(tree, {"arms": arms, "reduction": {"coordinates": 3}, "motion": base})
+    file.write_text("t,yaw,elbow\n0,0,0.3\n0.4,1.2,-0.6\n")
+    yaw = {"name": "yaw", "parent": "ground", "child": "upper", "axis": [0, 0, 1]}
+    elbow = {"name": "elbow", "parent": "upper", "child": "fore", "axis": [0, 1, 0]}
+    return with_keys(tree, {
+        "arms": [upper | {"inertia": [0.01, 0.08, 0.08, 0, 0, 0]}, fore | {"cells": [8, 2, 2]}],
+        "joints": [one | {"type": "revolute"} | own
+                   for one, own in zip((yaw, elbow), parts, strict=True)],
+        "reduction": {"coordinates": 6},
+        "motion": {"gravity": [0, 0, -9.81]},
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "most"), [("plane", 5e-6), ("space", 4e-4)])
+def test_elastic_joints_of_another_program(kind, most, tmp_path) -> None:
+    """Exudyn's kinematic trees, see `reference/README.md`."""
+    expected, found = reference(f"elastic_joints_{kind}"), machine(simulated(robot(kind, tmp_path)))
+    trajectory = found[0]
+    assert np.allclose(trajectory.t, expected["t"])
+    axes = "xyz"[: trajectory.mechanism.dim.d]
+    path = np.stack([expected[f"dev_{axis}"] for axis in axes], axis=1)
+    size = np.linalg.norm(path, axis=1).max()
+    off = np.linalg.norm(trajectory.deviation - path, axis=1).max()
+    assert off < most * size  # measured 1.0e-6, 1.8e-4
+    assert trajectory.motors is not None
+    angles = np.column_stack([trajectory.q_r[:, -2:], trajectory.motors])
+    wanted = np.column_stack([expected[key] for key in ("q_1", "q_2", "motor_1", "motor_2")])
+    away = np.abs(wanted[:, :2] - trajectory.desired.q[:, -2:]).max()
+    assert np.abs(angles - wanted).max() < most * away  # 1e-6, 9e-5
+
+
+def small(joints: Tree, **changes: Any) -> Tree:
+    """Return the controlled machine on few cells, its arms with keys of their joints."""
+    cells = ("arms.cells=[16,3]", "reduction.coordinates=3", "motion.horizon=1.9")
+    tree = two_arm(*cells, control=GAINS, simulation={"stiffening": True, "tolerance": 1e-5})
+    for arm in tree["arms"]:
+        arm |= joints
+    return with_keys(tree, {"motion": EARTH, **changes})
+
+
+def forked(tmp_path, parts: Tree, **changes: Any) -> Tree:
+    """Return the fork in space with parts of its two joints that move, one of them prismatic."""
+    (tmp_path / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
+    tree = fork() | {"name": "fork"}
+    tree["motion"]["file"] = str(tmp_path / "table.csv")
+    for joint in tree["joints"]:
+        if joint["type"] != "fixed":
+            joint |= parts
+    return with_keys(tree, {"simulation": {"tolerance": 1e-5}, **changes})
+
+
+PLANE = {
+    "bearing_stiffness": [1e6, 2e6, 0.0, 0.0, 0.0, 5e4],
+    "bearing_damping": [10.0] * 2 + [0.0] * 4,
+}
+SPACE = {"bearing_stiffness": [1e6, 2e6, 3e6, 3e4, 4e4, 5e4], "bearing_damping": [10.0] * 6}
+ELASTIC = {"feed_forward": "elastic"}
+HELD = {"stiffness": [2e4, 2e5], "damping": [600.0, 6e3]}
+SCENES = {
+    "bearings": lambda _: small(PLANE) | {"control": None},
+    "gears": lambda _: small(PLANE | GEARS[0]) | {"control": None},
+    "controlled": lambda _: small(PLANE | GEARS[0], control=ELASTIC),
+    "rigid gears": lambda _: small({"friction": [5.0, 10.0], "friction_speed": 0.1}),
+    "bearings in space": lambda path: forked(path, SPACE),
+    "gears in space": lambda path: forked(path, SPACE | GEARS[0]),
+    "controlled in space": lambda path: forked(path, GEARS[1] | SPACE, control=ELASTIC | HELD),
+}
+
+
+@pytest.mark.parametrize("kind", SCENES)
+def test_work_is_energy(kind, tmp_path) -> None:
+    """Drive work = kinetic + strain + potential energy + what dampers and friction took."""
+    result = simulated(SCENES[kind](tmp_path))
+    trajectory = result.trajectory
+    assert trajectory is not None
+    parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
+    assert min(parts) > 1e-4 * max(parts)  # each of them counts
+    assert imbalance(result) < 1e-7  # measured 3e-10 at most
+
+
+def test_stiff_bearings_hold() -> None:
+    """What they add falls with their softness."""
+    rigid = simulated(small({}) | {"control": None}).trajectory
+    left = []
+    for factor in (10.0, 100.0):
+        springs = {"bearing_stiffness": [factor * k for k in PLANE["bearing_stiffness"]]}
+        soft = simulated(small(springs) | {"control": None}).trajectory
+        left.append(apart(soft.sampled.deviation, rigid.sampled.deviation))
+    assert left[0] / left[1] == pytest.approx(10.0, rel=0.05)
+    assert left[1] < 2e-3
+
+
+def test_inf_is_rigid_as_zero_is() -> None:
+    """JSON does not know it: scenes keep 0."""
+    given = scene_from_dict(small({"bearing_stiffness": [1e6, np.inf, np.inf, 0.0, 0.0, 5e4]}))
+    assert given.arms[0].bearing_stiffness == (1e6, 0.0, 0.0, 0.0, 0.0, 5e4)
+
+
+def test_friction_of_prescribed_joints_is_the_drives() -> None:
+    """The motion keeps its bits; forces grow by f_v v + f_c tanh(v / v_s)."""
+    free, rubbed = (
+        simulated(small(parts) | {"control": None}).trajectory
+        for parts in ({}, {"friction": [5.0, 10.0], "friction_speed": 0.1})
+    )
+    np.testing.assert_array_equal(free.deviation, rubbed.deviation)
+    v = free.desired.qd[:, 1:]
+    expected = 5.0 * v + 10.0 * np.tanh(v / 0.1)
+    change = (rubbed.joint_forces - free.joint_forces)[:, 1:]
+    np.testing.assert_allclose(
+        change, expected, rtol=0, atol=1e-12 * np.abs(free.joint_forces).max()
+    )
+
+
+@pytest.mark.parametrize("kind", ["plane", "space"])
+def test_feed_forward_winds_gears(kind, tmp_path) -> None:
+    """At rest joints of rigid links are where they should be; without it they sag by the gear."""
+    tree, sags = robot(kind, tmp_path), []
+    for feed_forward in ("rigid", "elastic"):
+        for gear in tree["arms"] if kind == "plane" else tree["joints"]:
+            gear.pop("bearing_stiffness", None), gear.pop("bearing_damping", None)
+        scene = scene_from_dict(with_keys(tree, {"control": {"feed_forward": feed_forward}}))
+        built = built_of(scene, MPI.COMM_SELF)
+        owned = {k: arm.reduce(arm.uniform(1.0)) for k, arm in built.arms.items()}
+        y = build_system(scene, bodies_in(scene, scene, owned)).initial_state()[0][0]
+        sags.append(np.abs(y[:2]).max())  # deviations of both joints
+    assert sags[0] > 1e-3  # rad
+    assert sags[1] < 1e-6 * sags[0]  # links of 7e14 Pa are not quite rigid
+
+
+def test_bearings_stand_in_files(tmp_path) -> None:
+    """Their coordinates have columns and units of their own; compliance is the arms'."""
+    from dolfinopt.output.trajectory import trajectory_units, write_trajectory
+
+    trajectory = simulated(robot("space", tmp_path)).trajectory
+    units = trajectory_units(trajectory)
+    own = {key: unit for key, unit in units.items() if key.startswith("q_bearing")}
+    assert own == {
+        **{f"q_bearing_yaw_{key}": "m" for key in "xyz"},
+        **{f"q_bearing_yaw_{key}": "rad" for key in ("rx", "ry")},
+        **{f"q_bearing_elbow_{key}": "m" for key in "xyz"},
+        **{f"q_bearing_elbow_{key}": "rad" for key in ("rx", "ry", "rz")},
+    }
+    write_trajectory(tmp_path, trajectory)
+    table = np.genfromtxt(tmp_path / "trajectory.csv", delimiter=",", names=True)
+    assert list(table.dtype.names) == list(units)
+    found = np.load(tmp_path / "trajectory.npz")
+    # At rest under gravity the first bearing bears the weight of both links and the payload.
+    mass = sum(body.mass for body in trajectory.mechanism.arms) + 2.0
+    assert found["q_e"][0, 6 + 2] == pytest.approx(-9.81 * mass / 4e6, rel=1e-4)
+    assert found["compliance"].shape[1] == 2
+
+
+def frame(angle: float, springs: tuple[float, float], masses: tuple[float, float]) -> np.ndarray:
+    """Return the lowest three frequencies of two links as Timoshenko beams on springs, Hz.
+
+    Each of 20 elements, 0.5 and 0.54 x 0.03 x 0.01 m of aluminium, the second turned by `angle`,
+    rotational springs inboard of both, point masses at both outboard ends.
+    """
+    E, G, rho, h, b, count = 70e9, 70e9 / 2.66, 2700.0, 0.03, 0.01, 20
+    A, inertia = b * h, b * h**3 / 12.0
+    size = 3 * (2 * count + 1) + 2  # the joints' own rotations stand last: ground and elbow
+    K, M = np.zeros((2, size, size))
+    for k, (length, turn) in enumerate(((0.5, 0.0), (0.54, angle))):
+        s = length / count
+        phi = 12.0 * E * inertia / (5.0 / 6.0 * G * A * s * s)
+        c = E * inertia / (s**3 * (1.0 + phi))
+        stiff, mass = np.zeros((2, 6, 6))
+        stiff[np.ix_([0, 3], [0, 3])] = E * A / s * np.array([[1, -1], [-1, 1]])
+        bend = np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
+        near, far = (4 + phi) * s**2, (2 - phi) * s**2
+        stiff[bend] = c * np.array([
+            [12, 6 * s, -12, 6 * s], [6 * s, near, -6 * s, far],
+            [-12, -6 * s, 12, -6 * s], [6 * s, far, -6 * s, near]])  # fmt: skip
+        mass[np.ix_([0, 3], [0, 3])] = rho * A * s / 6.0 * np.array([[2, 1], [1, 2]])
+        mass[bend] = rho * A * s / 420.0 * np.array([
+            [156, 22 * s, 54, -13 * s], [22 * s, 4 * s**2, 13 * s, -3 * s**2],
+            [54, 13 * s, 156, -22 * s], [-13 * s, -3 * s**2, -22 * s, 4 * s**2]])  # fmt: skip
+        mass[np.ix_([2, 5], [2, 5])] += rho * inertia * s / 6.0 * np.array([[2, 1], [1, 2]])
+        R = np.eye(6)
+        for i in (0, 3):
+            R[i : i + 2, i : i + 2] = [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+        for e in range(count):
+            dofs = 3 * (k * count + e) + np.arange(6)
+            if e == 0:  # its inboard rotation is the joint's
+                dofs[2] = size - 2 + k
+            K[np.ix_(dofs, dofs)] += R.T @ stiff @ R
+            M[np.ix_(dofs, dofs)] += R.T @ mass @ R
+        end = 3 * (k + 1) * count
+        M[[end, end + 1], [end, end + 1]] += masses[k]
+        inner, outer = 3 * k * count + 2, size - 2 + k
+        pair = np.ix_([inner, outer], [inner, outer])
+        K[pair] += springs[k] * np.array([[1, -1], [-1, 1]])
+    free = np.arange(3, size)  # clamped at the ground
+    values = eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[:3]
+    return np.sqrt(values) / (2.0 * np.pi)
+
+
+@pytest.mark.parametrize("elbow", [0.0, 45.0, 90.0])
+def test_frequencies_of_two_links_on_elastic_joints(elbow, tmp_path) -> None:
+    """With motors held, in three poses, against a frame of Timoshenko beams."""
+    file, springs, masses = tmp_path / "still.csv", (2e3, 8e2), (0.3, 0.5)
+    angle = np.deg2rad(elbow)
+    file.write_text(f"t,upper,fore\n0,0,{angle}\n0.2,0,{angle}\n")
+    bar = {"height": 0.03, "thickness": 0.01, "cells": [50, 4], "passive": 0.0}
+    tree = two_arm("reduction.coordinates=8")
+    tree["arms"] = [
+        {"name": "upper", "length": 0.5, "gear_stiffness": springs[0], "joint_mass": 0.3, **bar},
+        {"name": "fore", "length": 0.54, "gear_stiffness": springs[1], "joint_mass": 0.0, **bar},
+    ]
+    tree |= {"design": {"initial": 1.0}, "payload": {"mass": masses[1]}, "motion": {
+        "path": "joints", "file": str(file), "base": "fixed", "joint_height": 0.0,
+        "duration": 0.2, "horizon": 0.2}}  # fmt: skip
+    scene = scene_from_dict(tree)
+    built = built_of(scene, MPI.COMM_SELF)
+    owned = {k: arm.reduce(arm.uniform(1.0)) for k, arm in built.arms.items()}
+    system = build_system(scene, bodies_in(scene, scene, owned))
+    rest = np.zeros((1, system.num_coordinates))
+    K, _, M = np.split(system.at(np.zeros(1)).linearise(rest, rest, rest).dense()[0], 3, axis=1)
+    found = np.sort(np.sqrt(1.0 / np.linalg.eigvals(np.linalg.solve(K, M)).real)) / (2.0 * np.pi)
+    expected = frame(angle, springs, masses)
+    # Measured 1.7e-4, 2.2e-4, 8.6e-4: clamped ends of plane arms, which beams do not have.
+    np.testing.assert_allclose(found[:3], expected, rtol=1.5e-3)
