@@ -29,6 +29,10 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.machine import Control
 
+GIVE_MASS = (
+    "give motors behind springs a rotor_inertia, carts before a bearing a cart_mass, and bearings "
+    "no stiffness about their joint's own axis: gear_stiffness is the spring there"
+)
 WRENCH = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 
 
@@ -203,7 +207,7 @@ def _solved(M: np.ndarray, right: np.ndarray, scene: Scene) -> np.ndarray:
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e14:
         raise InputError(
             f"{scene.source}: --state-space: a coordinate has no mass, so that its acceleration is "
-            "not determined; give motors behind springs a rotor_inertia, and carts a cart_mass"
+            f"not determined; {GIVE_MASS}"
         )
     found: np.ndarray = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * right)
     return found
@@ -390,8 +394,7 @@ def poles_of(one: Linearised) -> Poles:
     K, D, M = (scale[:, None] * x * scale for x in (one.K, one.D, one.M))
     if np.linalg.cond(M) > 1e14:
         raise InputError(
-            "a coordinate has no mass, so that its poles are not determined; give motors behind "
-            "springs a rotor_inertia, and carts a cart_mass"
+            f"a coordinate has no mass, so that its poles are not determined; {GIVE_MASS}"
         )
     bottom = -np.linalg.solve(M, np.hstack([K, D]))
     A = np.vstack([np.eye(n, 2 * n, n), bottom])
