@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from dolfinopt.dynamics.budget import Budget
+    from dolfinopt.dynamics.state_space import StateSpace
     from dolfinopt.part.check import Check
     from dolfinopt.part.part import Part
 
@@ -174,6 +175,16 @@ class SimulationResult:
         from dolfinopt.plots.curves import drives_figure
 
         return None if self.trajectory is None else drives_figure(self.trajectory)
+
+    def state_space(self, t: float) -> StateSpace | None:
+        """Return the machine linearised about its motion at an instant t, s; None but on rank 0.
+
+        Raises:
+            InputError: the instant is not within the motion.
+        """
+        from dolfinopt.dynamics.state_space import state_space
+
+        return None if self.trajectory is None else state_space(self.trajectory, t)
 
     def _initial(self) -> np.ndarray | None:
         """Return the deviation (n, 2) of the design to compare with, m."""

@@ -12,7 +12,7 @@ from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene.tables.arms import ElementName
 from dolfinopt.scene.tables.design import Law
-from dolfinopt.scene.tables.objective import NEEDS, Constraints, ObjectiveKind
+from dolfinopt.scene.tables.objective import NEEDS, NO_LIMITS, Constraints, ObjectiveKind
 from dolfinopt.scene.tables.simulation import ReductionMethod
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
@@ -54,5 +54,5 @@ def test_words_of_the_scene_are_those_of_the_code():
     assert set(get_args(ReductionMethod)) == METHODS.keys()
     assert set(get_args(Law)) == LAWS.keys()
     assert set(get_args(ElementName)) == ELEMENTS.keys()
-    limited = Constraints.model_fields.keys() - {"settling_after"}  # says when another one holds
+    limited = Constraints.model_fields.keys() - set(NO_LIMITS)
     assert {*get_args(ObjectiveKind), *limited} == NEEDS.keys()

@@ -16,13 +16,19 @@ from dolfinopt.cli.shared import (
     overwrite_option,
     prepare,
     scene_argument,
+    scene_of,
     set_option,
+    start,
     tell,
+    warn,
 )
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
+    from mpi4py import MPI
+
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.state_space import StateSpace
     from dolfinopt.scene.load import Scene
 
 
@@ -42,6 +48,15 @@ KINDS = (".sid", ".sid.npz", ".fem")
     "imported from, with the run's links; default folder: SCENE/urdf",
 )
 @click.option(
+    "--state-space",
+    "instant",
+    type=float,
+    metavar="T",
+    help="instead: the machine linearised about its motion at T seconds, as A, B, C, D (.npz and "
+    ".mat); SCENE is a scene's file or the folder of a finished run; default folder: "
+    "RUN/state-space or results/SCENE-state-space",
+)
+@click.option(
     "--before",
     type=PATH,
     metavar="DIR",
@@ -54,14 +69,20 @@ def export(
     overwrite: bool,
     overrides: tuple[str, ...],
     urdf: bool,
+    instant: float | None,
     before: Path | None,
 ) -> None:
-    """Write the reduced arms of SCENE for other multibody codes.
+    """Write the reduced arms of SCENE for other multibody codes, or its linearised machine.
 
     Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
     geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
     With [[joints]] in space; of rigid arms the screen tells mass, centre and inertia.
     """
+    if instant is not None:
+        if urdf or before is not None:
+            raise InputError("--state-space: expected no --urdf and no --before with it")
+        _export_state_space(scene, instant, design, out, overwrite, overrides)
+        return
     if urdf:
         if design is not None or overrides:
             raise InputError("--urdf: expected no --design and no --set, they are the run's")
@@ -73,7 +94,10 @@ def export(
     if before is not None:
         raise InputError("--before: expected --urdf with it")
     if scene.is_dir():
-        raise InputError(f"{scene}: a folder; name a scene file, or add --urdf for a robot's run")
+        raise InputError(
+            f"{scene}: a folder; name a scene file, or add --urdf for a robot's run, or "
+            "--state-space T"
+        )
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.exchange.mbdyn import write_fem
@@ -110,6 +134,99 @@ def export(
         click.echo(
             f"{arm.name}: {data.mass:.6g} kg, {data.num_modes} coordinates, "
             f"{len(element.labels)} nodes{stiffness}; in {folder / arm.name}.sid, .sid.npz, .fem"
+        )
+
+
+STATE_SPACE = ("state_space.npz", "state_space.mat")
+POLES_SHOWN = 5  # on the screen
+
+
+def _export_state_space(
+    source: Path,
+    instant: float,
+    design: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    overrides: tuple[str, ...],
+) -> None:
+    """Write a scene's machine, or a run's, linearised at an instant, s."""
+    folder = out or Path("results") / f"{source.stem}-state-space"
+    if source.is_dir():
+        if design is not None:
+            raise InputError("--design: expected none with the folder of a run, which has its own")
+        design, folder = source / "design.npz", out or source / "state-space"
+    world, loaded = _machine(source, overrides)
+    if not 0.0 <= instant <= loaded.motion.horizon:
+        raise InputError(
+            f"--state-space {instant:g}: expected an instant from 0 to motion.horizon = "
+            f"{loaded.motion.horizon:g} [s]"
+        )
+    claim(world, folder, overwrite, STATE_SPACE, scene=loaded)
+    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.dynamics.state_space import state_space
+    from dolfinopt.output.design import arms_with_design
+    from dolfinopt.parallel import on_root, together
+    from dolfinopt.profiling import Profile
+    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.order_selection import choose_coordinates
+
+    profile = Profile()
+    partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
+    tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
+    trajectory: Trajectory | None = evaluate(loaded, partition, arms, x_phys, profile)[1]
+
+    def found() -> StateSpace:
+        assert trajectory is not None
+        return state_space(trajectory, instant)
+
+    model = on_root(world, found)
+    prepare(world, folder)
+    with together(world):
+        if world.rank == 0:
+            _write_state_space(folder, model)
+
+
+def _machine(source: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
+    """Return all ranks, and the scene of a file or of a run's folder (collective)."""
+    if not source.is_dir():
+        return load(source, overrides)
+    if overrides:
+        raise InputError("--set: expected none with the folder of a run, whose scene it is")
+    world = start()
+    from dolfinopt.parallel import on_root
+
+    return world, on_root(world, scene_of, source)
+
+
+def _write_state_space(folder: Path, model: StateSpace) -> None:
+    """Write both files and say what they hold (root only)."""
+    import numpy as np
+    from scipy.io import savemat
+
+    from dolfinopt.disk import write_arrays, write_atomically
+
+    arrays, npz, mat = model.arrays(), *(folder / name for name in STATE_SPACE)
+    # MATLAB has cell arrays for words of several lengths.
+    cells = {k: x.astype(object) if x.dtype.kind == "U" else x for k, x in arrays.items()}
+    write_atomically(mat, lambda stream: savemat(stream, cells, oned_as="column"))
+    write_arrays(npz, arrays)
+    kind = "with its control" if model.closed else "drives free"
+    click.echo(
+        f"{kind}, at {model.time:g} s: {len(model.states)} states, {len(model.inputs)} inputs, "
+        f"{len(model.outputs)} outputs; in {npz}, {mat.name}"
+    )
+    poles = [pole for pole in model.poles if pole.imag >= 0.0]
+    for pole in poles[:POLES_SHOWN]:
+        size = abs(pole)
+        damping = -pole.real / size if size > 0.0 else 0.0
+        click.echo(f"  pole {pole:.5g} 1/s: {size / (2.0 * np.pi):.4g} Hz, damping {damping:.3g}")
+    worst = max(poles, key=lambda pole: float(pole.real))
+    if model.closed and worst.real > 0.0:
+        warn(
+            [
+                f"linearised at {model.time:g} s the closed loop has an unstable pole, {worst:.4g} "
+                "1/s; see whether it stays where the machine rests, at 0 or motion.horizon"
+            ]
         )
 
 

@@ -406,8 +406,9 @@ class BatchModes:
 
 def _joined(motions: Sequence[RigidMotion]) -> RigidMotion:
     """Return several motions one after the other."""
-    names = ("q", "qd", "qdd")
-    return RigidMotion(*(np.concatenate([getattr(m, name) for m in motions]) for name in names))
+    q, qd, qdd = (np.concatenate(x) for x in zip(*((m.q, m.qd, m.qdd) for m in motions)))
+    applied = [m.applied for m in motions if m.applied is not None]
+    return RigidMotion(q, qd, qdd, np.concatenate(applied) if applied else None)
 
 
 def related(systems: Sequence[ElasticSystem]) -> list[np.ndarray | None]:
@@ -437,6 +438,7 @@ def _same_hardware(system: ElasticSystem, other: ElasticSystem) -> bool:
         np.array_equal(one.rotors, two.rotors)
         and np.array_equal(one.origin, two.origin)
         and one.loads.keys() == two.loads.keys()
+        and one.forces == two.forces
         and all(
             _point(load) == _point(two.loads[site])
             for site, load in one.loads.items()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -22,6 +23,7 @@ from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.machine import family_of, friction_of, loops_of
 from dolfinopt.multibody.mechanism import (
+    AppliedForce,
     Closure,
     Drives,
     Mechanism,
@@ -36,6 +38,8 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.forces import FORCE_COLUMNS, Force
+from dolfinopt.scene.tables.interfaces import interface_number
 from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
 
 
@@ -105,9 +109,15 @@ def build_system(
         motion = desired_motion(scene)
     mechanism: Mechanism = family.build(scene, bodies)
     instants = breakpoints(scene, family.curve)
+    if scene.forces:
+        mechanism, motion = replace(mechanism, forces=forces_of(scene)), under_forces(motion, scene)
+        instants = with_rows(instants, tables_of_forces(scene), scene.motion.horizon)
     if not is_machine(scene):
         return ElasticSystem(mechanism, motion, instants)
-    instants, drives = _with_rows(instants, scene), _drives(scene)
+    if scene.control is not None and scene.control.forces is not None:
+        times = _forces(scene.control.forces, scene.driven)[0]
+        instants = with_rows(instants, [times], scene.motion.horizon)
+    drives = _drives(scene)
     loops = _loops(scene, mechanism, motion, drives)
     return MachineSystem(mechanism, motion, instants, drives, *loops)
 
@@ -119,6 +129,9 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
     """
     family = family_of(scene)
     mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
+    if scene.forces:
+        mechanism = replace(mechanism, forces=forces_of(scene))
+        motion = under_forces(lambda _: motion, scene)(t)
     if scene.closure is None:
         return largest_change(mechanism, motion)
     drives = _drives(scene)
@@ -226,23 +239,71 @@ def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
 
 
 def check_forces(scene: Scene) -> None:
-    """Raise `InputError` when the scene's table of forces cannot be read, or lacks a column."""
+    """Raise `InputError` when the scene's tables of forces cannot be read, or lack a column."""
     _table_of_forces(scene)
+    tables_of_forces(scene)
 
 
-def _with_rows(instants: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
-    """Return the breakpoints, s, and among them those of a table of forces that is not long."""
-    # Its slope jumps at every row, and at the last one the force itself.
-    if scene.control is None or scene.control.forces is None:
-        return instants
-    times = _forces(scene.control.forces, scene.driven)[0]
-    times = times if len(times) <= TABLE_BREAKPOINTS_LIMIT else times[-1:]
-    apart = SAME_INSTANT_SHARE * scene.motion.horizon
-    found = list(instants)
-    for t in map(float, times[(times > 0.0) & (times < scene.motion.horizon)]):
-        if min(abs(t - other) for other in found) > apart:
-            found.append(t)
+def with_rows(
+    instants: tuple[float, ...], tables: Iterable[np.ndarray], horizon: float
+) -> tuple[float, ...]:
+    """Return the breakpoints, s, and among them the instants of tables that are not long."""
+    # The slope of their values jumps at every row, and at the last one the value itself.
+    apart, found = SAME_INSTANT_SHARE * horizon, list(instants)
+    for times in tables:
+        rows = times if len(times) <= TABLE_BREAKPOINTS_LIMIT else times[-1:]
+        for t in map(float, rows[(rows > 0.0) & (rows < horizon)]):
+            if min(abs(t - other) for other in found) > apart:
+                found.append(t)
     return tuple(sorted(found))
+
+
+# -- forces on interfaces, [[forces]] ------------------------------------------------------------
+
+
+def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
+    """Return where the scene's forces act; their values stand in the motion of `under_forces`."""
+    names = [arm.name for arm in scene.arms]
+    return tuple(
+        AppliedForce(
+            site=(k, interface_number(scene.arms[k], force.interface) or 0),
+            column=column,
+            in_world=force.frame == "world",
+            known=force.feed_forward,
+        )
+        for column, force in enumerate(scene.forces)
+        for k in [names.index(force.arm)]
+    )
+
+
+def under_forces(
+    motion: Callable[[np.ndarray], RigidMotion], scene: Scene
+) -> Callable[[np.ndarray], RigidMotion]:
+    """Return the motion with the values of the scene's forces at the same instants."""
+
+    def with_forces(t: np.ndarray) -> RigidMotion:
+        values = [_force_values(force, scene.dimension, t) for force in scene.forces]
+        return replace(motion(t), applied=np.stack(values, axis=1))
+
+    return with_forces
+
+
+def _force_values(force: Force, dimension: int, t: np.ndarray) -> np.ndarray:
+    """Return force and moment at instants t (n,), (n, 3) or in space (n, 6), N and N m."""
+    static = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
+    values = np.tile(static, (len(t), 1))
+    if force.table is not None:
+        times, curve = _forces(force.table, FORCE_COLUMNS[dimension])
+        inside = t <= times[-1]
+        values[inside] += curve(t[inside])
+    return force.factor * values
+
+
+def tables_of_forces(scene: Scene) -> list[np.ndarray]:
+    """Return the instants (n,) of every table of [[forces]], s."""
+    columns = FORCE_COLUMNS[scene.dimension]
+    files = dict.fromkeys(one.table for one in scene.forces if one.table is not None)
+    return [_forces(file, columns)[0] for file in files]
 
 
 def _forces(file: str, columns: tuple[str, ...]) -> tuple[np.ndarray, Callable[..., np.ndarray]]:

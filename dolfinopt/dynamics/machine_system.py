@@ -134,7 +134,7 @@ class MachineInstants:
             actual = desired.copy()
             actual[:, free] += change[:, :R]
             parts.append(actual)
-        return type(self.desired)(*parts)
+        return replace(self.desired, q=parts[0], qd=parts[1], qdd=parts[2])
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
@@ -348,7 +348,7 @@ class MachineSystem:
     @cached_property
     def rigid(self) -> Mechanism:
         """The mechanism with rigid arms of the same mass and inertia."""
-        return self.mechanism.rigid
+        return self.mechanism.foreseen.rigid
 
     def initial_state(self) -> State:
         """Return y, yd (1, S): the equilibrium of the controlled machine at t = 0.

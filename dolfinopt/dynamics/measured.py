@@ -163,3 +163,15 @@ KEPT_INSTANTS_LIMIT = 20_000
 SAME_INSTANT_SHARE = 1e-6  # of the horizon, within which two instants are one
 JOINT_LIMIT_ROUNDING = 1e-6  # relative, of a joint's limit, which files round
 DRIVES_CHUNK = 512  # instants whose matrices are made at once for the drives' derivatives
+
+# -- state_space -----------------------------------------------------------------------------
+
+# Angle, rad, by which a closed loop moves between two evaluations of its constraints' rate: the
+# fourth-order differences leave 1e-12 of it, rounding 1e-13.
+LOOP_STEP_SHARE = 1e-3
+# Largest displacement, m or rad, along a vibration over which its poles' derivatives are taken, and
+# offsets and weights of central differences of sixth order: both errors are below 1e-10.
+POLE_STEP = 3e-3
+POLE_STENCIL = (
+    (1.0, 0.75), (-1.0, -0.75), (2.0, -0.15), (-2.0, 0.15), (3.0, 1.0 / 60.0), (-3.0, -1.0 / 60.0),
+)  # fmt: skip

@@ -16,7 +16,15 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import add_cells, build_model
-from dolfinopt.mesh.gmsh_session import FURTHER, INBOARD, OUTBOARD, PASSIVE, gmsh_on_root, mesh_geo
+from dolfinopt.mesh.gmsh_session import (
+    FURTHER,
+    INBOARD,
+    OUTBOARD,
+    PASSIVE,
+    VOID,
+    gmsh_on_root,
+    mesh_geo,
+)
 from dolfinopt.mesh.hollow import Hull, Wall, box_hull, rib_stations, tube_hull, wall_of
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
 from dolfinopt.parallel import on_root, together
@@ -230,8 +238,8 @@ def _solid_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
         tags = parts[2]
         further = [
-            InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(one.point))
-            for k, one in enumerate(arm.interfaces)
+            InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(point))
+            for k, (one, point) in enumerate(zip(arm.interfaces, arm.interface_points[1:]))
         ]
         mesh = replace(mesh, further=tuple(further))
         if arm.solid_ends > 0.0:
@@ -245,9 +253,10 @@ def _arm_mesh(
     owned, _ = compat.local_cell_counts(mesh)
     dim = mesh.geometry.dim
     corners = compat.cell_coordinates(mesh, owned)[:, :, :dim]
-    solid = np.zeros(owned, dtype=bool)
-    tagged = cell_tags.indices[cell_tags.values == PASSIVE]
-    solid[tagged[tagged < owned]] = True
+    solid, void = np.zeros((2, owned), dtype=bool)
+    for group, marked in ((PASSIVE, solid), (VOID, void)):
+        tagged = cell_tags.indices[cell_tags.values == group]
+        marked[tagged[tagged < owned]] = True
     return ArmMesh(
         name=name,
         comm=comm,
@@ -255,7 +264,7 @@ def _arm_mesh(
         centroid=corners.mean(axis=1),
         area=cell_areas(corners) if dim == 2 else cell_volumes(corners),
         passive=solid,
-        void=np.zeros(owned, dtype=bool),
+        void=void,
         inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
         outboard_facets=facet_tags.indices[facet_tags.values == OUTBOARD],
         outboard_point=np.array([length, 0.0, 0.0])[:dim],
@@ -282,7 +291,7 @@ def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmM
         number, reason = problem
         raise InputError(f"arm {arm.name!r}: region {number} of arms.regions: {reason}")
     found = region_cells(arm, centroid)
-    return replace(mesh, passive=mesh.passive | found.solid, void=found.void)
+    return replace(mesh, passive=mesh.passive | found.solid, void=mesh.void | found.void)
 
 
 def _all_cells(mesh: ArmMesh) -> Cells:

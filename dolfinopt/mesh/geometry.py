@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -20,6 +20,19 @@ from mpi4py import MPI
 
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.abaqus import read_inp
+from dolfinopt.mesh.bores import (
+    ENDS,
+    HEXAHEDRON,
+    TENSOR,
+    TETRAHEDRON,
+    Entities,
+    bores_of,
+    elements_of,
+    further_of,
+    interface_names,
+    placed,
+)
 from dolfinopt.mesh.checks import check_cells, check_mesh, facet_keys, flatten, keys_of, remedy
 from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import (
@@ -32,6 +45,7 @@ from dolfinopt.mesh.gmsh_session import (
     PASSIVE,
     QUADRILATERAL,
     TRIANGLE,
+    VOID,
     find_groups,
     gmsh_on_root,
     group_named,
@@ -58,12 +72,12 @@ LENGTH, HEIGHT, SOLID = "length (m)", "height (m)", "solid length at both ends (
 SIZE, SHAPE = SIZE_PARAMETER, "cell shape"
 
 
-def _where(arm: Arm) -> str:
+def where_of(arm: Arm) -> str:
     return f"{arm.mesh}: mesh of arm {arm.name!r}"
 
 
 @contextmanager
-def _telling_where(where: str) -> Iterator[None]:
+def telling_where(where: str) -> Iterator[None]:
     """Put file and arm before what is wrong with them, and before what Gmsh says."""
     try:
         yield
@@ -87,10 +101,10 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
         InputError: one line that names file, arm and remedy. Other errors are this program's.
     """
     assert arm.mesh is not None
-    where = _where(arm)
+    where = where_of(arm)
     readers = {".geo": _read_geo, ".msh": _read_msh, ".step": read_step, ".stp": read_step}
     unknown: list[str] = []
-    with _telling_where(where):
+    with telling_where(where):
         with silent_terminal():
             solid_done = readers[Path(arm.mesh).suffix.lower()](gmsh, arm, unknown)
         groups = find_groups(gmsh, unknown)
@@ -404,12 +418,6 @@ def _same_places(a: np.ndarray, b: np.ndarray, tolerance: float) -> bool:
 # `arms.interfaces`; in a STEP file without such names they are the bores about the joint axes, or
 # the flat ends there. Volumes, or STEP products, whose names begin with passive stay solid.
 
-TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
-# From Gmsh's order of a hexahedron's corners to that of a tensor product.
-TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
-Entities = dict[int, list[int]]
-ENDS = (INBOARD, OUTBOARD)
-
 
 def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
     """Make the Gmsh model of a solid arm with a mesh file: read, mesh, name the groups, check.
@@ -421,34 +429,13 @@ def build_solid(gmsh: Any, arm: Arm) -> np.ndarray:
     Raises:
         InputError: one line that names file, arm and remedy.
     """
-    with _telling_where(_where(arm)):
+    with telling_where(where_of(arm)):
         with silent_terminal():
-            step = Path(str(arm.mesh)).suffix.lower() in (".step", ".stp")
-            groups = (_read_step if step else _read_groups)(gmsh, arm)
+            readers = {".step": _read_step, ".stp": _read_step, ".inp": read_inp}
+            groups = readers.get(Path(str(arm.mesh)).suffix.lower(), read_groups)(gmsh, arm)
+            groups = placed(gmsh, groups, arm)
         _set_groups(gmsh, groups, arm)
         return _checked(gmsh, groups, arm)
-
-
-def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Read the solid of a .msh file, of whatever cells.
-
-    Returns:
-        Points by their tags (n, 3), m; cells (m, c) in Gmsh's order; points (k, 3) of the inboard
-        and of the outboard interface.
-
-    Raises:
-        InputError: one line that names file, arm and remedy.
-    """
-    with _telling_where(_where(arm)):
-        groups = _read_groups(gmsh, arm)
-        tags, places, _ = gmsh.model.mesh.getNodes()
-        points = np.zeros((int(tags.max()) + 1, 3))
-        points[tags.astype(int)] = places.reshape(-1, 3)
-        cells = _elements(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
-        ends = [points[np.unique(_elements(gmsh, 2, groups[tag]))] for tag in ENDS]
-        for name, at, x in zip(("inboard", "outboard"), ends, (0.0, arm.length), strict=True):
-            _check_place(at, name, x, arm)
-    return points, cells, ends
 
 
 def _mesh(gmsh: Any, arm: Arm) -> None:
@@ -462,7 +449,7 @@ def _mesh(gmsh: Any, arm: Arm) -> None:
     gmsh.model.mesh.generate(3)
 
 
-def _read_groups(gmsh: Any, arm: Arm) -> Entities:
+def read_groups(gmsh: Any, arm: Arm) -> Entities:
     """Read a .msh or .geo file and return the entities of our groups by their names there."""
     open_file(gmsh, str(arm.mesh))
     if Path(str(arm.mesh)).suffix.lower() == ".geo":
@@ -471,38 +458,27 @@ def _read_groups(gmsh: Any, arm: Arm) -> Entities:
     for dim, tag in model.getPhysicalGroups():
         if dim < 2:
             continue
-        kinds = (INBOARD, OUTBOARD) if dim == 2 else (PASSIVE, DESIGN)
+        kinds = (INBOARD, OUTBOARD) if dim == 2 else (PASSIVE, VOID, DESIGN)
         name = model.getPhysicalName(dim, tag)
-        group = _further(arm).get(name.strip().casefold()) if dim == 2 else None
+        group = further_of(arm).get(name.strip().casefold()) if dim == 2 else None
         group = group or group_named(name, *kinds)
         if group is not None:
             found[group] += model.getEntitiesForPhysicalGroup(dim, tag).tolist()
-    names = _interface_names(arm)
-    for tag, name in names.items():
-        if not found[tag]:
+    for tag, name in interface_names(arm).items():
+        if not found[tag] and tag not in bores_of(arm):
             raise InputError(
                 f'no faces in a group "{name}"; name the interface\'s faces so: '
                 f'Physical Surface("{name}") = {{...}}'
             )
     if not found[DESIGN]:
         volumes = [volume for _, volume in model.getEntities(3)]
-        found[DESIGN] = [volume for volume in volumes if volume not in found[PASSIVE]]
+        stays = found[PASSIVE] + found[VOID]
+        found[DESIGN] = [volume for volume in volumes if volume not in stays]
     return found
 
 
 def _none(arm: Arm) -> Entities:
-    return {tag: [] for tag in (*NAMES, *_further(arm).values())}
-
-
-def _further(arm: Arm) -> dict[str, int]:
-    """Return the groups of the arm's further interfaces by their names, small letters."""
-    return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
-
-
-def _interface_names(arm: Arm) -> dict[int, str]:
-    """Return the names of all interfaces by their groups."""
-    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.interfaces)}
-    return {INBOARD: NAMES[INBOARD], OUTBOARD: NAMES[OUTBOARD], **more}
+    return {tag: [] for tag in (*NAMES, *further_of(arm).values())}
 
 
 def _read_step(gmsh: Any, arm: Arm) -> Entities:
@@ -526,7 +502,9 @@ def _read_step(gmsh: Any, arm: Arm) -> Entities:
         group = group_named(name, PASSIVE) or DESIGN
         found[group] += [tag for _, tag in parts]
     places = ((0.0, 0.0), *(point[:2] for point in arm.interface_points))
-    for tag, place in zip(_interface_names(arm), places, strict=True):
+    for tag, place in zip(interface_names(arm), places, strict=True):
+        if tag in bores_of(arm):
+            continue
         named = _named(model, faces_named, tag, everywhere, arm)
         found[tag] = named or _joint_faces(model, tag, place, arm)
     model.removePhysicalGroups()
@@ -545,7 +523,7 @@ def _named(
     model: Any, shapes: StepShapes, group: int, everywhere: np.ndarray, arm: Arm
 ) -> list[int]:
     """Return the faces that a STEP file names as the group's."""
-    further = _further(arm)
+    further = further_of(arm)
 
     def belongs(name: str) -> bool:
         return (further.get(name) or group_named(name, INBOARD, OUTBOARD)) == group
@@ -559,7 +537,7 @@ def _named(
     ]
     if not found:
         raise InputError(
-            f'the faces named "{_interface_names(arm)[group]}" are not where the file says'
+            f'the faces named "{interface_names(arm)[group]}" are not where the file says'
         )
     return found
 
@@ -587,7 +565,7 @@ def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -
     if ends:
         return ends
     if group >= FURTHER:
-        name = _interface_names(arm)[group]
+        name = interface_names(arm)[group]
         raise InputError(
             f'no faces of interface "{name}": expected a face named so, or a bore about the line '
             f"along z through its point ({x:g}, {y:g}) m"
@@ -602,7 +580,7 @@ def _joint_faces(model: Any, group: int, place: tuple[float, float], arm: Arm) -
 def _set_groups(gmsh: Any, groups: Entities, arm: Arm) -> None:
     """Put our groups in place of the file's, after a look at the kinds of cells."""
     model = gmsh.model
-    solids = groups[DESIGN] + groups[PASSIVE]
+    solids = [solid for tag in (DESIGN, PASSIVE, VOID) for solid in groups[tag]]
     kinds = {int(kind) for solid in solids for kind in model.mesh.getElements(3, solid)[0]}
     if not kinds:
         raise InputError("it has no cells in space; mesh its volumes in 3D")
@@ -632,18 +610,18 @@ def _checked(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     tags, places, _ = gmsh.model.mesh.getNodes()
     points = np.zeros((int(tags.max()) + 1, 3))
     points[tags.astype(int)] = places.reshape(-1, 3)
-    cells = _elements(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
+    cells = elements_of(gmsh, 3, groups[DESIGN] + groups[PASSIVE] + groups[VOID])
     cells = cells[:, TENSOR[cells.shape[1]]]
     check_cells(points, cells)
     known, largest = facet_keys(cells), int(cells.max())
     used, found = points[np.unique(cells)], []
-    for tag, name in _interface_names(arm).items():
-        facets = _elements(gmsh, 2, groups[tag])
+    for tag, name in interface_names(arm).items():
+        facets = elements_of(gmsh, 2, groups[tag])
         if facets.max() > largest or not np.isin(keys_of(facets, largest), known).all():
             raise InputError(f'group "{name}" has facets of no cells; repair the mesh')
         if tag in ENDS:  # the reference point of another may lie anywhere
             x = 0.0 if tag == INBOARD else arm.length
-            _check_place(points[facets].reshape(-1, 3), name, x, arm)
+            check_place(points[facets].reshape(-1, 3), name, x, arm)
         found += [points[facets].reshape(-1, 3), points[facets].mean(axis=1)]
     for k, (key, size) in enumerate((("height", arm.height), ("thickness", arm.thickness)), 1):
         wide = float(np.ptp(used[:, k]))
@@ -655,19 +633,7 @@ def _checked(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _elements(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
-    """Return the nodes (n, corners) of the elements of entities, in Gmsh's order."""
-    rows = []
-    for entity in entities:
-        for ids, nodes in zip(*gmsh.model.mesh.getElements(dim, entity)[1:], strict=True):
-            rows.append(nodes.reshape(len(ids), -1).astype(int))
-    if not rows or len({row.shape[1] for row in rows}) > 1:
-        kind = "faces" if dim == 2 else "volumes"
-        raise InputError(f"its {kind} carry no elements of one kind; save the mesh of all of them")
-    return np.concatenate(rows)
-
-
-def _check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
+def check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     tolerance = arm.interface_offset or FRAME_TOLERANCE * max(arm.height, arm.thickness)
     if np.linalg.norm(middle - [x, 0.0, 0.0]) > tolerance:
@@ -690,12 +656,14 @@ class Tetrahedra:
         points: (n, 3) in the arm's frame, m.
         cells: (m, 4) of positive volume.
         inboard, outboard: (k, 3) nodes of the interfaces' facets.
+        further: those of further interfaces by their names.
     """
 
     points: np.ndarray
     cells: np.ndarray
     inboard: np.ndarray
     outboard: np.ndarray
+    further: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
 
     kind: ClassVar[str] = "tetrahedra"
 
@@ -792,7 +760,7 @@ def _meshed(
     model.mesh.createGeometry()
     faces = [tag for _, tag in model.getEntities(2)]
     chosen = {}
-    for group, mark in zip((INBOARD, OUTBOARD), interfaces, strict=True):
+    for group, mark in zip(ENDS, interfaces, strict=True):
         chosen[group] = _faces_of(model, faces, points, triangles, mark)
     solid = model.geo.addVolume([model.geo.addSurfaceLoop(faces)])
     model.geo.synchronize()
@@ -846,7 +814,7 @@ def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahed
                 for face in interfaces[group]
             ]
         )
-        for group in (INBOARD, OUTBOARD)
+        for group in ENDS
     ]
     return Tetrahedra(points[used], cells.reshape(-1, 4), *facets)
 
@@ -892,8 +860,11 @@ def add_cells(model: Any, mesh: InterfaceMesh) -> None:
     model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
     model.addPhysicalGroup(dim, [solid], DESIGN)
     model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
-    for group, facets in ((INBOARD, mesh.inboard), (OUTBOARD, mesh.outboard)):
+    named = [(INBOARD, NAMES[INBOARD], mesh.inboard), (OUTBOARD, NAMES[OUTBOARD], mesh.outboard)]
+    if isinstance(mesh, Tetrahedra):
+        named += [(FURTHER + k, name, own) for k, (name, own) in enumerate(mesh.further.items())]
+    for group, name, facets in named:
         face = model.addDiscreteEntity(dim - 1)
         model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
         model.addPhysicalGroup(dim - 1, [face], group)
-        model.setPhysicalName(dim - 1, group, NAMES[group])
+        model.setPhysicalName(dim - 1, group, name)

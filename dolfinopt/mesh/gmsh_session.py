@@ -131,9 +131,10 @@ def mesh_surfaces(gmsh: Any, shape: str | None) -> None:
 # Whatever a user's file calls its groups and however it numbers them, they become these four.
 
 # Physical groups of the model.
-INBOARD, OUTBOARD, DESIGN, PASSIVE = 1, 2, 3, 4
+INBOARD, OUTBOARD, DESIGN, PASSIVE, VOID = 1, 2, 3, 4, 5
 FURTHER = 11  # the first of a solid's further interfaces; the next ones follow
 NAMES = {INBOARD: "inboard", OUTBOARD: "outboard", DESIGN: "design", PASSIVE: "passive"}
+NAMES[VOID] = "void"  # of solids alone; in the plane arms.regions say so
 
 
 def group_named(name: str, *groups: int) -> int | None:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.bores import ENDS, TENSOR, elements_of
 from dolfinopt.mesh.checks import facet_corners
-from dolfinopt.mesh.geometry import TENSOR, read_cells
+from dolfinopt.mesh.geometry import check_place, read_groups, telling_where, where_of
+from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
 from dolfinopt.mesh.hollow import Hull, hull_of, stations
 from dolfinopt.mesh.measured import RAY_SHIFT_SHARE, SAME_CROSSING_SHARE
 
@@ -42,6 +44,28 @@ def read_hull(gmsh: Any, arm: Arm) -> Hull:
     hull = hull_of(outer)
     _check_room(hull, arm)
     return hull
+
+
+def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Read the solid of a .msh file, of whatever cells.
+
+    Returns:
+        Points by their tags (n, 3), m; cells (m, c) in Gmsh's order; points (k, 3) of the inboard
+        and of the outboard interface.
+
+    Raises:
+        InputError: one line that names file, arm and remedy.
+    """
+    with telling_where(where_of(arm)):
+        groups = read_groups(gmsh, arm)
+        tags, places, _ = gmsh.model.mesh.getNodes()
+        points = np.zeros((int(tags.max()) + 1, 3))
+        points[tags.astype(int)] = places.reshape(-1, 3)
+        cells = elements_of(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
+        ends = [points[np.unique(elements_of(gmsh, 2, groups[tag]))] for tag in ENDS]
+        for name, at, x in zip(("inboard", "outboard"), ends, (0.0, arm.length), strict=True):
+            check_place(at, name, x, arm)
+    return points, cells, ends
 
 
 def _surface(cells: np.ndarray) -> np.ndarray:

@@ -95,3 +95,10 @@ LAYER_SHARE = 0.25  # of the largest wall: a layer of cells, and one more for ea
 WORD_CHARACTERS_LIMIT = 250  # of a name, number or text; Gmsh's parser has buffers of 256 and 1024
 LINE_CHARACTERS_LIMIT = 1000  # of a line that Gmsh sees; it reads blocks of 8192
 UNREAD_STATEMENTS_LIMIT = 1000  # of a .geo file that Gmsh gave up: no file of an arm has more
+
+# -- abaqus, bores ---------------------------------------------------------------------------
+
+INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
+# By how much nodes may be off a bore's radius: CAD programs place them to 1e-6, converters in
+# single precision to 1e-4, facets of stl files with 12 sides by 3 %.
+BORE_RADIUS_SHARE = 0.02

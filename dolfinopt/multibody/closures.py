@@ -31,8 +31,8 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Load
-from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, product
-from dolfinopt.multibody.end_effector import Posed, rotated
+from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, compose, product
+from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.measured import INDEPENDENT_SHARE
 from dolfinopt.multibody.mechanism import Closure, Mechanism, Site
 
@@ -62,7 +62,7 @@ class SiteMotion:
             return
         place, turned = posed.interface(*site)
         self.place = place + product(turned, point[:, None])
-        self.R = rotated(turned, R)
+        self.R = compose(turned, R)
         if (cart := mechanism.cart_coordinate) is not None:
             self.by_place[0, cart], self.order[cart] = 1.0, 0
         for step, (i, number) in enumerate(self.way):

@@ -46,6 +46,11 @@ def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return out
 
 
+def compose(R: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """Return R S of rotations (d, d, n), or one (d, d)."""
+    return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)
+
+
 def transposed_product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return A' B (j, ..., n) likewise."""
     return product(A.swapaxes(0, 1), B)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
-from dolfinopt.multibody.dimension import Turning, product
+from dolfinopt.multibody.dimension import Turning, compose, product
 from dolfinopt.multibody.kinematics import MovingJoint
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
@@ -48,7 +48,7 @@ def end_rotation(
     end = mechanism.way[-1]
     R = Posed(mechanism, motion.q, q).interface(*end)[1]
     rigid = Posed(mechanism, desired.q, np.zeros_like(q)).interface(*end)[1]
-    apart = rotated(R, rigid.swapaxes(0, 1))
+    apart = compose(R, rigid.swapaxes(0, 1))
     dim = mechanism.constants[0].dim
     vectors = dim.rotation_vector(apart.reshape(dim.d, dim.d, -1))
     return np.broadcast_to(vectors.T, (len(q), dim.r))
@@ -155,7 +155,7 @@ class Posed:
             moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
             if moving.is_offset:
                 place = place + product(R, moving.r)
-            self._bodies[i] = moving, place, rotated(R, moving.R)
+            self._bodies[i] = moving, place, compose(R, moving.R)
         return self._bodies[i]
 
     def section(self, i: int, number: int) -> Section:
@@ -169,11 +169,6 @@ class Posed:
         """Return its place (d, n) and its rotation; of `GROUND` where that is."""
         if (i, number) not in self._interfaces:
             (_, place, R), section = self.body(i), self.section(i, number)
-            turned = R if section.turning is None else rotated(R, section.turning.R)
+            turned = R if section.turning is None else compose(R, section.turning.R)
             self._interfaces[i, number] = place + product(R, section.place), turned
         return self._interfaces[i, number]
-
-
-def rotated(R: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """Return R S of rotations (d, d, n), or one (d, d)."""
-    return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)

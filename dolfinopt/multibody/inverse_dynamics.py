@@ -13,6 +13,7 @@ import numpy as np
 
 from dolfinopt.multibody.body_motion import BodyMotion, Load
 from dolfinopt.multibody.closures import Loops
+from dolfinopt.multibody.dimension import compose, product
 from dolfinopt.multibody.kinematics import Interface, MovingJoint
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
@@ -30,12 +31,27 @@ class Link:
         body: itself.
         interfaces: its outboard ones on which something sits, by number.
         carried: what it carries there without a joint, as it moves, by number.
+        applied: what given forces ask of it there, by number.
     """
 
     joint: MovingJoint
     body: BodyMotion
     interfaces: dict[int, Interface]
     carried: dict[int, BodyMotion]
+    applied: dict[int, Applied]
+
+
+@dataclass(frozen=True, eq=False)
+class Applied:
+    """What given forces on an interface ask of it: their negatives, in the body's components.
+
+    Attributes:
+        load: of all forces.
+        in_world: the part that keeps its direction in the world.
+    """
+
+    load: Load
+    in_world: Load
 
 
 def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Link]:
@@ -60,8 +76,42 @@ def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Lin
             for s, interface in interfaces.items()
             if (i, s) in tree.loads
         }
-        links[i] = Link(moving, body, interfaces, carried)
-    return [links[i] for i in range(len(links))]
+        links[i] = Link(moving, body, interfaces, carried, {})
+    found = [links[i] for i in range(len(links))]
+    if tree.forces:
+        _apply_forces(tree, found, motion)
+    return found
+
+
+def _apply_forces(tree: Mechanism, links: list[Link], motion: RigidMotion) -> None:
+    """Add the motion's given forces to the interfaces on which they act."""
+    assert motion.applied is not None, "a motion without the values of the mechanism's forces"
+    d = tree.dim.d
+    turned = rotations(tree, links)
+    for force in tree.forces:
+        i, s = force.site
+        values = -motion.applied[:, force.column].T
+        load, in_world = (values[:d], values[d:]), (0.0 * values[:d], 0.0 * values[d:])
+        if force.in_world:
+            back = turned[i].swapaxes(0, 1)
+            load = in_world = (product(back, load[0]), tree.dim.rotated(back, load[1]))
+        if (before := links[i].applied.get(s)) is not None:
+            load, in_world = _sum([before.load, load]), _sum([before.in_world, in_world])
+        links[i].applied[s] = Applied(load, in_world)
+
+
+def rotations(tree: Mechanism, links: list[Link]) -> dict[int, np.ndarray]:
+    """Return every body's rotation from its frame to the world's, (d, d, n) or (d, d)."""
+    found: dict[int, np.ndarray] = {}
+    for i in tree.order:
+        joint, R = tree.joints[i], links[i].joint.R
+        if joint.parent != GROUND:
+            interface = links[joint.parent].interfaces[joint.interface]
+            if interface.body.is_flexible:
+                R = compose(interface.turning.R, R)
+            R = compose(found[joint.parent], R)
+        found[i] = R
+    return found
 
 
 def instants_last(rates: Rates) -> np.ndarray:
@@ -108,11 +158,23 @@ def inward_pass(
                 parts.append(link.carried[s].load)
             if (i, s) in pull:
                 parts.append(pull[i, s])
-            outboard[i][s] = interface.in_body(_sum(parts))
+            loads = [interface.in_body(_sum(parts))] if parts else []
+            if s in link.applied:
+                loads.append(link.applied[s].load)
+            outboard[i][s] = _sum(loads)
         if felt:
             parts = [link.interfaces[s].at_origin(load) for s, load in outboard[i].items()]
             joints[i] = _sum([link.body.load, *parts])
     return Loads(outboard, joints)
+
+
+def carried_load(link: Link, loads: dict[int, Load], s: int) -> Load:
+    """Return the part of `Loads.outboard` that turns with an interface: without given forces."""
+    force, moment = loads[s]
+    if s not in link.applied:
+        return force, moment
+    applied = link.applied[s].load
+    return force - applied[0], moment - applied[1]
 
 
 def _sum(loads: list[Load]) -> Load:

@@ -24,8 +24,8 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.paths.tables import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
-from dolfinopt.scene.tables.arms import interface_number
 from dolfinopt.scene.tables.closures import Closures, closing_site
+from dolfinopt.scene.tables.interfaces import interface_number
 from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
 
 # -- rigid bodies ----------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def rigid_link(arm: Arm, density: float) -> ShapeIntegrals:
     if inertia is None:
         squares = (y * y + z * z, x * x + z * z, x * x + y * y)
         inertia = (*(mass * square / 12.0 for square in squares), 0.0, 0.0, 0.0)
-    further = tuple(one.point for one in arm.interfaces)
+    further = arm.interface_points[1:]
     return rigid_spatial_body(mass, centre, _tensor(inertia), (x, 0.0, 0.0), further)
 
 

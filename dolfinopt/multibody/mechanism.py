@@ -245,6 +245,23 @@ class Joint:
         return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
+@dataclass(frozen=True)
+class AppliedForce:
+    """A given force and moment on an outboard interface, whose values stand in the motion.
+
+    Attributes:
+        site: the interface.
+        column: its place among `RigidMotion.applied`.
+        in_world: whether it keeps its direction in the world; otherwise in the body's frame.
+        known: whether a control's feed-forward counts it.
+    """
+
+    site: Site
+    column: int
+    in_world: bool = True
+    known: bool = True
+
+
 def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
     """Return the diagonal of a matrix that has nothing else, or the matrix."""
     diagonal = np.diagonal(A)
@@ -271,6 +288,7 @@ class Mechanism:
         origin: (d,) of the ground's frame, which a cart moves along x, m.
         cart: its mass, kg, of the first rigid coordinate; None without one.
         scales: of every body's elastic rows, forces and moments, or none.
+        forces: given ones on interfaces.
         bearings: the bodies whose joints sit on bearings, see `joints.with_bearings`: the last
             bodies, massless, in this order.
         friction: of the joints' coordinates, or None.
@@ -285,6 +303,7 @@ class Mechanism:
     origin: np.ndarray
     cart: float | None = None
     scales: tuple[Scale, ...] = ()
+    forces: tuple[AppliedForce, ...] = ()
     bearings: tuple[int, ...] = ()
     friction: Friction | None = None
     rods: int = 0
@@ -303,6 +322,12 @@ class Mechanism:
     def rigid(self) -> Mechanism:
         """The same of bodies of the same mass and inertia that do not deform."""
         return replace(self, bodies=tuple(body.rigid_part for body in self.bodies))
+
+    @property
+    def foreseen(self) -> Mechanism:
+        """The same under the forces alone that are known in advance."""
+        known = tuple(one for one in self.forces if one.known)
+        return self if len(known) == len(self.forces) else replace(self, forces=known)
 
     # -- coordinates -------------------------------------------------------------------------
 
@@ -374,7 +399,7 @@ class Mechanism:
         for joint in self.joints:
             if joint.parent != GROUND:
                 found[joint.parent].add(joint.interface)
-        for body, interface in self.loads:
+        for body, interface in (*self.loads, *(one.site for one in self.forces)):
             found[body].add(interface)
         return tuple(tuple(sorted(one)) for one in found)
 

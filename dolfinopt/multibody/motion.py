@@ -55,15 +55,19 @@ class RigidMotion:
         q, qd, qdd: (n, 1 + arms); m and rad, per s, per s2. The first angle is measured from +x,
             each further one from the deformed outboard tangent of the arm before. On a fixed base
             x_cart is its constant position.
+        applied: (n, F, d + r) force and moment of every `mechanism.AppliedForce`, N and N m, in
+            the components it has; None without.
     """
 
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
+    applied: np.ndarray | None = None
 
     def __getitem__(self, part: slice | np.ndarray) -> RigidMotion:
         """Return it at some of the instants."""
-        return RigidMotion(self.q[part], self.qd[part], self.qdd[part])
+        applied = None if self.applied is None else self.applied[part]
+        return RigidMotion(self.q[part], self.qd[part], self.qdd[part], applied)
 
 
 @dataclass(frozen=True, eq=False)

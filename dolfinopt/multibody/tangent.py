@@ -18,6 +18,7 @@ from dolfinopt.multibody.dimension import product
 from dolfinopt.multibody.inverse_dynamics import (
     Link,
     Loads,
+    carried_load,
     interface_pushes,
     inward_pass,
     outward_pass,
@@ -258,6 +259,11 @@ def _inward_derivatives(
             s: _on_interface(tree, links, loads, places, (i, s), on_joints, ends.get((i, s)))
             for s in link.interfaces
         }
+        for s, applied in link.applied.items() if i in motions else ():
+            turned = motions[i][d : d + dim.r, size : 2 * size]  # by q, as the spin by q'
+            force, moment = applied.in_world
+            outboard[s][:d, :size] -= dim.velocity(turned, force)
+            outboard[s][d:, :size] -= dim.commutator(turned, moment)
         if link.body.is_flexible:
             part = _body_tangent(tree, link, loads, places, i, outboard, motions.get(i))
             tangents.append(part)
@@ -311,7 +317,8 @@ def _on_interface(
         return total
     total = np.concatenate(interface.in_body((total[:d], total[d:])))
     if len(kept := places.kept[i]):
-        total[:, places.of_body(i)[0]] += interface.load_by_rates(loads.outboard[i][s], kept)
+        load = carried_load(link, loads.outboard[i], s)
+        total[:, places.of_body(i)[0]] += interface.load_by_rates(load, kept)
     return total
 
 
@@ -401,6 +408,7 @@ def body_gradient(
     zeta = np.ascontiguousarray(multipliers.T)
     moves, ends = _virtual_motion(tree, links, zeta, of_forces)
     by_motion: dict[int, Motion] = {}
+    by_rotation = _by_rotation(tree, links, moves, zeta)
     gradient: dict[int, ShapeIntegrals] = {}
     for i in reversed(tree.order):
         link, own = links[i], zeta[tree.slices[i]]
@@ -413,14 +421,50 @@ def body_gradient(
             parts = [links[k].joint.pulled_back(by_motion[k]) for k in tree.hanging[i, s]]
             if s in link.carried:
                 parts.append(_motion_gradient(link.carried[s], ends[i, s]))
-            inner, displaced = interface.pulled_back(_sum_motions(parts))
-            by.append(inner)
+            if parts:
+                inner, displaced = interface.pulled_back(_sum_motions(parts))
+                by.append(inner)
+            else:
+                displaced = (np.zeros((link.body.dim.b, zeta.shape[1])),) * 3
             if link.body.is_flexible:
-                load = loads.outboard[i][s]
-                outboard[s] = _interface_weights(interface, load, moves[i], own, displaced)
+                both = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
+                outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
+                if (i, s) in by_rotation:
+                    outboard[s].value[link.body.dim.d :] += by_rotation[i, s]
         by_motion[i] = _sum_motions(by)
         gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
     return [gradient[i] for i in range(len(links))]
+
+
+def _by_rotation(
+    tree: Mechanism, links: list[Link], moves: dict[int, Load], zeta: np.ndarray
+) -> dict[Site, np.ndarray]:
+    """Return the derivatives by every interface's theta (r, n) through forces of the world.
+
+    What turns a body turns such a force the other way in the body's components.
+    """
+    found: dict[Site, np.ndarray] = {}
+    if not tree.forces:
+        return found
+    dim, of_bodies = tree.dim, dict.fromkeys(range(len(links)), np.zeros((tree.dim.r, 1)))
+    for i in reversed(tree.order):
+        link, own = links[i], zeta[tree.slices[i]]
+        total = np.zeros((dim.r, zeta.shape[1]))
+        for s, interface in link.interfaces.items():
+            turned = sum(
+                (dim.rotated(links[k].joint.R, of_bodies[k]) for k in tree.hanging[i, s]),
+                np.zeros_like(total),
+            )
+            if link.body.is_flexible:
+                turned = dim.rotated(interface.turning.R, turned)
+                found[i, s] = interface.turning.pulled(turned)
+            total += turned
+            if s in link.applied:
+                p, phi = interface.virtual(moves[i], own)
+                force, moment = link.applied[s].in_world
+                total -= dim.moment(force, p) + dim.commutator(moment, phi)
+        of_bodies[i] = total
+    return found
 
 
 def _motion_gradient(body: BodyMotion, virtual: Load) -> Motion:
@@ -460,18 +504,20 @@ def _virtual_motion(
 
 def _interface_weights(
     interface: Interface,
-    load: Load,
+    loads: tuple[Load, Load],
     virtual: Load,
     zeta: np.ndarray,
     displaced: Motion,
 ) -> Weights:
     """Return the derivatives (b, n) by (u, theta), their rates and variation."""
-    # Of a load on a flexible body's interface, `virtual` of its frame, zeta (q, n) its multipliers;
-    # `displaced` are those by (u, theta) and their rates through the interface's motion.
+    # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
+    # frame, zeta (q, n) its multipliers; `displaced` are those by (u, theta) and their rates
+    # through the interface's motion.
+    load, (own_force, own_moment) = loads
     (force, moment), dim, turning = load, interface.dim, interface.turning
     p, phi = interface.virtual(virtual, zeta)
     # The load's lever, its components, and J' of the row.
-    turned = turning.pulled(dim.moment(force, p) + dim.commutator(moment, phi))
+    turned = turning.pulled(dim.moment(own_force, p) + dim.commutator(own_moment, phi))
     by_theta = turning.by_theta(moment, -1.0)
     if by_theta is not None:
         theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][dim.d :], zeta)

@@ -200,6 +200,7 @@ FILES = {
         ("compliance", "deviation", "esl", "load_case_compliance", "orientation", "settling"),
         "motion",
     ),
+    **dict.fromkeys(("damping_ratio", "pole_frequency"), "poles"),
     **dict.fromkeys(("effort", "peak_force"), "drives"),
     **dict.fromkeys(("eigenfrequency", "first_frequency"), "frequency"),
     **dict.fromkeys(("stiffness", "tip_deflection"), "static"),

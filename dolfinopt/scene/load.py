@@ -54,6 +54,7 @@ from dolfinopt.scene.tables.arms import (
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
 from dolfinopt.scene.tables.closures import Closures, as_closure
 from dolfinopt.scene.tables.design import Law
+from dolfinopt.scene.tables.forces import Force
 from dolfinopt.scene.tables.machine import Joint
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import NEEDS, Objective, WorstBy
@@ -80,8 +81,13 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Arrays of tables of which --set knows single ones by their name.
-NAMED: dict[str, type[Table]] = {"arms": Arm, "joints": Joint, "closures": Closures}
+# Arrays of tables of which --set knows single ones by their name, or their number.
+NAMED: dict[str, type[Table]] = {
+    "arms": Arm,
+    "joints": Joint,
+    "closures": Closures,
+    "forces": Force,
+}
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
@@ -219,7 +225,7 @@ def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
         if not isinstance(arm, dict) or not isinstance(mesh := arm.get("mesh"), str):
             continue
         kind, solid = Path(mesh).suffix.lower(), arm.get("cell_shape") in SOLID_SHAPES
-        meshed = kind == ".msh" and not (solid and key == "cell_shape")
+        meshed = kind in (".msh", ".inp") and not (solid and key == "cell_shape")
         if kind == ".geo" and key == "mesh_size" and not solid:
             meshed = f'{SIZE_PARAMETER}"' not in Path(mesh).read_text("utf-8", errors="replace")
         if meshed:

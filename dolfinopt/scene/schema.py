@@ -19,10 +19,12 @@ from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material, interface_number
+from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer
+from dolfinopt.scene.tables.forces import Force
+from dolfinopt.scene.tables.interfaces import interface_number
 from dolfinopt.scene.tables.machine import Closure, Control, Damping, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
@@ -71,6 +73,9 @@ class Scene(Table):
     payload: Payload = Field(
         description="load of the end-effector",
         examples=["[payload] with mass = 2.0 [kg], or mass = 0.0 without a load"],
+    )
+    forces: tuple[Force, ...] = Field(
+        default=(), description="given forces on interfaces of arms; none without this table"
     )
     damping: Damping = Field(default=Damping(), description="structural damping")
     reduction: Reduction = Field(default=Reduction(), description="model reduction")
@@ -186,9 +191,12 @@ class Scene(Table):
 
     @property
     def used_interfaces(self) -> frozenset[tuple[int, int]]:
-        """Return the interfaces, as of `end_effector`, on which joints or the payload sit."""
+        """Return the interfaces, as of `end_effector`, of joints, forces and the payload."""
         index = {arm.name: i for i, arm in enumerate(self.arms)}
         found = {self.end_effector}
+        for force in self.forces:
+            if (k := index.get(force.arm)) is not None:
+                found.add((k, interface_number(self.arms[k], force.interface) or 0))
         for joint in self.joints:
             if (k := index.get(joint.parent)) is not None:
                 found.add((k, interface_number(self.arms[k], joint.parent_interface) or 0))

@@ -24,8 +24,8 @@ Action = Literal["optimize", "simulate", "sample"]
 
 # Scenes that differ in these tables alone have the same arms, which are built and factorised once.
 SCENARIO = frozenset(
-    "motion control closure payload damping reduction simulation objective constraints optimizer "
-    "scenarios".split()
+    "motion control closure payload forces damping reduction simulation objective constraints "
+    "optimizer scenarios".split()
 )
 # Bases that do not depend on `SCALING`: Krylov's shifts and the Gramian's band are frequencies.
 SCALABLE = ("craig-bampton", "modal")

@@ -23,7 +23,12 @@ from dolfinopt.study import variants
 # These values of material and arms scale the integrals of the reduced arms; the thickness in the
 # plane alone: in space it is one of the cells' sides.
 SCALING = ("young_modulus", "density", "thickness")
-APART = ("motion", "payload", "damping")  # tables that leave the reduced bodies as they are
+APART = (
+    "motion",
+    "payload",
+    "forces",
+    "damping",
+)  # tables that leave the reduced bodies as they are
 
 
 def simulate_scenarios(

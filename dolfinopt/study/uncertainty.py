@@ -37,7 +37,8 @@ from dolfinopt.study.variants import asked_by, axis_of, changed
 
 # Tables and keys that do not change what a given design does, or that no given design outlives.
 TABLES = (
-    "motion", "control", "closure", "payload", "damping", "material", "arms", "interpolation",
+    "motion", "control", "closure", "payload", "forces", "damping", "material", "arms",
+    "interpolation",
 )  # fmt: skip
 RESULTS = (*QUANTITIES, "at [s]")
 LEAST = 10  # samples: fewer tell nothing of the scatter
@@ -182,7 +183,8 @@ def parse_input(scene: Scene, text: str) -> Input:
             )
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
-        field = field_at(("arms", 0, parts[-1]) if parts[0] == "arms" else tuple(parts))
+        several = parts[0] in ("arms", "forces")
+        field = field_at((parts[0], 0, parts[-1]) if several else tuple(parts))
         try:
             return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
         except InputError as error:
@@ -192,6 +194,10 @@ def parse_input(scene: Scene, text: str) -> Input:
 def nominal_value(scene: Scene, key: str) -> object:
     """Return the scene's value of a key, None where arms differ in it."""
     parts = key.split(".")
+    if parts[0] == "forces":  # told by their numbers
+        places = [int(parts[1])] if len(parts) == 3 else range(len(scene.forces))
+        found = {getattr(scene.forces[i], parts[-1], None) for i in places}
+        return found.pop() if len(found) == 1 else None
     if parts[0] != "arms":
         return getattr(getattr(scene, parts[0]), parts[1], None)
     count = len(scene.arms)

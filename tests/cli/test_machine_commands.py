@@ -7,6 +7,7 @@ import pytest
 from machines import controlled, loop
 from mpi4py import MPI
 from runs import refusal, run
+from scipy.io import loadmat
 
 from dolfinopt.part.files.scene_file import toml_text
 
@@ -47,6 +48,36 @@ def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
     run("plot", out)
     WORLD.barrier()
     assert (out / "drives.png").stat().st_size > 5000
+
+
+def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys):
+    """Both files hold the same matrices, with names, whatever the ranks; refusals write nothing."""
+    path, out = write_scene(controlled(), shared_tmp_path), shared_tmp_path / "run"
+    run("simulate", path, *QUICK, "--out", out, "--no-plots")
+    WORLD.barrier()
+    run("export", out, "--state-space", 3.0)
+    run("export", path, *QUICK, "--state-space", 3.0, "--out", shared_tmp_path / "scene")
+    WORLD.barrier()
+    folders = (out / "state-space", shared_tmp_path / "scene")
+    first, second = (np.load(one / "state_space.npz") for one in folders)
+    assert all(np.array_equal(first[key], second[key]) for key in first.files)
+    matlab = loadmat(folders[0] / "state_space.mat")
+    for key in "ABCD":
+        assert np.array_equal(matlab[key], first[key])
+    assert [str(one[0]) for one in matlab["inputs"][:, 0]] == list(first["inputs"])
+    assert first["A"].shape == (len(first["states"]),) * 2
+    if WORLD.rank == 0:
+        told = capsys.readouterr().out
+        assert "with its control, at 3 s: 22 states, 6 inputs, 7 outputs" in told
+    for words, expected in (
+        ([path, "--state-space", 5.0], "motion.horizon = 3"),
+        ([path, "--state-space", 1.0, "--urdf"], "--urdf"),
+        ([out, "--state-space", 1.0, "--set", "payload.mass=2"], "--set"),
+        ([out], "--state-space T"),
+    ):
+        line = ["export", *words, "--out", shared_tmp_path / "none"]
+        refusal(lambda line=line: run(*line), expected)
+    assert not (shared_tmp_path / "none").exists()
 
 
 def test_bodies_of_a_loop_are_exported(shared_tmp_path):

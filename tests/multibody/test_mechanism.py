@@ -21,13 +21,14 @@ from bodies import (
 from runs import ROOT
 
 from dolfinopt.multibody.end_effector import (
+    Posed,
     deviation,
     end_effector,
     end_effector_gradient,
     end_rotation,
 )
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
-from dolfinopt.multibody.mechanism import JointHardware
+from dolfinopt.multibody.mechanism import AppliedForce, JointHardware, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.scene.load import load_scene
@@ -55,7 +56,12 @@ class Machine:
 
     def split(self, states: np.ndarray) -> tuple[RigidMotion, list[np.ndarray]]:
         """Return rigid motion and elastic coordinates with rates."""
-        return RigidMotion(*states[:, :, : self.rigid]), list(states[:, :, self.rigid :])
+        forces, (count, b) = self.mechanism.forces, (states.shape[1], self.mechanism.dim.b)
+        motion = RigidMotion(*states[:, :, : self.rigid])
+        if forces:
+            values = np.random.default_rng(11).normal(size=(count, len(forces), b))
+            motion = replace(motion, applied=values)
+        return motion, list(states[:, :, self.rigid :])
 
     def forces(self, states: np.ndarray, mechanism: Any = None) -> np.ndarray:
         """Return the forces of rigid and elastic coordinates (n, S)."""
@@ -76,7 +82,17 @@ def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
     return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
 
 
+def given(mechanism: Mechanism) -> tuple[AppliedForce, ...]:
+    """Return forces of the world and the arm on every interface, two together at the end."""
+    every = [(i, s) for i, c in enumerate(mechanism.constants) for s in range(len(c.points))]
+    sites = [mechanism.end, *every]
+    return tuple(AppliedForce(site, k, in_world=k % 2 == 0) for k, site in enumerate(sites))
+
+
 def machine_of(kind: str, count: int = 4) -> Machine:
+    if kind.endswith(PUSHED):
+        one = machine_of(kind.removesuffix(PUSHED), count)
+        return replace(one, mechanism=replace(one.mechanism, forces=given(one.mechanism)))
     rng = np.random.default_rng(7)
     arms, bent = kind.removesuffix(", stiffened"), kind.endswith("stiffened")
     if arms == "tree":
@@ -94,7 +110,10 @@ def machine_of(kind: str, count: int = 4) -> Machine:
 
 
 CHAINS = [f"{arms}{bent}" for arms in ("1 arm", "2 arms", "3 arms") for bent in ("", ", stiffened")]
-KINDS = [*CHAINS, "tree", "tree, stiffened"]
+PUSHED = ", pushed"
+OF_POINTS = [*CHAINS, "tree"]  # a stiffened tree: by what it has of the plane's
+KINDS = [*OF_POINTS, "tree, stiffened", *(k + PUSHED for k in ("3 arms, stiffened", "tree"))]
+KINDS += ["tree, stiffened" + PUSHED]
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -102,7 +121,7 @@ def machine(request) -> Machine:
     return machine_of(request.param)
 
 
-@pytest.mark.parametrize("kind", KINDS[:-1])  # a stiffened tree: by what it has of the plane's
+@pytest.mark.parametrize("kind", OF_POINTS)
 def test_forces_are_those_of_the_points(kind: str) -> None:
     """Lagrange's equations in the plane, Newton's law for every point in space."""
     one = machine_of(kind, 3)
@@ -113,6 +132,26 @@ def test_forces_are_those_of_the_points(kind: str) -> None:
     motion, rates = one.split(one.states)
     alone = elastic_residual(one.mechanism, motion, *rates)
     assert_close(alone, found[:, one.rigid :], ROUNDING)
+
+
+@pytest.mark.parametrize("in_world", [True, False])
+@pytest.mark.parametrize("kind", ["3 arms", "3 arms, stiffened", "tree, stiffened"])
+def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
+    """On every coordinate what the end-effector's virtual displacement and rotation ask for."""
+    one = machine_of(kind)
+    pushed = replace(one.mechanism, forces=(AppliedForce(one.mechanism.end, 0, in_world),))
+    motion, (q, qd, qdd) = one.split(one.states)
+    values = np.random.default_rng(3).normal(size=(len(q), one.mechanism.dim.b))
+    motion = replace(motion, applied=values[:, None])
+    rows, drives = inverse_dynamics(pushed, motion, q, qd, qdd)
+    d, R = one.mechanism.dim.d, np.eye(one.mechanism.dim.d)[:, :, None]
+    if not in_world:
+        R = Posed(one.mechanism, motion.q, q).body(one.mechanism.end[0])[2]
+    force = np.einsum("ijn,nj->ni", np.broadcast_to(R, (d, d, len(q))), values[:, :d])
+    moment = one.mechanism.dim.rotated(R * np.ones(len(q)), values[:, d:].T).T
+    of_q, of_rigid, _ = end_effector_gradient(one.mechanism, motion, q, force, moment)
+    expected = one.forces(one.states) - np.hstack([of_rigid, of_q])
+    assert_close(np.hstack([drives, rows]), expected, ROUNDING)
 
 
 def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
@@ -189,7 +228,7 @@ def test_end_effector(machine: Machine) -> None:
         return float(np.sum(weights * end_effector(one, moved, q)) + 0.5 * squares.sum())
 
     def along(h: float) -> float:
-        moved = RigidMotion(motion.q + h * turn, motion.qd, motion.qdd)
+        moved = replace(motion, q=motion.q + h * turn)
         return worth(mechanism, moved, q + h * step)
 
     expected = np.sum(by_q * step) + np.sum(by_rigid * turn)

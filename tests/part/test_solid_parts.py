@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from machines import fork
 from mpi4py import MPI
 from parts import write_run
 from runs import ROOT, run, shell
@@ -20,6 +21,7 @@ import dolfinopt.part.solid.part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.part.files.scene_file import scene_text
 from dolfinopt.part.files.step import solid_text
 from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.plane.curves import Arc, Piece, Shape
@@ -38,6 +40,7 @@ from dolfinopt.part.solid.surface import (
     nodal_densities,
     outside,
 )
+from dolfinopt.scene.load import scene_from_dict
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
@@ -314,8 +317,40 @@ def test_bores_are_interfaces_of_parts(tmp_path):
     for faces, facets in ((domain.inboard, found.inboard), (domain.outboard, found.outboard)):
         assert area_of(found.points[facets]) == pytest.approx(area_of(faces), rel=0.02)
         assert distance_to_faces(found.points[np.unique(facets)], faces).max() < 1e-9
-    with pytest.raises(InputError, match="several outboard interfaces"):
-        solid_mesh(replace(part, domain=replace(domain, further=1)), 0.01)
+
+
+@pytest.mark.slow
+def test_part_with_a_further_interface_is_a_link_again(tmp_path):
+    """Its mesh holds the facets of all interfaces by name, a patch to a cell's side."""
+    side = {"name": "side", "point": (0.25, 0.02, 0.0), "radius": 0.03}
+    (tmp_path / "table.csv").write_text("t,swing\n0,0\n0.2,1\n")
+    tree = fork() | {"payload": {"mass": 1.0}, "reduction": {"coordinates": 12}}
+    link = tree["arms"][0] | {"cells": [20, 6, 4], "interfaces": [side], "passive": 0.03}
+    tree |= {"arms": [link], "joints": tree["joints"][:1]}
+    tree["forces"] = [{"arm": "link", "interface": "side", "force": [0.0, 500.0, 0.0]}]
+    scene = scene_from_dict(tree, str(tmp_path / "link.toml"))
+    mesh = arm_mesh(MPI.COMM_SELF, scene.arms[0])
+    x, y, z = mesh.centroid.T
+    density = 1.0 * ((np.abs(y) > 0.007) | (np.abs(z) > 0.005) | (np.abs(x - 0.25) < 0.05))
+    density[mesh.passive] = 1.0
+    domain = solid_domain(mesh, density)
+    assert list(domain.further) == ["side"] and len(domain.further["side"]) > 4
+    part = make_solid_part(domain)
+    found = solid_mesh(part, mesh_size(part))
+    area = area_of(found.points[found.further["side"]])
+    around = domain.further["side"]
+    expected = area_of(around[:, :3]) + area_of(around[:, [0, 2, 3]])
+    assert area == pytest.approx(expected, rel=0.15)
+    assert distance_to_faces(found.points[found.further["side"]].mean(axis=1),
+                             domain.further["side"]).max() < 1e-3  # fmt: skip
+    found.write(tmp_path / "link.msh")
+    (tmp_path / "part.toml").write_text(scene_text(scene, {0: part}, tmp_path))
+    again = do.load_scene(tmp_path / "part.toml")
+    assert again.arms[0].interfaces[0].radius is None
+    back = arm_mesh(MPI.COMM_SELF, again.arms[0])
+    assert back.area.sum() == pytest.approx(part.volume, rel=1e-6)
+    assert len(back.further[0].facets) == len(found.further["side"])
+    assert np.allclose(back.further[0].point, side["point"])
 
 
 @pytest.mark.parametrize("cell", [0.014, 0.016])

@@ -13,7 +13,7 @@ from remainders import hold_instants, taylor, wave
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, ObjectiveKind
+from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, POLES, ObjectiveKind
 
 WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
@@ -42,6 +42,8 @@ BASES = {
     "fork": ("", ROUGHLY[2:]),
 }  # fmt: skip
 DRIVES = "t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n"
+PUSH = "t,fx,fy,mz\n0,0,20,1\n0.7,40,-20,5\n1.4,-60,0,-2\n2.0,10,30,0\n"
+TWIST = "t,fx,fy,fz,mx,my,mz\n0,0,1,2,0,0.5,1\n0.1,10,-5,2,1,0,0\n0.2,0,5,0,-1,1,0.2\n"
 # Strokes with a stop between them.
 STROKES = "t,cart,arm1,arm2\n0,0,2,-1.5\n0.6,0.1,1.5,-1\n0.9,0.1,1.5,-1\n1.9,0,1,-0.8\n"
 SPATIAL_STROKES = "t,yaw,shoulder,elbow\n0,0,0.4,-1.9\n0.2,0.4,0.7,-1.5\n0.3,0.4,0.7,-1.5\n"
@@ -61,6 +63,8 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
         for name, text in (("drives.csv", DRIVES), ("skew.geo", SKEW)):
             (folder / name).write_text(text)
         (folder / "strokes.csv").write_text(STROKES)
+        (folder / "push.csv").write_text(PUSH)
+        (folder / "twist.csv").write_text(TWIST)
         (folder / "spatial.csv").write_text(SPATIAL_STROKES)
     WORLD.barrier()
     name, quick = BASES[base]
@@ -84,6 +88,7 @@ COMPLIANCE, DEVIATION, STRESS = (
 EFFORT, PEAK = (("objective.kind=effort", KEPT), ("objective.kind=peak_force", KEPT))
 SETTLING, ORIENTATION = "objective.kind=settling", "objective.kind=orientation"
 BUCKLING = "objective.kind=buckling"
+DAMPING, PERIOD = "objective.kind=damping_ratio", "objective.kind=pole_frequency"
 IN_STROKES = ("motion.path=joints", "motion.file='FOLDER/strokes.csv'")
 STATIC, FREQUENCY = "objective.kind=static", "objective.kind=eigenfrequency"
 MODAL = "reduction.method=modal"
@@ -108,6 +113,18 @@ TWO_IN_SPACE = (
     '{changes=["material.young_modulus=60e9", "material.density=2500.0"], weight=2.0}]'
 )
 HELD = "control={stiffness=[2e4,2e4,2e4], damping=[600.0,600.0,600.0]}"
+# A force of the world over time between the arms, one of the arm's frame at the end.
+PUSHED = (
+    'forces=[{arm="arm1", force=[30.0,-50.0], table="FOLDER/push.csv"}, '
+    '{arm="arm2", force=[5.0,40.0], moment=-3.0, frame="arm"}]',
+)
+UNFORESEEN = (PUSHED[0].replace("-3.0,", "-3.0, feed_forward=false,"),)
+TRUST = (PUSHED[0].replace("arm1", "rod").replace("arm2", "rod"),)
+PUSHED_FORK = (
+    'forces=[{arm="link", interface="side", force=[3.0,-20.0,30.0], moment=[0.5,1.0,-2.0]}, '
+    '{arm="hand", force=[5.0,10.0,-4.0], frame="arm"}, '
+    '{arm="link", moment=[0.5,1.0,2.0], table="FOLDER/twist.csv", frame="arm"}]',
+)
 REPEATED = (
     "arms.cells=[40,4]", "arms.passive=0.05", "arms.arm2.pattern=arm1", "arms.arm2.length=0.8",
     "arms.arm2.height=0.045", "arms.arm2.thickness=0.012", "arms.symmetric=true",
@@ -250,9 +267,28 @@ CASES = [
     case("slider", BUCKLING, GRAVITY, "motion.speed=30"),
     case("fork", BUCKLING),
     case("space", BUCKLING, slow=True),
+    # Forces on interfaces.
+    case("two_arm", DEVIATION, BENT, *LOADED, *PUSHED, ranks=True),
+    case("two_arm", *EFFORT, *PUSHED, slow=True),
+    case("two_arm", STRESS, BENT, *PUSHED, slow=True),
+    case("two_arm", BUCKLING, BENT, *PUSHED, slow=True),
+    case("two_arm", DEVIATION, TWO, *PUSHED, slow=True),
+    case("controlled", DEVIATION, GRAVITY, *UNFORESEEN, slow=True),
+    case("controlled", *EFFORT, GRAVITY, *PUSHED, slow=True),
+    case("slider", COMPLIANCE, CRANK, *TRUST),
+    case("pin", BENT, TRUST[0].replace("rod", "coupler"), slow=True),
+    case("fork", DEVIATION, *PUSHED_FORK),
+    case("fork", *EFFORT, *PUSHED_FORK, slow=True),
+    # Poles of the closed loop: of the residual's second derivatives all parts.
+    case("controlled", DAMPING, BENT, GRAVITY, "constraints.poles_at=[0.0,0.7,1.9]"),
+    case("controlled", PERIOD, *UNFORESEEN, slow=True),
+    case("controlled", DAMPING, GRAVITY, "control.limits=[150.0,200.0,150.0]",
+         "arms.joint_stiffness=3e4", "arms.joint_damping=3.0", "arms.rotor_inertia=2e-5",
+         "arms.gear_ratio=100.0", "constraints.damping_below=60.0", slow=True),
+    case("space", DAMPING, HELD, BENT, slow=True),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", f"objective.kind={kind}", "design.filter_radius=0.05", *limit, slow=True)
-      for kind in get_args(ObjectiveKind)
+      for kind in get_args(ObjectiveKind) if kind not in POLES
       for limit in [[KEPT] * (kind in ("mass", *EXACT_ONLY))]),
 ]  # fmt: skip
 

@@ -4,13 +4,13 @@ import os
 
 import numpy as np
 import pytest
-from machines import CRANK, ROD, controlled, loop
+from machines import CRANK, ROD, controlled, fork, loop, two_arm
 from mpi4py import MPI
 from remainders import built_of
 from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
-from dolfinopt.scene.load import pose_scenarios
+from dolfinopt.scene.load import pose_scenarios, scene_from_dict
 
 pytestmark = pytest.mark.serial
 
@@ -122,3 +122,53 @@ def test_scenarios_change_gains_and_closures():
     gains = {"stiffness": [2e3], "damping": [20.0]}
     first, second = pose_scenarios(loop(control=gains, scenarios=changes))
     assert first.control.stiffness == (1e3,) and second.closure.force == 10.0
+
+
+FORK_PUSH = {"arm": "link", "force": [0.0, 0.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [
+        ({"arm": "arm1"}, ["forces.0.force", "expected force, moment, or table", "acts"]),
+        ({"force": [1.0, 2.0]}, ["forces.0.arm", "missing"]),
+        ({"arm": "boom", "force": [1.0, 2.0]}, ['forces.0.arm = "boom"', '"arm1" | "arm2"']),
+        ({"arm": "arm1", "interface": "side", "force": [1.0, 2.0]},
+         ['forces.0.interface = "side"', '"outboard"']),
+        ({"arm": "arm1", "force": [1.0, 2.0, 3.0]}, ["forces.0.force", "array of two numbers"]),
+        ({"arm": "arm1", "moment": [0.0, 0.0, 3.0]}, ["forces.0.moment", "a number", "plane"]),
+        ({"arm": "arm1", "force": [1.0, 2.0], "frame": "tip"}, ["frame", '"world" | "arm"']),
+        ({"arm": "arm1", "force": [1.0, 2.0], "feed_forward": False},
+         ["forces.0.feed_forward = false", "the default", "[control]"]),
+        ({"arm": "arm1", "force": [1.0, 2.0], "factor": 1e9}, ["forces.0.factor", "<= 1000000"]),
+        ({"arm": "arm1", "table": "nowhere.csv"}, ['forces.0.table = "nowhere.csv"', "a file"]),
+        ({**FORK_PUSH, "force": [1.0, 2.0]}, ["forces.0.force", "three numbers", "[[joints]]"]),
+        ({**FORK_PUSH, "moment": 2.0}, ["forces.0.moment", "array of three numbers"]),
+        ({**FORK_PUSH, "interface": "nose"}, ['interface = "nose"', '"outboard" | "side"']),
+    ],
+)  # fmt: skip
+def test_forces_that_cannot_act(force, words, tmp_path):
+    if force.get("arm") != "link":
+        refusal(lambda: scene_from_dict(two_arm() | {"forces": [force]}), *words)
+        return
+    (tmp_path / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
+    tree = fork() | {"forces": [force]}
+    refusal(lambda: scene_from_dict(tree, str(tmp_path / "fork.toml")), *words)
+
+
+def test_tables_of_applied_forces_need_time_and_columns(tmp_path):
+    """The file, its columns; and a force alone on an interface is a use of it."""
+    table = tmp_path / "push.csv"
+    tree = two_arm() | {"forces": [{"arm": "arm2", "table": str(table)}]}
+    for text, words in (("fx,fy,mz\n0,0,0\n1,2,3\n", ["push.csv", "column t"]),
+                        ("t,fx,fy\n0,0,0\n1,2,3\n", ["push.csv", "mz"])):  # fmt: skip
+        table.write_text(text)
+        refusal(lambda: check_forces(scene_from_dict(tree)), *words)
+    (tmp_path / "table.csv").write_text("t,swing\n0,0\n0.2,1\n")
+    lone = fork()
+    lone["arms"], lone["joints"] = lone["arms"][:2], lone["joints"][:2]
+    lone["payload"] = {"mass": 1.0}
+    source = str(tmp_path / "fork.toml")
+    refusal(lambda: scene_from_dict(lone, source), "side", "[[forces]]")
+    lone["forces"] = [{"arm": "link", "interface": "side", "force": [0.0, 1.0, 0.0]}]
+    assert (0, 1) in scene_from_dict(lone, source).used_interfaces

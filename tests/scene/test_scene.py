@@ -483,8 +483,10 @@ def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
     tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness.
-    elsewhere = ("arms.regions", "control", "closure", "joints", "arms.interfaces",
+    # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness,
+    # test_inp.
+    elsewhere = ("arms.regions", "control", "closure", "joints", "forces", "arms.interfaces",
+                 "arms.inboard_bore", "arms.outboard_bore", "arms.mesh_scale",
                  "constraints.stiffness.")  # fmt: skip
     assert {info.key for info in describe_keys() if not info.key.startswith(elsewhere)} <= tried
 
@@ -567,7 +569,9 @@ def test_whatever_is_shown_is_short_and_printable():
         ("payload.mas", "payload.mas", "payload.mass", "mass, inertia"),
         ("arms.1.lenght", "arms.1.lenght (arm2)", "arms.1.length", "name, length, height"),
         ("payload.density", "payload.density", "material.density or arms.density", "mass, inertia"),
-        ("radius", "radius", "arms.interfaces.radius or motion.radius", "name, material"),
+        ("radius", "radius",
+         "arms.interfaces.radius or arms.inboard_bore.radius or arms.outboard_bore.radius or "
+         "motion.radius", "name, material"),
         ("tolerance", "tolerance",
          "reduction.tolerance or simulation.tolerance or optimizer.tolerance or part.tolerance",
          "name, mat"),
@@ -576,8 +580,8 @@ def test_whatever_is_shown_is_short_and_printable():
         ("design.shared", "design.shared", "design.shared_volume", "volume_fraction, shared"),
         ("payload.x y", 'payload."x y"', None, "mass, inertia"),
         ("payload.", 'payload.""', None, "mass, inertia"),
-        ("source", "source", "closure", "name, material"),
-        ("_source", "_source", None, "name, material"),
+        ("source", "source", "forces", "name, material"),
+        ("_source", "_source", "forces", "name, material"),
         ("payload.1", "payload.1", None, "mass"),
     ],
 )  # fmt: skip
@@ -661,6 +665,9 @@ def test_every_key_is_described_with_a_unit():
         assert info.allowed and not info.allowed.endswith(" "), info
 
 
+BORE = ("point", "axis", "radius")
+
+
 def test_described_defaults():
     defaults = {info.key: info.default for info in describe_keys()}
     assert defaults["arms.cells"] == "[200, 12]"
@@ -676,6 +683,8 @@ def test_described_defaults():
         *("arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm"),
         *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
+        "forces.arm",
+        *(f"arms.{end}_bore.{key}" for end in ("inboard", "outboard") for key in BORE),
     }
 
 
@@ -689,7 +698,7 @@ def test_described_defaults():
         ({"changes": [], "weight": 0}, ["scenarios.0.weight = 0", "a number >= 1e-09"]),
         ({"weight": 1.0}, ["missing key scenarios.0.changes"]),
         ({"changes": [], "wait": 1.0}, ["unknown key scenarios.0.wait", "scenarios.0.weight?"]),
-        ({"changes": ["arms.length=2"]}, ["motion, control, closure, payload, damping or"]),
+        ({"changes": ["arms.length=2"]}, ["motion, control, closure, payload, forces, damping or"]),
         ({"changes": ["material.poisson_ratio=0.2"]}, ["no material.poisson_ratio"]),
         ({"changes": ["payload.mas=2"]}, ["with --set payload.mas=2", "unknown key payload.mas"]),
         ({"changes": ["payload.mass=-2"]}, ["payload.mass = -2", "a number >= 0"]),

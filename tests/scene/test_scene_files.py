@@ -116,7 +116,7 @@ def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, tex
 @pytest.mark.parametrize(
     ("suffix", "keys", "words"),
     [
-        (".toml", {}, [".geo, .msh, .step, .stp"]),
+        (".toml", {}, [".geo, .msh, .inp, .step, .stp"]),
         (".msh", {"mesh_size": 0.01}, [".msh", "its cells"]),
         (".msh", {"cell_shape": "triangle"}, [".msh", "its cells"]),
         (".geo", {"mesh_size": 0.07}, ["at most height = 0.06 [m]"]),

@@ -61,6 +61,7 @@ CHANGES = {
     "arms": "arms.arm2.length=1.01",
     "motion": "motion.flattening=0.9",
     "payload": "payload.mass=6.0001",
+    "forces": 'forces=[{arm="arm2", force=[1.0, 0.0]}]',
     "damping": "damping.stiffness_proportional=1e-4",
     "reduction": "reduction.coordinates=5",
     "simulation": "simulation.tolerance=2e-4",

@@ -14,7 +14,7 @@ import dolfinopt as do
 from dolfinopt.mesh.sections import FLAT_BAR, SOLID_BAR
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.scene.schema import file_digest
-from dolfinopt.scene.tables.arms import Interface
+from dolfinopt.scene.tables.interfaces import Interface
 from dolfinopt.study.sections import (
     LEAST,
     WORTH,

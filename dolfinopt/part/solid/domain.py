@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from dataclasses import field as default
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -36,7 +38,8 @@ class SolidDomain:
         own: (n, 3 or 4, 3) corners of the arm's own faces, around them, m.
         inboard, outboard: those of the interfaces, likewise; outboard is all that are not inboard.
         kept: those around what stays solid, likewise.
-        further: number of outboard interfaces besides the first.
+        further: of the outboard interfaces besides the first, by their names, likewise; they are
+            among outboard, too.
         void: volume of the cells that stay void, m3.
         filter_radius: of the design, m; 0: none.
         minimum_member, minimum_gap: smallest widths that the scene asks for, m; 0: none.
@@ -53,7 +56,7 @@ class SolidDomain:
     outboard: np.ndarray
     kept: np.ndarray
     crisp: bool
-    further: int = 0
+    further: Mapping[str, np.ndarray] = default(default_factory=dict)
     void: float = 0.0
     filter_radius: float = 0.0
     minimum_member: float = 0.0
@@ -164,7 +167,7 @@ def solid_domain(mesh: ArmMesh, x_phys: np.ndarray, field: np.ndarray | None = N
         outboard,
         kept,
         crisp=field is None,
-        further=len(mesh.further),
+        further={one.name: faces[np.isin(facets, one.facets)] for one in mesh.further},
         void=float(mesh.area[mesh.void].sum()),
     )
 

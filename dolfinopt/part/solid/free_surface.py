@@ -406,7 +406,8 @@ def _held(
         across[facets[straight & (axis == k)], k] = True
     held = across.sum(axis=1) > 1
     held[facets[~straight]] = True
-    held[mesh.inboard] = held[mesh.outboard] = True
+    for own in (mesh.inboard, mesh.outboard, *mesh.further.values()):
+        held[own] = True
     return held, across
 
 

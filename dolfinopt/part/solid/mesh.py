@@ -24,6 +24,7 @@ MOST = 10_000  # cells of a part, about
 ACROSS = 3.0  # cells over the smaller of a part's height and thickness, at least
 IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
 NEAR = 1e-6  # of a cell: distance of points from the arm's faces up to which they lie on them
+BESIDE = 0.1  # of a cell: distance of a facet's middle from a further interface that it belongs to
 LEAST = 1e-3  # shape of the worst cell, of a valid mesh
 SAME_VOLUME = 1e-4  # relative, of a mesh that is taken to the part
 ROUNDS = 10  # of holding points whose cells a correction of the volume would spoil
@@ -48,10 +49,10 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
     Raises:
         InputError: Gmsh cannot mesh it.
     """
-    if part.domain.further:
+    if part.domain.further and part.flat is not None:
         raise InputError(
-            f"arm {part.name!r}: parts with several outboard interfaces (arms.interfaces) are not "
-            "meshed"
+            f"arm {part.name!r}: plates with several outboard interfaces (arms.interfaces) are not "
+            "meshed; leave out arms.extruded"
         )
     if not part.closed:  # Gmsh would end the process
         raise InputError(f"arm {part.name!r}: its surface is not closed")
@@ -82,7 +83,20 @@ def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     inboard, outboard = (
         distance_to_faces(centres, faces) < near for faces in (domain.inboard, domain.outboard)
     )
-    return tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
+    for faces in domain.further.values():
+        outboard &= distance_to_faces(centres, faces) >= near
+    mesh = tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
+    if not domain.further:
+        return mesh
+    # They may be parts of faces: what of the new facets lies there, as far as facets tell.
+    facets = mesh.boundary
+    middles = mesh.points[facets].mean(axis=1)
+    found = {}
+    for name, faces in domain.further.items():
+        found[name] = facets[distance_to_faces(middles, faces) < BESIDE * size]
+        if not len(found[name]):
+            raise InputError(f"the {name} interface is lost in its faces")
+    return replace(mesh, further=found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -515,6 +515,7 @@ FEW = (
     20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
 )
 MARKS = ("own", "inboard", "outboard")
+FURTHER = "further "  # before the names of the marks of further interfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -539,6 +540,7 @@ class _Field:
 def _field(domain: SolidDomain) -> _Field:
     corners, density = domain.corners, domain.field
     faces = {name: getattr(domain, name) for name in MARKS}
+    faces |= {FURTHER + name: one for name, one in domain.further.items()}
     is_box = domain.is_box
     if corners.shape[1] == 8 and (len(corners) <= FEW or not is_box):
         points, nodes, values = halved(corners, density)
@@ -617,13 +619,18 @@ def _number_of_pieces(solid: Any) -> int:
 
 
 def _joined(solid: Any) -> Any:
-    """Return the pieces of a grid that have a part of both interfaces; None: there are none."""
+    """Return the pieces of a grid that have a part of both interfaces; None: there are none.
+
+    Further interfaces have a part of them, too.
+    """
     if solid.n_cells == 0:
         return None
     of_points, of_cells = _regions(solid)
     ends = [of_points[solid.point_data[name] > WHOLE] for name in ("inboard", "outboard")]
     both = np.intersect1d(*ends)
-    if not len(both):
+    more = [name for name in solid.point_data if name.startswith(FURTHER)]
+    marked = [of_points[solid.point_data[name] > WHOLE] for name in more]
+    if not len(both) or not all(np.isin(one, both).any() for one in marked):
         return None
     stays = np.isin(of_cells, both)
     return solid if stays.all() else solid.extract_cells(stays)

@@ -12,6 +12,14 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
 from dolfinopt.scene.tables.design import Region, check_regions
+from dolfinopt.scene.tables.interfaces import (
+    Bore,
+    Interface,
+    Point,
+    check_bores,
+    check_interfaces,
+    in_frame,
+)
 from dolfinopt.scene.tables.joint_parts import (
     FRICTION_SPEED,
     PART_KEYS,
@@ -32,94 +40,6 @@ from dolfinopt.scene.tables.joint_parts import (
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
-
-
-# -- `[[arms.interfaces]]`: where further joints or the payload sit on an arm in space -----------
-
-INBOARD, OUTBOARD = "inboard", "outboard"
-
-
-def _check_name(name: str) -> str:
-    """Return `name` if it can name a group of faces besides those of the arm's ends."""
-    if not name.strip() or len(name) > 64 or not name.isprintable():
-        raise Refusal("expected 1 to 64 printable characters")
-    if name.strip().casefold() in (INBOARD, OUTBOARD):
-        raise Refusal(f'expected another name: "{INBOARD}" and "{OUTBOARD}" are the arm\'s ends')
-    return name
-
-
-class Interface(Table):
-    """A rigid part of an arm's surface besides its outboard interface."""
-
-    name: Annotated[str, AfterValidator(_check_name)] = Field(
-        description="unique name of the arm's interface, also that of its faces in a mesh file and "
-        "of its node in a SID file [-]"
-    )
-    point: tuple[Position, Position, Position] = Field(
-        description="its reference point in the arm's frame [m]"
-    )
-    radius: Length | None = Field(
-        default=None,
-        description="of an arm made of cells: the sides of cells on its surface whose middle is "
-        "at most so far from the point are the interface [m]",
-    )
-
-
-def interface_number(arm: Arm, name: str) -> int | None:
-    """Return 0 for the outboard interface, 1 ... for `arms.interfaces`; None for another name."""
-    names = [OUTBOARD, *(one.name.casefold() for one in arm.interfaces)]
-    return names.index(name.casefold()) if name.casefold() in names else None
-
-
-def refuse_unknown(arm: Arm, name: str, at: Loc) -> None:
-    """Refuse a name that none of an arm's interfaces has."""
-    if interface_number(arm, name) is None:
-        allowed = " | ".join(shown(one) for one in (OUTBOARD, *(x.name for x in arm.interfaces)))
-        raise Refusal(f"expected the name of an interface of {arm.name}: {allowed}", at)
-
-
-def check_interfaces(scene: Scene, index: int) -> None:
-    """Refuse interfaces that an arm cannot have, or on which nothing sits."""
-    arm, at = scene.arms[index], ("arms", index)
-    if not arm.interfaces:
-        return
-    if not scene.is_spatial:
-        raise Refusal(
-            "expected none without [[joints]]: an arm in the plane carries the next one at its end",
-            (*at, "interfaces"),
-        )
-    if arm.pattern is not None:
-        raise Refusal("expected none with pattern", (*at, "interfaces"), (*at, "pattern"))
-    meshed = arm.flexible and arm.cells is not None
-    known = [one.name.casefold() for one in arm.interfaces]
-    for k, one in enumerate(arm.interfaces):
-        here = (*at, "interfaces", k)
-        if one.name.casefold() in known[:k]:
-            raise Refusal("expected a name that no other interface of the arm has", (*here, "name"))
-        if (one.radius is None) == meshed:
-            made = "a rigid arm" if arm.rigid else "an arm made of cells"
-            if arm.sid is not None:
-                made = f'a body from a file, which has a node "{one.name}"'
-            elif not arm.rigid and arm.cells is None:
-                made = f'a mesh file, which has faces in a group "{one.name}"'
-            expected = "a number > 0 [m]" if one.radius is None else "none"
-            raise Refusal(f"expected {expected} with {made}", (*here, "radius"))
-
-
-def check_used(scene: Scene) -> None:
-    """Refuse interfaces on which nothing sits; those of arms of one design are the same."""
-    for index, arm in enumerate(scene.arms):
-        if arm.design is not None:
-            continue
-        sharing = [index, *(k for k, one in enumerate(scene.arms) if one.design == arm.name)]
-        for number, one in enumerate(arm.interfaces, start=1):
-            if not scene.used_interfaces & {(k, number) for k in sharing}:
-                raise Refusal(
-                    f'expected a joint with parent_interface = "{one.name}", or the payload '
-                    "there: nothing sits on it",
-                    ("arms", index, "interfaces", number - 1, "name"),
-                    ("joints",),
-                )
 
 
 # -- inertia of rigid bodies in space, as URDF states it -----------------------------------------
@@ -226,7 +146,7 @@ CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MAX_ARMS = 1000  # every arm is checked beside all others
 PART_FILES = ("_face", "_r12")  # behind an arm's name in files of its part
 STEP_FILES = (".step", ".stp")
-MESH_FILES = (".geo", ".msh", *STEP_FILES)
+MESH_FILES = (".geo", ".msh", ".inp", *STEP_FILES)
 
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = (
@@ -237,8 +157,10 @@ SPRING_KEYS = "joint_stiffness", "joint_damping"  # the same spring by either pa
 GEAR_KEYS = "gear_stiffness", "gear_damping"
 SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
-MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset")
-OF_OTHER_MESHES = ("cells", "interface_offset")  # what an arm with a mesh of its own does not take
+BORE_KEYS = ("mesh_scale", "inboard_bore", "outboard_bore")
+MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset", *BORE_KEYS)
+# What an arm with a mesh of its own does not take.
+OF_OTHER_MESHES = ("cells", "interface_offset", *BORE_KEYS)
 SIZE_PARAMETER = "mesh size (m)"  # its name in a .geo file
 CELLS_ACROSS = 12  # the height of an arm from a STEP file without mesh_size
 SOLID_CELLS_ACROSS = 4  # the smaller of height and thickness of a solid one
@@ -280,7 +202,9 @@ class Arm(Table):
         "over the height and over the thickness of a solid one [-]",
     )
     mesh: FileName | None = Field(
-        default=None, description="geometry or mesh file (.geo, .msh, .step) in place of cells [-]"
+        default=None,
+        description="geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX "
+        ".inp) in place of cells [-]",
     )
     mesh_size: Length | None = Field(
         default=None,
@@ -290,13 +214,19 @@ class Arm(Table):
     cell_shape: CellShape | None = Field(
         default=None,
         description="cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
-        "a solid, with a .msh file, too [-]",
+        "a solid, with a .msh or .inp file, too [-]",
     )
     interface_offset: Length | None = Field(
         default=None,
         description="how far the middles of a solid mesh file's interfaces may lie from the joints "
         "at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: a twentieth of "
         "the larger of height and thickness [m]",
+    )
+    mesh_scale: float = Field(
+        default=1.0,
+        ge=1e-9,
+        le=1e9,
+        description="length of the mesh file's unit, of a solid arm: 0.001 of a file in mm [m]",
     )
     element: ElementName | None = Field(
         default=None,
@@ -431,6 +361,14 @@ class Arm(Table):
         default=(),
         description="in space: further outboard interfaces, each with six coordinates, on which "
         "joints or the payload sit; taken from the arm whose design this one shares alone",
+    )
+    inboard_bore: Bore | None = Field(
+        default=None,
+        description="of a solid arm with a mesh file: the bore that is the inboard interface. It "
+        "and outboard_bore place the arm's frame, wherever the file has the arm",
+    )
+    outboard_bore: Bore | None = Field(
+        default=None, description="the bore that is the outboard interface"
     )
 
     @model_validator(mode="after")
@@ -623,6 +561,7 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_mesh(self) -> Arm:
+        check_bores(self)
         if self.mesh is None:
             for key in (*SIZE_KEYS, "interface_offset"):
                 if getattr(self, key) is not None:
@@ -647,10 +586,18 @@ class Arm(Table):
             raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
         for key in SIZE_KEYS:
             told = key == "cell_shape" and self.cell_shape in SOLID_SHAPES
-            if kind == ".msh" and getattr(self, key) is not None and not told:
+            if kind in (".msh", ".inp") and getattr(self, key) is not None and not told:
                 raise Refusal(
-                    "expected only with .geo or .step: a .msh file has its cells", (key,), ("mesh",)
+                    f"expected only with .geo or .step: a {kind} file has its cells",
+                    (key,),
+                    ("mesh",),
                 )
+        if kind == ".inp" and not self.is_solid:
+            raise Refusal(
+                'expected "tetrahedron" or "hexahedron" with a .inp file, whose cells are solid',
+                ("cell_shape",),
+                ("mesh",),
+            )
         if self.element == "incompatible" and self.cell_shape in SIMPLICES:
             cells = "triangles" if self.cell_shape == "triangle" else "tetrahedra"
             raise Refusal(
@@ -780,9 +727,9 @@ class Arm(Table):
         return 6 * (1 + len(self.interfaces)) if self.is_solid else 3
 
     @property
-    def interface_points(self) -> tuple[tuple[float, float, float], ...]:
+    def interface_points(self) -> tuple[Point, ...]:
         """Return the reference points of all outboard interfaces in the arm's frame, m."""
-        return (self.length, 0.0, 0.0), *(one.point for one in self.interfaces)
+        return (self.length, 0.0, 0.0), *(in_frame(self, one.point) for one in self.interfaces)
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse a name that is taken, and what does not fit the arm whose design it has."""

@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from dolfinopt.scene.tables.arms import (
-    OUTBOARD,
-    Moment,
-    Tensor,
-    check_arm_name,
-    check_used,
-    refuse_unknown,
-    tensor_problem,
-)
+from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.interfaces import OUTBOARD, check_used, refuse_unknown
 from dolfinopt.scene.tables.joint_parts import (
     FRICTION_SPEED,
     PART_KEYS,

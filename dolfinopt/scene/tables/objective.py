@@ -29,6 +29,8 @@ ObjectiveKind = Literal[
     "eigenfrequency",
     "first_frequency",
     "tip_deflection",
+    "damping_ratio",
+    "pole_frequency",
 ]
 Direction = Literal["minimize", "maximize"]
 GradientKind = Literal["esl", "exact"]
@@ -305,6 +307,7 @@ Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
+Ratio = Annotated[float, Field(ge=-0.99, le=0.99)]  # -
 Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
 
 
@@ -416,6 +419,25 @@ class Constraints(Table):
         description="lower limit of the first natural frequency of every flexible arm with what "
         "it carries (objective.attached), one for all or one for each [Hz]",
     )
+    damping_ratio: Ratio | None = Field(
+        default=None,
+        description="lower limit of the least damping ratio of the closed loop's poles, of the "
+        "machine under [control] linearised at constraints.poles_at [-]",
+    )
+    damping_below: Frequency | None = Field(
+        default=None,
+        description="frequency below which poles count for constraints.damping_ratio; default: "
+        "all do [Hz]",
+    )
+    pole_frequency: Frequency | None = Field(
+        default=None,
+        description="lower limit of the least natural frequency of the closed loop's poles [Hz]",
+    )
+    poles_at: tuple[Delay, ...] | None = Field(
+        default=None,
+        description="instants at which poles count; default: start, middle and end of the motion "
+        "[s]",
+    )
     tip_deflection: Distance | tuple[Distance, ...] | None = Field(
         default=None,
         description="upper limit of the static deflection of the outboard interface of every "
@@ -447,7 +469,13 @@ class Constraints(Table):
     def limits(self) -> dict[str, Limit]:
         """What is limited, in the order of the keys."""
         stated = {key: limit for key, limit in vars(self).items() if limit is not None}
-        return {key: limit for key, limit in stated.items() if key != "settling_after"}
+        return {key: limit for key, limit in stated.items() if key not in NO_LIMITS}
+
+    def pole_instants(self, motion: Motion) -> tuple[float, ...]:
+        """Return the instants at which poles count, s."""
+        if self.poles_at is not None:
+            return self.poles_at
+        return (0.0, 0.5 * motion.duration, motion.duration)
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse arrays that are not one limit for everything that has a value."""
@@ -464,6 +492,39 @@ class Constraints(Table):
         for index, one in enumerate(self.stiffness or ()):
             one.check_in_scene(scene, (*at, "stiffness", index))
         self._check_delay(scene.motion, (*at, "settling_after"))
+        self._check_poles(scene, at)
+
+    def _check_poles(self, scene: Scene, at: Loc) -> None:
+        """Refuse responses of poles without a closed loop, and options of none."""
+        used = [name for name in POLES if name in asked(scene)]
+        for key, names in (("damping_below", POLES[:1]), ("poles_at", POLES)):
+            if getattr(self, key) is not None and not set(names) & set(used):
+                users = " or ".join(f"constraints.{name}" for name in names)
+                raise Refusal(f"expected none without {users}: nothing else uses it", (*at, key))
+        if not used:
+            return
+        where = (*at, used[0]) if used[0] in self.limits else ("objective", "kind")
+        if scene.control is None:
+            raise Refusal(
+                "expected another response without [control]: poles are those of the closed loop; "
+                "add the table, or take first_frequency",
+                where,
+            )
+        if scene.closure is not None:
+            raise Refusal(
+                "expected another response with [closure]: poles of kinematic loops have no "
+                "gradient; look at them with dolfinopt export DIR --state-space T",
+                where,
+                ("closure", "kind"),
+            )
+        instants = self.pole_instants(scene.motion)
+        horizon = scene.motion.horizon
+        if sorted(set(instants)) != list(instants) or not instants or instants[-1] > horizon:
+            raise Refusal(
+                f"expected ascending instants up to motion.horizon = {horizon:g} [s]",
+                (*at, "poles_at"),
+                ("motion", "horizon"),
+            )
 
     def _check_delay(self, motion: Motion, own: Loc) -> None:
         """Refuse a delay that leaves nothing of a rest."""
@@ -485,6 +546,10 @@ class Constraints(Table):
                     own,
                 )
 
+
+# Keys of [constraints] that are options of limits.
+NO_LIMITS = ("settling_after", "damping_below", "poles_at")
+POLES = ("damping_ratio", "pole_frequency")  # limits of the closed loop's poles
 
 # -- what the responses that a scene can name need; `dolfinopt.responses` computes them ----------
 
@@ -509,11 +574,13 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "stiffness": STATICS,
     "effort": MOTION,
     "peak_force": MOTION,
+    "damping_ratio": MOTION,
+    "pole_frequency": MOTION,
 }
 # Forces of drives, of which no equivalent static load tells anything: their gradient is always the
-# exact one, and so is that of buckling.
+# exact one, and so is that of buckling and of poles.
 FORCES = frozenset({"effort", "peak_force"})
-EXACT_ONLY = FORCES | {"buckling"}
+EXACT_ONLY = FORCES | {"buckling", *POLES}
 # What uses an option of [objective]: as objective, and under [constraints].
 OPTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "worst": (("esl",), ("esl",)),
@@ -567,7 +634,7 @@ def need_of(scene: Scene, what: Need) -> list[str]:
 # -- `[[scenarios]]` -----------------------------------------------------------------------------
 
 # What may differ between scenarios: not the arms, which are one design, reduced once.
-TABLES = ("motion", "control", "closure", "payload", "damping", "material")
+TABLES = ("motion", "control", "closure", "payload", "forces", "damping", "material")
 
 
 class Scenario(Table):
@@ -575,7 +642,7 @@ class Scenario(Table):
 
     changes: tuple[str, ...] = Field(
         description='changes to the scene as "key=value", of motion, control, closure, payload, '
-        "damping or material [-]"
+        "forces, damping or material [-]"
     )
     weight: float = Field(
         default=1.0, ge=1e-9, le=1e9, description="weight in the sum of the scenarios [-]"

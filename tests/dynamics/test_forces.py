@@ -1,0 +1,173 @@
+"""Forces on interfaces, [[forces]]: closed forms, energy, control, batches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from machines import energies, fork, two_arm, with_keys
+from runs import scene
+
+import dolfinopt as do
+from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import Scene, scene_from_dict
+
+pytestmark = pytest.mark.serial
+ANGLE = 0.7  # rad, at which the arm is held
+LENGTH, HEIGHT, THICKNESS, MODULUS = 1.0, 0.02, 0.01, 70e9
+
+
+def held(folder: Path, *forces: dict, **changes) -> Scene:
+    """Return one arm of solid material that its joint holds at `ANGLE`."""
+    (folder / "held.csv").write_text(f"t,arm\n0,{ANGLE}\n0.1,{ANGLE}\n")
+    tree = {
+        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.0, "density": 2700.0},
+        "arms": [{"name": "arm", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS,
+                  "cells": [100, 4]}],
+        "motion": {"path": "joints", "file": "held.csv", "base": "fixed", "duration": 0.1,
+                   "horizon": 0.1},
+        "payload": {"mass": 0.0},
+        "design": {"initial": 1.0, "volume_fraction": 1.0},
+        "simulation": {"stiffening": False},
+        "forces": list(forces),
+    }  # fmt: skip
+    return scene_from_dict(with_keys(tree, changes), str(folder / "held.toml"))
+
+
+def trajectory_of(one: Scene) -> Trajectory:
+    found = do.Model(one).simulate().trajectory
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(
+    ("force", "moment", "frame"),
+    [((0.0, 2.0), 0.0, "arm"), ((0.0, 0.0), 1.5, "world"), ((0.0, -3.0), 1.0, "world")],
+)
+def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path) -> None:
+    """Tip and joint of Timoshenko's beam, F L^3 / 3 E I + F L / k G A + M L^2 / 2 E I."""
+    one = held(tmp_path, {"arm": "arm", "force": force, "moment": moment, "frame": frame})
+    found = trajectory_of(one)
+    own = complex(*force) * (np.exp(-1j * ANGLE) if frame == "world" else 1.0)
+    EI, EA = MODULUS * THICKNESS * HEIGHT**3 / 12.0, MODULUS * THICKNESS * HEIGHT
+    across = own.imag * (LENGTH**3 / (3.0 * EI) + LENGTH / (5.0 / 6.0 * 0.5 * EA))
+    across += moment * LENGTH**2 / (2.0 * EI)
+    tip = (own.real * LENGTH / EA + 1j * across) * np.exp(1j * ANGLE)
+    # 100 cells leave 4e-5 to 1.1e-4, 50 cells 3e-4.
+    assert found.deviation[-1] == pytest.approx([tip.real, tip.imag], rel=1.5e-4)
+    assert np.ptp(found.distance) < 1e-9 * abs(tip)  # it begins in equilibrium
+    place = LENGTH + complex(*found.deviation[0]) * np.exp(-1j * ANGLE)
+    torque = -((np.conj(place) * own).imag + moment)
+    assert found.joint_forces[0, 1] == pytest.approx(torque, rel=1e-9)
+
+
+def test_force_along_the_arm_stiffens_it(tmp_path) -> None:
+    """Pulled by P, a cantilever bends by F / P (L - tanh(kL) / k), k^2 = P / EI; source:
+    Timoshenko & Gere, Theory of Elastic Stability (1961), sec. 1.11.
+    """
+    pull, across = 400.0, 1.0
+    forces = {"arm": "arm", "force": [pull, across], "frame": "arm"}
+    changes = {"simulation": {"stiffening": True}, "reduction": {"coordinates": 8}}
+    found = trajectory_of(held(tmp_path, forces, **changes))
+    # The force keeps the arm's direction at rest, whatever the tip does.
+    k = np.sqrt(pull / (MODULUS * THICKNESS * HEIGHT**3 / 12.0))
+    exact = across / pull * (LENGTH - np.tanh(k * LENGTH) / k)
+    tip = complex(*found.deviation[-1]) * np.exp(-1j * ANGLE)
+    linear = across * LENGTH**3 / (3.0 * pull / k**2)
+    assert linear / exact > 1.2
+    assert tip.imag == pytest.approx(exact, rel=1e-3)
+
+
+def test_work_of_forces_is_energy(tmp_path) -> None:
+    """Drives and forces, of the world over time and of the arm, by the places of interfaces."""
+    table = tmp_path / "push.csv"
+    table.write_text("t,fx,fy,mz\n0,0,0,0\n0.8,30,-10,4\n1.6,-20,30,0\n3,0,0,0\n")
+    forces = [
+        {"arm": "arm1", "table": str(table), "moment": 2.0},
+        {"arm": "arm2", "force": [5.0, 20.0], "moment": -1.0, "frame": "arm"},
+    ]
+    changes = ("arms.cells=[16,2]", "simulation.tolerance=1e-5", "simulation.stiffening=true")
+    tree = two_arm(*changes) | {"forces": forces}
+    found = trajectory_of(scene_from_dict(tree))
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    grid, mechanism = found.solution.time_grid, found.mechanism
+    h = np.diff(grid)[:, None]
+    t = (grid[:-1, None] + 0.5 * h * (nodes + 1.0)).ravel()
+    seen = found.at(t)
+    power = (seen.joint_forces * seen.motion.qd).sum(axis=1)
+    qd = found.solution.sample(t, 1)
+    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
+        power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
+    step = 1e-5  # s, of central differences
+    poses = [found.at(t + sign * step) for sign in (0.0, 1.0, -1.0)]
+    for force in mechanism.forces:
+        now, after, before = (Posed(mechanism, one.motion.q, one.q_e) for one in poses)
+        F, M = seen.motion.applied[:, force.column, :2].T, seen.motion.applied[:, force.column, 2]
+        R = now.body(force.site[0])[2]
+        F = F if force.in_world else np.einsum("ijn,jn->in", R, F)
+        (p, Q), (q, S) = (pose.interface(*force.site) for pose in (after, before))
+        turned = np.arctan2(*reversed(np.einsum("ijn,ikn->jkn", S, Q)[:, 0]))
+        power += ((p - q) * F).sum(axis=0) / (2.0 * step) + M * turned / (2.0 * step)
+    work = np.cumsum((0.5 * h * weights * power.reshape(len(h), -1)).sum(axis=1))
+    stored = sum(energies(found, grid))
+    assert np.abs(work).max() > 0.1 * np.abs(stored).max()
+    assert np.abs(work - (stored[1:] - stored[0])).max() < 1e-5 * np.abs(stored).max()
+
+
+def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path) -> None:
+    """A moment that the control foresees leaves no error at the start, another one M / k."""
+    push = {"arm": "arm2", "moment": 20.0}
+    quick = ("arms.cells=[8,2]", "motion.horizon=2.0")
+    for known in (True, False):
+        tree = two_arm(*quick) | {
+            "control": {"stiffness": [2e5, 2e4, 2e4], "damping": [2e4, 600.0, 600.0]},
+            "forces": [push | {"feed_forward": known}],
+        }
+        found = trajectory_of(scene_from_dict(tree))
+        error = found.motion.q[0, 1:] - found.desired.q[0, 1:]
+        if known:
+            assert np.abs(error).max() < 1e-12
+        else:
+            assert error == pytest.approx([20.0 / 2e4, 20.0 / 2e4], rel=1e-9)
+
+
+def test_scenarios_of_forces_are_simulated_together() -> None:
+    """A batch of other forces, on a motion that the scenes share, is what each is by itself."""
+    quick = ("arms.cells=[8,2]", "motion.horizon=2.0", "simulation.tolerance=1e-6")
+    scenes = [scene(*quick, f'forces=[{{arm="arm2", force=[{x}, 2.0]}}]') for x in (5.0, -9.0)]
+    scenes.append(scene(*quick))
+    bodies = list(do.Model(scenes[0]).simulate().trajectory.mechanism.bodies)
+    profile = Profile()
+    every = simulate_batch(scenes, [bodies] * 3, profile)
+    for one, found in zip(scenes, every, strict=True):
+        (alone,) = simulate_batch([one], [bodies], profile)
+        t = np.linspace(0.0, 2.0, 50)
+        a, b = found.at(t).deviation, alone.at(t).deviation
+        assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
+
+
+def test_link_between_pin_and_cylinder_bears_its_force(tmp_path) -> None:
+    """The joint of a link that its second interface pushes, in space, by the rigid lever."""
+    (tmp_path / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,0,0\n")
+    tree = with_keys(fork(), {"motion": {"gravity": [0.0, 0.0, 0.0]}})
+    tree["joints"][0]["axis"] = [0, 0, 1]
+    tree["arms"] = [dict(one) for one in tree["arms"][:2]]
+    tree["joints"] = tree["joints"][:2]
+    tree["payload"] = {"mass": 0.0}
+    tree["simulation"] = {"stiffening": False}
+    (tmp_path / "table.csv").write_text("t,swing\n0,0.3\n0.2,0.3\n")
+    force = np.array([10.0, 50.0, 0.0])
+    tree["forces"] = [{"arm": "link", "interface": "side", "force": list(force), "frame": "arm"}]
+    one = scene_from_dict(tree, str(tmp_path / "link.toml"))
+    found = trajectory_of(one)
+    lever = np.array([0.29, 0.02, 0.0])
+    # The interface has moved by the link's deflection, 2e-4 of the lever.
+    assert found.joint_forces[-1, 0] == pytest.approx(-np.cross(lever, force)[2], rel=1e-3)
+    assert found.compliance[-1, 0] > 0.0
+    other = replace(found.problem.mechanism, forces=())
+    assert other.sites[0] == (0,)
+    assert found.mechanism.sites[0] == (0, 1)

@@ -1,0 +1,251 @@
+"""Machines linearised: closed forms, differences of the nonlinear equations, loops, files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from machines import controlled, loop_tree, two_arm, with_keys
+from runs import refusal
+
+import dolfinopt as do
+from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.state_space import (
+    Linearised,
+    StateSpace,
+    free_machine,
+    null_space,
+    poles_of,
+    state_space,
+)
+from dolfinopt.multibody.end_effector import interface_place
+from dolfinopt.scene.load import Scene, scene_from_dict
+
+pytestmark = pytest.mark.serial
+MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
+
+
+def trajectory_of(scene: Scene) -> Trajectory:
+    found = do.Model(scene).simulate().trajectory
+    assert found is not None
+    return found
+
+
+def hanging(folder: Path, gravity: float = 9.81, **tables) -> Trajectory:
+    """Return a slender beam of solid material that hangs at rest from its joint."""
+    rows = f"t,arm\n0,{-0.5 * np.pi}\n0.1,{-0.5 * np.pi}\n"
+    (folder / "held.csv").write_text(rows)
+    tree = {
+        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.0, "density": DENSITY},
+        "arms": [{"name": "arm", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS,
+                  "cells": [60, 3]}],
+        "motion": {"path": "joints", "file": "held.csv", "base": "fixed", "duration": 0.1,
+                   "horizon": 0.1, "gravity": [0.0, -gravity]},
+        "payload": {"mass": 0.0},
+        "damping": {"stiffness_proportional": 0.0},
+        "reduction": {"coordinates": 10},
+        "design": {"initial": 1.0, "volume_fraction": 1.0},
+    }  # fmt: skip
+    return trajectory_of(scene_from_dict(with_keys(tree, tables), str(folder / "held.toml")))
+
+
+def test_free_drive_leaves_a_pendulum(tmp_path) -> None:
+    """Its frequency sqrt(m g c / J), and the static compliance of joint and tip."""
+    found = state_space(hanging(tmp_path), 0.05)
+    mass = DENSITY * LENGTH * HEIGHT * THICKNESS
+    J = mass * (LENGTH**2 / 3.0 + HEIGHT**2 / 12.0)
+    exact = np.sqrt(0.5 * mass * 9.81 * LENGTH / J)
+    assert abs(found.poles[0]) == pytest.approx(exact, rel=1e-4)  # the beam bends by 1e-4
+    assert np.abs(found.poles.real).max() < 1e-6
+    assert found.states[:2] == ("arm", "arm q1") and len(found.states) == 22
+    assert found.inputs == ("arm", "tool fx", "tool fy", "tool mz")
+    gain = -found.C @ np.linalg.solve(found.A, found.B)
+    # A moment M turns it by M / (m g c); a force F at the tip, across, by F L / (m g c).
+    stiffness = 0.5 * mass * 9.81 * LENGTH
+    assert gain[0, :2] == pytest.approx([1.0 / stiffness, LENGTH / stiffness], rel=2e-3)
+    # Gravity bends it back along its length by twice the force: (1/3 - 2/8) F L^3 / E I.
+    bent = LENGTH**3 / (12.0 * MODULUS * THICKNESS * HEIGHT**3 / 12.0)
+    across = found.outputs.index("deflection x")
+    assert gain[across, 1] == pytest.approx(bent, rel=3e-3)
+
+
+def test_stiff_drive_clamps_the_beam(tmp_path) -> None:
+    """Euler and Bernoulli's frequencies of a cantilever, 0.1 to 0.4 % above Timoshenko's."""
+    gains = {"stiffness": [1e9], "damping": [0.0]}
+    found = state_space(hanging(tmp_path, 0.0, control=gains), 0.0)
+    exact = np.array([1.875104, 4.694091, 7.854757]) ** 2 / (2.0 * np.pi)
+    exact *= np.sqrt(MODULUS * HEIGHT**2 / (12.0 * DENSITY)) / LENGTH**2
+    assert found.closed
+    assert found.arrays()["frequencies"][:6:2] == pytest.approx(exact, rel=5e-3)
+
+
+# -- the nonlinear equations -------------------------------------------------------------------
+
+
+def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
+    """Return z'' (n,) for independent coordinates and rates x (2 n,), by the equations alone."""
+    system, instants = one.system, one.system.at(one.t)
+    _, moving, last = system.ends
+    every = np.concatenate([np.arange(moving), np.arange(last, system.num_coordinates)])
+    dependent = np.flatnonzero(~system.drives.driven) if system.closure else np.zeros(0, dtype=int)
+    independent = np.setdiff1d(every, dependent)
+    y, yd, rest = one.rates[0].copy(), one.rates[1].copy(), np.zeros_like(one.rates[0])
+    n = len(independent)
+    y[0, independent], yd[0, independent] = x[:n], x[n:]
+
+    def jacobian(y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
+        here = interface_place(system.mechanism, motion, q, second=True)
+        speeds = np.hstack([motion.qd, instants.split(yd)[1]])
+        bias = np.einsum("nij,ni,nj->n", here.hessian, speeds, speeds)
+        J = system.closure.project(here.jacobian[:, system.columns])[0]
+        return J, system.closure.project(bias)[0]
+
+    if system.closure is not None:
+        for _ in range(8):
+            motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
+            gap = system.closure.gap(interface_place(system.mechanism, motion, q).place)[0]
+            y[0, dependent] -= np.linalg.solve(jacobian(y, yd)[0][:, dependent], gap)
+        J = jacobian(y, yd)[0]
+        free = np.setdiff1d(np.arange(moving), dependent)
+        swept = J[:, free] @ yd[0, free]
+        swept += J[:, : system.ends[0]] @ instants.desired.qd[0, system.drives.free]
+        yd[0, dependent] = -np.linalg.solve(J[:, dependent], swept)
+    # The residual is linear in y''; multipliers stand there, too. What the simulation leaves at
+    # the instant itself, forces of free drives above all, is an input that is held.
+    r = instants.residual(y, yd, rest)[0] - instants.residual(*one.rates)[0]
+    units = np.eye(system.num_coordinates)
+    matrix = np.stack([instants.residual(y, yd, u[None])[0] for u in units], axis=1)
+    matrix -= instants.residual(y, yd, rest)[0][:, None]
+    if system.closure is not None:
+        (J, bias), ydd = jacobian(y, yd), one.rates[2][0, :moving]
+        J0, bias0 = jacobian(*one.rates[:2])
+        desired = instants.desired.qdd[0, system.drives.free]
+        size = len(desired)
+        matrix[moving:last, :moving] = J
+        r[moving:last] = bias - bias0 - J0 @ ydd + (J - J0)[:, :size] @ desired
+    return np.linalg.solve(matrix, -r)[independent]
+
+
+def open_two_arm() -> Trajectory:
+    return trajectory_of(scene_from_dict(two_arm("arms.cells=[16,2]", "motion.gravity=[0,-9.81]")))
+
+
+def soft_two_arm() -> Trajectory:
+    soft = {"joint_stiffness": 3e4, "joint_damping": 30.0, "rotor_inertia": 2e-5}
+    changes = [f"arms.{key}={value}" for key, value in (*soft.items(), ("gear_ratio", 100.0))]
+    return trajectory_of(controlled(*changes, "simulation.stiffening=true"))
+
+
+def geared_two_arm() -> Trajectory:
+    """Return arms on gears and bearings, with friction, whose drives nothing controls."""
+    keys = {"gear_stiffness": 3e4, "gear_damping": 30.0, "rotor_inertia": 2e-5, "gear_ratio": 100.0,
+            "bearing_stiffness": [1e7, 1e7, 0, 0, 0, 0], "friction": [5.0, 2.0]}  # fmt: skip
+    changes = [f"arms.{key}={value}" for key, value in keys.items()]
+    changes += ["motion.cart_mass=5.0"]  # a cart without mass before a bearing has no acceleration
+    return trajectory_of(scene_from_dict(two_arm("arms.cells=[16,2]", *changes)))
+
+
+def slider(**tables) -> Trajectory:
+    return trajectory_of(scene_from_dict(loop_tree(**tables, simulation={"tolerance": 1e-6})))
+
+
+MACHINES = {
+    "open, two arms": (open_two_arm, 0.8),
+    "closed, two arms": (lambda: trajectory_of(controlled("motion.gravity=[0,-9.81]")), 0.8),
+    "closed, motors behind springs": (soft_two_arm, 0.5),
+    "open, gears, bearings and friction": (geared_two_arm, 0.7),
+    "open, slider-crank": (slider, 0.03),
+    "closed, slider-crank": (
+        lambda: slider(control={"stiffness": [2e3], "damping": [20.0]}), 0.07
+    ),
+    "closed, four-bar": (
+        lambda: slider(kind="pin", control={"stiffness": [2e3], "damping": [20.0]}), 0.06
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", MACHINES)
+def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
+    """By central differences of accelerations that are solved for, loops closed anew each time."""
+    make, t = MACHINES[kind]
+    trajectory = make()
+    found, one = state_space(trajectory, t), free_machine(trajectory, t)
+    N = null_space(one)[0]
+    independent = [int(np.flatnonzero(column == 1.0)[0]) for column in N.T]
+    x = np.concatenate([one.rates[k][0, independent] for k in (0, 1)])
+    n = len(independent)
+    # By the coordinates' own masses, so that a step, and what it does, is J^(1/2).
+    scale = np.sqrt(np.abs(np.diag(one.M)[independent]))
+    columns = []
+    for k in range(2 * n):
+        step = np.zeros(2 * n)
+        step[k] = 1e-5 / scale[k % n]
+        ends = [accelerations(one, x + sign * step) for sign in (1.0, -1.0)]
+        columns.append((ends[0] - ends[1]) / (2.0 * step[k]))
+    differences = scale[:, None] * np.stack(columns, axis=1)
+    exact = scale[:, None] * found.A[n:]
+    assert np.array_equal(found.A[:n], np.eye(n, 2 * n, n))
+    size = np.maximum(np.abs(exact).max(axis=0), 1e-9 * np.abs(exact).max())
+    assert (np.abs(exact - differences).max(axis=0) / size).max() < 3e-5
+
+
+def test_inputs_and_outputs_answer_each_other() -> None:
+    """Places move by what forces there do: the gain from tool to tool is symmetric, and of drives.
+
+    Without control and motion the machine is conservative.
+    """
+    found: StateSpace = state_space(open_two_arm(), 0.0)
+    s = 3.0
+    gain = found.C @ np.linalg.solve(s * np.eye(len(found.A)) - found.A, found.B)
+    block = gain[:5, :5]  # cart, two joints, tool x and y by the forces there
+    assert np.abs(block - block.T).max() < 1e-3 * np.abs(block).max()
+
+
+def test_least_damping_follows_the_control() -> None:
+    """More derivative gain, more damping; the limit is met or not, and told so."""
+    ratios = []
+    for factor in (0.5, 1.0):
+        changes = (f"control.damping_factor={factor}", "constraints.damping_ratio=0.05",
+                   "constraints.damping_below=20.0")  # fmt: skip
+        scene = controlled(*changes)
+        result = do.Model(scene).simulate()
+        again = result.state_space(1.0)
+        assert again is not None and np.array_equal(again.A, state_space(result.trajectory, 1.0).A)
+        poles = [
+            poles_of(free_machine(result.trajectory, t)).values
+            for t in scene.constraints.pole_instants(scene.motion)
+        ]
+        every = np.concatenate(poles)
+        every = every[np.abs(every) < 2.0 * np.pi * 20.0]
+        (measured,) = result.evaluation.values_of("damping_ratio")
+        assert measured == pytest.approx((-every.real / np.abs(every)).min(), rel=1e-9)
+        assert (result.evaluation.constraints[-1] <= 0.0) == (measured >= 0.05)
+        ratios.append(measured)
+    assert ratios[1] > 1.2 * ratios[0]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: scene_from_dict(two_arm("constraints.damping_ratio=0.05")),
+         ["constraints.damping_ratio = 0.05", "[control]"]),
+        (lambda: controlled("constraints.damping_below=10.0"),
+         ["constraints.damping_below = 10.0", "none without constraints.damping_ratio"]),
+        (lambda: controlled("constraints.damping_ratio=0.05", "constraints.poles_at=[0.5,9.0]"),
+         ["constraints.poles_at", "motion.horizon"]),
+        (lambda: controlled("constraints.damping_ratio=1.5"), ["damping_ratio = 1.5", "<= 0.99"]),
+        (lambda: controlled("objective.kind=pole_frequency", "control.stiffness=[1,1]"),
+         ["control.stiffness"]),
+        (lambda: scene_from_dict(loop_tree(
+            control={"stiffness": [2e3], "damping": [20.0]},
+            constraints={"pole_frequency": 3.0})), ["constraints.pole_frequency", "closure"]),
+    ],
+)  # fmt: skip
+def test_poles_that_cannot_be_limited(make, words) -> None:
+    refusal(make, *words)
+
+
+def test_instant_within_the_motion() -> None:
+    refusal(lambda: state_space(open_two_arm(), 4.0), "--state-space 4", "motion.horizon = 3")

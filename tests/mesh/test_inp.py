@@ -1,0 +1,220 @@
+"""Links of others: Abaqus and CalculiX files, interfaces by bores wherever the file has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import refused
+from scipy.spatial.transform import Rotation
+
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.scene.load import Arm
+
+pytestmark = pytest.mark.serial
+COMM = MPI.COMM_SELF
+LENGTH, HEIGHT, THICKNESS, RADIUS = 0.3, 0.05, 0.02, 0.012
+SIZE = {"name": "a", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS}
+# Where a CAD program has the link: turned, and its inboard bore away from the origin.
+TURNED = Rotation.from_rotvec([0.4, -0.8, 1.1]).as_matrix()
+MOVED = np.array([0.12, -0.04, 0.033])  # m
+MORE = """*MATERIAL, NAME=STEEL
+*ELASTIC
+210000., 0.3
+*STEP
+*STATIC
+*BOUNDARY
+inboard, 1, 3
+*END STEP
+"""
+
+
+def write_link(path: Path, order: int = 1) -> None:
+    """Write a flat link with two bores, tetrahedra, groups as Gmsh saves them."""
+    with gmsh_on_root(COMM) as gmsh:
+        model = gmsh.model
+        model.add("link")
+        box = model.occ.addBox(
+            -0.5 * HEIGHT, -0.5 * HEIGHT, -0.5 * THICKNESS, LENGTH + HEIGHT, HEIGHT, THICKNESS
+        )
+        bores = [
+            model.occ.addCylinder(x, 0.0, -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, RADIUS)
+            for x in (0.0, LENGTH)
+        ]
+        ((solid, *_), _) = model.occ.cut([(3, box)], [(3, one) for one in bores])
+        model.occ.synchronize()
+        for name, x in (("inboard", 0.0), ("outboard", LENGTH)):
+            own = [
+                face
+                for _, face in model.getEntities(2)
+                if np.ptp(np.reshape(model.getBoundingBox(2, face), (2, 3)), axis=0)[0]
+                == pytest.approx(2.0 * RADIUS, abs=1e-4)
+                and abs(model.occ.getCenterOfMass(2, face)[0] - x) < RADIUS
+            ]
+            model.setPhysicalName(2, model.addPhysicalGroup(2, own), name)
+        model.setPhysicalName(3, model.addPhysicalGroup(3, [solid[1]]), "part")
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.012)
+        model.mesh.generate(3)
+        model.mesh.setOrder(order)
+        gmsh.option.setNumber("Mesh.SaveGroupsOfNodes", 1)
+        gmsh.write(str(path))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a folder with the link as .msh, .inp, and turned, in mm, of second order."""
+    found = tmp_path_factory.mktemp("links")
+    write_link(found / "link.msh")
+    write_link(found / "link.inp")
+    (found / "link.inp").write_text((found / "link.inp").read_text() + MORE)
+    write_link(found / "faces.inp", order=2)
+    write_link(found / "second.msh", order=2)
+    mesh = meshio.read(found / "second.msh")
+    cells = [block for block in mesh.cells if block.type == "tetra10"]
+    points = 1e3 * (mesh.points @ TURNED.T + MOVED)
+    meshio.write(found / "turned.inp", meshio.Mesh(points, cells), file_format="abaqus")
+    return found
+
+
+def link(folder: Path, name: str, **keys) -> ArmMesh:
+    return arm_mesh(COMM, Arm(mesh=str(folder / name), cell_shape="tetrahedron", **SIZE | keys))
+
+
+def bore(x: float, radius: float = RADIUS, sign: float = 1.0) -> dict:
+    """Return a bore of the turned link."""
+    point, axis = TURNED @ [x, 0.0, 0.0] + MOVED, sign * 3.0 * TURNED[:, 2]
+    return {"point": tuple(point), "axis": tuple(axis), "radius": radius}
+
+
+def same(mesh: ArmMesh, other: ArmMesh) -> bool:
+    """Return whether cells lie at the same places, and interfaces have as many facets."""
+    order = [np.lexsort(np.round(one.centroid, 9).T) for one in (mesh, other)]
+    apart = mesh.centroid[order[0]] - other.centroid[order[1]]
+    counts = [
+        (len(one.inboard_facets), len(one.outboard_facets), one.num_cells) for one in (mesh, other)
+    ]
+    return bool(counts[0] == counts[1] and np.abs(apart).max() < 1e-9)
+
+
+def test_file_of_abaqus_is_that_of_gmsh(folder) -> None:
+    """Sets as interfaces; what a model has besides its mesh does not matter."""
+    plain = link(folder, "link.msh")
+    assert same(link(folder, "link.inp"), plain)
+    assert same(link(folder, "faces.inp"), plain)
+    assert plain.area.sum() == pytest.approx(
+        THICKNESS * ((LENGTH + HEIGHT) * HEIGHT - 2.0 * np.pi * RADIUS**2), rel=0.01
+    )
+
+
+def test_link_is_found_by_its_bores_wherever_it_lies(folder) -> None:
+    """Turned, in mm, cells of second order and no sets: the same arm to rounding."""
+    bores = {"inboard_bore": bore(0.0), "outboard_bore": bore(LENGTH)}
+    turned = link(folder, "turned.inp", mesh_scale=1e-3, **bores)
+    assert same(turned, link(folder, "link.msh"))
+    # An axis the other way turns the link over about x: its mirror image in y and z together.
+    over = link(folder, "turned.inp", mesh_scale=1e-3,
+                inboard_bore=bore(0.0, sign=-1.0), outboard_bore=bore(LENGTH))  # fmt: skip
+    mirrored = np.sort(over.centroid * [1.0, -1.0, -1.0], axis=0)
+    assert np.allclose(mirrored, np.sort(turned.centroid, axis=0), atol=1e-9)
+    # A .msh file alike, where its groups are not asked for.
+    there = {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0), "radius": RADIUS}
+    beyond = there | {"point": (LENGTH, 0.0, 0.0)}
+    again = link(folder, "link.msh", inboard_bore=there, outboard_bore=beyond)
+    assert same(again, link(folder, "link.msh"))
+
+
+def write_blocks(path: Path, surfaces: bool) -> None:
+    """Write a bar of 6 x 2 x 2 hexahedra by hand, sets of nodes and of cells."""
+    nx, n = 6, 2
+    x, y, z = np.meshgrid(
+        np.linspace(0.0, 0.3, nx + 1), np.linspace(-0.02, 0.02, n + 1),
+        np.linspace(-0.02, 0.02, n + 1), indexing="ij",
+    )  # fmt: skip
+    number = np.arange(1, x.size + 1).reshape(x.shape)
+    lines = ["*HEADING", "a bar", "*NODE"]
+    rows = zip(number.ravel(), x.ravel(), y.ravel(), z.ravel(), strict=True)
+    lines += [f"{k}, {a:.9g}, {b:.9g}, {c:.9g}" for k, a, b, c in rows]
+    lines.append("*ELEMENT, TYPE=C3D8R, ELSET=ALL")
+    cell = 0
+    for i in range(nx):
+        for j in range(n):
+            for k in range(n):
+                cell += 1
+                low, high = number[i : i + 2, j : j + 2, k], number[i : i + 2, j : j + 2, k + 1]
+                around = [one[a] for one in (low, high) for a in ((0, 0), (1, 0), (1, 1), (0, 1))]
+                lines.append(", ".join(map(str, [cell, *around])))
+    for name, plane in (("INBOARD", number[0]), ("OUTBOARD-1", number[-1])):
+        lines += [f"*NSET, NSET={name}", ", ".join(map(str, plane.ravel()))]
+    side = number[2:4, 2, :]
+    lines += ["*NSET, NSET=Side", ", ".join(map(str, side.ravel()))]
+    lines += ["*ELSET, ELSET=PASSIVE_ROOT, GENERATE", "1, 4, 1", "*ELSET, ELSET=VOID", "13, 14"]
+    if surfaces:  # in place of the sets of nodes
+        lines = [line.replace("BOARD", "") if "NSET" in line else line for line in lines]
+        lines += ["*ELSET, ELSET=_last, GENERATE", "21, 24, 1"]
+        lines += ["*SURFACE, TYPE=ELEMENT, NAME=inboard", "PASSIVE_ROOT, S6"]
+        lines += ["*SURFACE, TYPE=ELEMENT, NAME=Outboard", "_last, S4"]
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("surfaces", [False, True])
+def test_sets_are_interfaces_and_regions(surfaces, tmp_path) -> None:
+    """Hexahedra of CalculiX; a further interface, cells that stay solid and void."""
+    write_blocks(tmp_path / "bar.inp", surfaces)
+    mesh = arm_mesh(COMM, Arm(
+        mesh=str(tmp_path / "bar.inp"), cell_shape="hexahedron", name="a", length=0.3, height=0.04,
+        thickness=0.04, interfaces=({"name": "side", "point": (0.125, 0.02, 0.0)},),
+    ))  # fmt: skip
+    assert mesh.num_cells == 24 and mesh.area.sum() == pytest.approx(0.3 * 0.04**2, rel=1e-12)
+    assert (len(mesh.inboard_facets), len(mesh.outboard_facets)) == (4, 4)
+    assert [len(one.facets) for one in mesh.further] == [2]
+    assert np.all(mesh.passive == (mesh.centroid[:, 0] < 0.05)) and mesh.passive.sum() == 4
+    assert mesh.void.sum() == 2 and np.allclose(mesh.centroid[mesh.void, 0], 0.175)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("solid bar\n", ["bar.inp", "begins with *"]),
+        ("*NODE\n1, 0, 0, 0\n*INCLUDE, INPUT=/etc/passwd\n", ["*INCLUDE", "one file"]),
+        ("*NODE\n1, 0, 0\n*ELEMENT, TYPE=C3D8\n1, 2\n", ["cannot be read"]),
+        ("*NODE\n1,0,0,0\n2,1,0,0\n3,0,1,0\n*ELEMENT, TYPE=CPS3\n1,1,2,3\n", ["C3D4", "C3D8"]),
+    ],
+)
+def test_files_that_are_no_link(text, words, tmp_path) -> None:
+    (tmp_path / "bar.inp").write_text(text)
+    with refused(*words):
+        link(tmp_path, "bar.inp")
+
+
+def test_what_is_missing_is_told(folder) -> None:
+    """Sets of other names, bores of other radii or places, with what the file has."""
+    with refused('node set "inboard" is missing', "*NSET, NSET=inboard", "inboard_bore"):
+        link(folder, "turned.inp")
+    keys = {"mesh_scale": 1e-3, "outboard_bore": bore(LENGTH)}
+    with refused("no bore of radius 0.01 m", '"inboard"', "0.012 m from the axis", "mesh_scale"):
+        link(folder, "turned.inp", inboard_bore=bore(0.0, 0.01), **keys)
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"inboard_bore": bore(0.0)}, ["outboard_bore", "the arm's frame"]),
+        ({"inboard_bore": bore(0.0), "outboard_bore": bore(0.31)}, ["0.31 [m]", "distance"]),
+        ({"inboard_bore": bore(0.0) | {"axis": (0.0, 0.0, 0.0)}, "outboard_bore": bore(LENGTH)},
+         ["not of length zero"]),
+        ({"cell_shape": None}, ["tetrahedron", ".inp"]),
+        ({"mesh": None, "cells": (20, 4), "cell_shape": None, "mesh_scale": 0.001},
+         ["only with the mesh file"]),
+    ],
+)  # fmt: skip
+def test_keys_that_do_not_fit(folder, keys, words) -> None:
+    told = {"mesh": str(folder / "turned.inp"), "cell_shape": "tetrahedron"} | SIZE | keys
+    with pytest.raises(ValueError) as caught:
+        Arm(**{key: value for key, value in told.items() if value is not None})
+    assert all(word in str(caught.value) for word in words)
+    assert not isinstance(caught.value, InputError)
