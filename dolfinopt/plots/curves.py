@@ -351,11 +351,10 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
         if name in free:
             row.insert(0, (f"{name}: error", units[name], {"": error[:, k]}))
         rows.append(row)
-    driven = scene.driven
-    for name, sizes in trajectory.closure_sizes.items():
+    for name, sizes in trajectory.closure_sizes.items() if scene.closures else ():
         words = {"N": "force", "N m": "moment"}
         row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
-        rows += [row] if name not in driven else []  # a driven rod's is its drive's
+        rows += [row] if name not in scene.driven else []  # a driven rod's is its drive's
     forces = trajectory.closure_force
     if forces is not None and trajectory.closure is not None:
         names = ("",) if forces.shape[1] == 1 else ("x", "y")

@@ -19,7 +19,6 @@ from dolfinopt.dynamics.state_space import (
     poles_of,
     state_space,
 )
-from dolfinopt.multibody.end_effector import interface_place
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -88,7 +87,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     system, instants = one.system, one.system.at(one.t)
     _, moving, last = system.ends
     every = np.concatenate([np.arange(moving), np.arange(last, system.num_coordinates)])
-    dependent = np.flatnonzero(~system.drives.driven) if system.closure else np.zeros(0, dtype=int)
+    dependent = np.flatnonzero(~system.drives.driven) if system.loops else np.zeros(0, dtype=int)
     independent = np.setdiff1d(every, dependent)
     y, yd, rest = one.rates[0].copy(), one.rates[1].copy(), np.zeros_like(one.rates[0])
     n = len(independent)
@@ -96,16 +95,15 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
 
     def jacobian(y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
-        here = interface_place(system.mechanism, motion, q, second=True)
-        speeds = np.hstack([motion.qd, instants.split(yd)[1]])
-        bias = np.einsum("nij,ni,nj->n", here.hessian, speeds, speeds)
-        J = system.closure.project(here.jacobian[:, system.columns])[0]
-        return J, system.closure.project(bias)[0]
+        here = system.loops.at(system.mechanism, motion.q, q)
+        speeds = np.hstack([motion.qd, instants.split(yd)[1]])[0]
+        bias = [speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(system.loops.count)]
+        return here.jacobian[0][:, system.columns], np.array(bias)
 
-    if system.closure is not None:
+    if system.loops is not None:
         for _ in range(8):
             motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
-            gap = system.closure.gap(interface_place(system.mechanism, motion, q).place)[0]
+            gap = system.loops.at(system.mechanism, motion.q, q).gap[0]
             y[0, dependent] -= np.linalg.solve(jacobian(y, yd)[0][:, dependent], gap)
         J = jacobian(y, yd)[0]
         free = np.setdiff1d(np.arange(moving), dependent)
@@ -118,7 +116,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     units = np.eye(system.num_coordinates)
     matrix = np.stack([instants.residual(y, yd, u[None])[0] for u in units], axis=1)
     matrix -= instants.residual(y, yd, rest)[0][:, None]
-    if system.closure is not None:
+    if system.loops is not None:
         (J, bias), ydd = jacobian(y, yd), one.rates[2][0, :moving]
         J0, bias0 = jacobian(*one.rates[:2])
         desired = instants.desired.qdd[0, system.drives.free]

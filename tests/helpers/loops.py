@@ -79,6 +79,45 @@ def four_bar(kind: str = "pin") -> Tree:
     }
 
 
+def guided_crank() -> Tree:
+    """Return crank, flexible rod and a block that a slider guides along the ground's x axis."""
+    return {
+        "name": "guided crank",
+        "arms": [bar("crank", 0.1), flexible("rod", 0.28), weightless("block")],
+        "joints": [
+            hinge("turn", "ground", "crank"),
+            hinge("knee", "crank", "rod", passive=True),
+            hinge("wrist", "rod", "block", passive=True),
+        ],
+        "closures": [{"name": "guide", "kind": "slider", "between": ["block", "ground"],
+                      "axis": [1, 0, 0]}],
+        "motion": {"initial_joints": [0.5, -0.6, 0.1]},
+    }  # fmt: skip
+
+
+def crossed_crank() -> Tree:
+    """Return the slider-crank of `spatial_slider_crank` whose universal joint closes the loop."""
+    turns = [("about x", [1, 0, 0]), ("about y", [0, 1, 0]), ("about z", UP)]
+    joints = [
+        hinge("turn", "ground", "crank", origin=[0, 0.1, 0.12], axis=[1, 0, 0]),
+        {"name": "slide", "type": "prismatic", "parent": "ground", "child": "slider",
+         "axis": [1, 0, 0], "passive": True},
+    ]  # fmt: skip
+    arms = [weightless("crank", ("pin", (0.0, 0.0, 0.08))), weightless("slider")]
+    below: dict[str, str] = {"parent": "crank", "parent_interface": "pin"}
+    for k, (name, axis) in enumerate(turns):
+        child = "rod" if k == 2 else f"carrier {k}"
+        arms.append(flexible("rod", 0.3) if k == 2 else weightless(child))
+        joints.append({"name": name, "type": "revolute", "child": child, "axis": axis,
+                       "passive": True, **below})  # fmt: skip
+        below = {"parent": child}
+    cross = {"name": "cross", "kind": "universal", "between": ["rod", "slider"],
+             "axis": [0, 1, 0], "cross_axis": [0, 0, 1]}  # fmt: skip
+    start = [0, 0.2, 0.0, 0.73, -0.46]
+    return {"name": "crossed crank", "arms": arms, "joints": joints, "closures": [cross],
+            "motion": {"initial_joints": start}, "payload": {"arm": "rod"}}  # fmt: skip
+
+
 def five_bar() -> Tree:
     """Return two cranks 0.3 m apart that hold a tool by two flexible links."""
     return {

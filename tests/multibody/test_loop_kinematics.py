@@ -17,9 +17,11 @@ from loops import (
     UPPER,
     boom,
     closed,
+    crossed_crank,
     delta,
     five_bar,
     four_bar,
+    guided_crank,
     parallelogram,
 )
 from machines import with_keys
@@ -76,9 +78,25 @@ def of_four_bar(q: np.ndarray) -> np.ndarray:
     return np.abs(0.1 * np.exp(1j * a) + 0.28 * np.exp(1j * b) + 0.25 * np.exp(1j * c) - 0.25)
 
 
+def of_guided_crank(q: np.ndarray) -> np.ndarray:
+    """The block is where the rod reaches the axis, and does not turn."""
+    a, b, c = np.cumsum(q, axis=1).T
+    end = 0.1 * np.exp(1j * a) + 0.28 * np.exp(1j * b)
+    place = 0.1 * np.cos(a) + np.sqrt(0.28**2 - (0.1 * np.sin(a)) ** 2)
+    return np.stack([np.abs(end - place), c])
+
+
+def of_crossed_crank(q: np.ndarray) -> np.ndarray:
+    """The slider is as far from the crank's pin as the rod is long."""
+    y, z = 0.1 - 0.08 * np.sin(q[:, 0]), 0.12 + 0.08 * np.cos(q[:, 0])
+    return q[:, 1] - np.sqrt(0.3**2 - y**2 - z**2)
+
+
 @pytest.mark.parametrize(
     ("tree", "table", "law"),
     [
+        (guided_crank(), "t,turn\n0,0.5\n1,5.5\n", of_guided_crank),
+        (crossed_crank(), "t,turn\n0,0\n1,5.5\n", of_crossed_crank),
         (four_bar("pin"), "t,turn\n0,0.5\n1,5.5\n", of_four_bar),
         (five_bar(), "t,a,b\n0,2.0,1.1\n1,1.6,0.8\n", of_five_bar),
         (parallelogram(), "t,shoulder\n0,0.3\n1,1.0\n", of_parallelogram),

@@ -33,7 +33,7 @@ SAME_PLACE = 1e-6  # m: a solid has an interface at a point no farther from it
 OWN = ("links", "points")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RobotLoops:
     """What a scene of a robot has of closed loops.
 
