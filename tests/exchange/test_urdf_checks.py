@@ -127,6 +127,7 @@ def joint(kind, parent, child, inside="", name="j"):
         (AB + joint("planar", "a", "b"), ["'planar'"]),
         (AB + joint("revolute", "a", "b", '<axis xyz="0 0 0"/>'), ["not all zero"]),
         (AB + joint("revolute", "a", "b", '<mimic joint="k"/>'), ["'k'", "a joint that moves"]),
+        (AB + joint("revolute", "a", "b", '<dynamics damping="-1"/>'), ["'j'", "damping", "-1"]),
         (AB + '<link name="c"/>' + joint("fixed", "b", "c") + joint("fixed", "c", "b", name="k"),
          ["loop"]),
         ("<link/>", ["yourdfpy"]),
@@ -249,12 +250,13 @@ def test_a_package_path_that_is_none(tmp_path):
     refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
 
 
-def test_limits_come_into_the_scene(tmp_path):
-    """None where the file says none, or zero."""
+def test_limits_and_friction_come_into_the_scene(tmp_path):
+    """No limit where the file says none, or zero."""
     text = DEMO.read_text()
     old = '<limit lower="-3.1416" upper="3.1416" effort="430" velocity="2.618"/>'
     assert text.count(old) == 1
     new = '<limit lower="-3.1416" upper="3.1416" effort="0" velocity="0"/>'
+    new += '<dynamics damping="0.4" friction="0.1"/>'
     (tmp_path / "r.urdf").write_text(text.replace(old, new, 1))
     run_import(tmp_path / "r.urdf", "forearm", DEMO_MOTION, tmp_path / "a")
     robot, scene = read_robot(DEMO), load_scene(tmp_path / "a" / "r.toml")
@@ -265,9 +267,10 @@ def test_limits_come_into_the_scene(tmp_path):
         joint = joints[one.name]
         assert one.position_limits == (joint.lower, joint.upper)
         if one.name in none:
-            assert one.velocity_limit is None
+            assert one.velocity_limit is None and one.friction == (0.4, 0.1)
         else:
             assert (one.velocity_limit, one.effort_limit) == (joint.velocity, joint.effort)
+            assert one.friction is None
 
 
 # -- inertias --------------------------------------------------------------------------------

@@ -166,7 +166,19 @@ def _joint(file: Path, one: Any) -> RobotJoint:
     unit = axis / length if length else np.array([1.0, 0.0, 0.0])
     mimic = None if one.type == "fixed" or one.mimic is None else _mimic(one.mimic)
     own = one.name, one.type, one.parent, one.child, _pose(one.origin), unit
-    return RobotJoint(*own, lower, upper, rate, effort, mimic)
+    return RobotJoint(*own, lower, upper, rate, effort, mimic, _friction(where, one))
+
+
+def _friction(where: str, one: Any) -> tuple[float, float]:
+    """Return viscous and Coulomb friction of the element <dynamics>; 0 where nothing is stated."""
+    found = []
+    for word in ("damping", "friction"):
+        value = None if one.dynamics is None else getattr(one.dynamics, word)
+        value = 0.0 if value is None or one.type == "fixed" else float(value)
+        if not (math.isfinite(value) and value >= 0.0):
+            raise InputError(f"{where}: dynamics {word} = {value:g}; expected a number >= 0")
+        found.append(value)
+    return found[0], found[1]
 
 
 def _limit(where: str, word: str, limit: Any) -> float:

@@ -47,6 +47,7 @@ class RobotJoint:
         velocity: limit of its rate, rad/s or m/s; infinite where there is none.
         effort: limit of what drives it, N m or N; infinite where there is none.
         mimic: which joint it follows, or None.
+        friction: viscous, N m s/rad or N s/m, and Coulomb, N m or N: `damping` and `friction`.
     """
 
     name: str
@@ -60,6 +61,7 @@ class RobotJoint:
     velocity: float = math.inf
     effort: float = math.inf
     mimic: Mimic | None = None
+    friction: tuple[float, float] = (0.0, 0.0)
 
     @property
     def moves(self) -> bool:

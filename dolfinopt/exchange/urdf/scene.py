@@ -233,6 +233,8 @@ class RobotScene:
             lines.append(f"velocity_limit = {number(joint.velocity)}  # {length}/s")
         if math.isfinite(joint.effort):
             lines.append(f"effort_limit = {number(joint.effort)}  # {force}")
+        if any(joint.friction):
+            lines.append(f"friction = {_list(joint.friction)}  # {force} s/{length}, {force}")
         return lines
 
     def _rest(self) -> list[str]:
