@@ -342,7 +342,7 @@ Panel = tuple[str, str, dict[str, np.ndarray]]  # label, SI unit, curves (n,) by
 def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
     """Return the rows of the figure: of every drive error and force, of the ground its force."""
     scene, rows = trajectory.scene, []
-    places = np.arange(scene.num_rigid)[scene.driven_columns].tolist()
+    places = map(int, np.arange(scene.num_rigid)[scene.driven_columns])
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
     units, loads = scene.rigid_units, drive_units(scene)
     for name, k in zip(scene.driven, places, strict=True):

@@ -470,7 +470,7 @@ class FreeOutline:
     def _as_large(self, area: float) -> FreeOutline:
         """Return the outline moved outwards by one length, so that it encloses an area, m2."""
         made = self
-        moves = np.concatenate([run.filter(0.0).any(axis=1) for run in self.runs] or [np.empty(0)])
+        moves = ~np.concatenate([run.held for run in self.runs] or [np.empty(0, dtype=bool)])
         for _ in range(AREA_STEPS if moves.any() else 0):
             by_s = made.size_by_s() @ moves
             made = made.moved(moves * ((area - made.size) / by_s))

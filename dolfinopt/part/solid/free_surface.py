@@ -358,7 +358,7 @@ def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:
     vectors = 0.5 * np.cross(b - a, c - a)
     normal = vectors / np.linalg.norm(vectors, axis=1)[:, None]
     own = distance_to_faces(np.vstack([a, b, c, (a + b + c) / 3.0]), domain.own) < near
-    own = own.reshape(4, -1).all(axis=0)
+    own = np.asarray(own.reshape(4, -1).all(axis=0))
     free = ~own
     held, across = _held(mesh, facets[own], normal[own])
     if len(domain.kept):
