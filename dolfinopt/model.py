@@ -48,7 +48,6 @@ from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
-from dolfinopt.study.studies import Preset, study
 from dolfinopt.units import with_unit
 
 if TYPE_CHECKING:
@@ -59,6 +58,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.state_space import StateSpace
     from dolfinopt.part.check import Check
     from dolfinopt.part.part import Part
+    from dolfinopt.study.studies import Preset
 
 Densities = Mapping[str, np.ndarray]
 
@@ -498,6 +498,8 @@ class Model:
         Raises:
             InputError: something asked for is not possible.
         """
+        from dolfinopt.study.studies import study  # with pandas: a third of the import's time
+
         with self._folder(folder) as place:
             paths = [
                 self._design_file(one, place / f"design{k}.npz") for k, one in enumerate(designs, 1)

@@ -262,6 +262,12 @@ def test_the_package_imports_nothing() -> None:
     assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
 
 
+@pytest.mark.serial
+def test_model_imports_nothing_of_studies_and_pictures() -> None:
+    others = DRAW | {"gmsh", "pandas", "scipy.stats"}
+    assert loaded(others | {"dolfinx"}, "from dolfinopt import Model") == {"dolfinx"}
+
+
 # What can be answered before MPI and PETSc are loaded, which takes a second.
 WORDS = [
     [],

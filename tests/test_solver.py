@@ -92,14 +92,18 @@ def test_mumps_solves_several_loads_at_once(pivot):
 
 
 @pytest.mark.serial
-def test_large_plane_arms_take_mumps(monkeypatch):
-    """By their rows, on one rank; the objective stays the same to rounding of the factors."""
-    monkeypatch.setattr(interior, "BAND_WORK_LIMIT", 0.0)  # no band
-    found = {}
-    for name, rows in (("petsc", np.inf), ("mumps", 100)):
+def test_plane_arms_take_the_band_then_mumps(monkeypatch):
+    """By work and rows, on one rank; the objective stays the same to rounding of the factors."""
+    found, band = {}, interior.BAND_WORK_LIMIT
+    assert band >= 310_206 * 197**2  # 1600 x 96 cells
+    for name, rows, most in (
+        ("LAPACK's band", 100, band), ("petsc", np.inf, 0.0), ("mumps", 100, 0.0)
+    ):  # fmt: skip
         monkeypatch.setattr(interior, "MUMPS_ROWS", rows)
+        monkeypatch.setattr(interior, "BAND_WORK_LIMIT", most)
         scene = do.load_scene(TWO_ARM, ["arms.cells=[24,4]", "design.filter_radius=0"])
         built = built_of(scene, MPI.COMM_SELF)
         found[name] = built.evaluate(built.uniform())[0].objective
         assert built.arms[0].substructure.interior.solver_name == name
-    assert found["mumps"] == pytest.approx(found["petsc"], rel=3e-10)
+    for name in ("mumps", "LAPACK's band"):
+        assert found[name] == pytest.approx(found["petsc"], rel=3e-10)

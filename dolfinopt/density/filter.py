@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.density.measured import (
     COLUMN_PLACES,
     FACET_SKEW_LIMIT,
+    FACTORISED_FACETS,
     LEAST_SIDE_DISTANCE,
     MIRROR_DISTANCE_LIMIT,
     NEAR_CELLS,
@@ -298,10 +299,15 @@ def _matrix(mesh: ArmMesh, blocks: np.ndarray, rows: np.ndarray, columns: np.nda
 
 
 def _solver(mesh: ArmMesh, matrix: PETSc.Mat) -> PETSc.KSP:
-    """Return a direct solver; in space conjugate gradients, which need some 20 to 50 steps."""
-    if mesh.dim == 3:
-        return conjugate_gradients(matrix, "dolfinopt_filter_")
-    return direct_solver(matrix, "rcm", "dolfinopt_filter_")
+    """Return a direct solver; in space conjugate gradients for boxes and for large meshes."""
+    prefix = "dolfinopt_filter_"
+    if mesh.dim == 2:
+        return direct_solver(matrix, "rcm", prefix)
+    # On boxes 20 to 50 steps; with values in the facets 100 to 1200, 60 for every cell in r.
+    by_cell = matrix.getSize()[0] == mesh.mesh.topology.index_map(3).size_global
+    if by_cell or matrix.getSize()[0] > FACTORISED_FACETS:
+        return conjugate_gradients(matrix, prefix)
+    return direct_solver(matrix, "nd", prefix, own=False)
 
 
 def _positive_definite(mat: PETSc.Mat) -> PETSc.Mat:

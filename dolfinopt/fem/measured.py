@@ -38,9 +38,10 @@ HARMLESS_CONTRAST = 1e6
 
 # -- interior: the choice of a solver --------------------------------------------------------
 
-# Rows times bandwidth squared up to which a band is factorised as such: an arm of 800 x 48 cells
-# has 8e8, and takes a quarter of the time of nested dissection (docs/pages/develop/profile.md).
-BAND_WORK_LIMIT = 1e9
+# Rows times bandwidth squared up to which a band is factorised as such: an arm of 1600 x 96 cells
+# has 1.2e10, and a nearby design takes 0.93 s, by MUMPS 1.1 to 1.4, by PETSc's Cholesky 1.6
+# (docs/pages/develop/profile.md). The band takes 8 bytes times rows times bandwidth, 0.5 GB there.
+BAND_WORK_LIMIT = 1.5e10
 # Of a solid arm beside MUMPS: a slender one of 180 x 18 x 12 cells, 133 000 rows, has 7e10 and
 # takes three quarters of its time; one of 220 x 22 x 14 cells has 2.4e11 and takes as long.
 SOLID_BAND_WORK_LIMIT = 1.5e11
