@@ -384,13 +384,8 @@ class AxisSymmetry:
 
 
 def _containing(points: np.ndarray, centroids: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return for each of points (k, d) which of the cells near it it lies in, -1: in none.
-
-    Args:
-        points: m.
-        centroids: (n, d) of the cells.
-        corners: (n, c, d) of the cells, those of a tensor product in its order.
-    """
+    """Return for each of points (k, d), m, which of the cells near it it lies in; -1: in none."""
+    # Cells have centroids (n, d) and corners (n, c, d), those of a tensor product in its order.
     parts = np.array(SIMPLICES[corners.shape[2], corners.shape[1]])
     near = cKDTree(centroids).query(points, k=min(NEAR_CELLS, len(centroids)))[1]
     near = near.reshape(len(points), -1)

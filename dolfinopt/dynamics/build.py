@@ -52,7 +52,7 @@ def soft_joints(scene: Scene) -> dict[int, JointParts]:
 
 def dependent_coordinates(scene: Scene) -> list[int]:
     """Return the rigid coordinates that follow from the others in closed loops."""
-    if scene.is_spatial:
+    if scene.joints:
         return [k for k, joint in enumerate(scene.movable) if joint.passive]
     return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
 

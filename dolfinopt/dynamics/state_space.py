@@ -297,11 +297,9 @@ def _dependent(system: MachineSystem, G: np.ndarray) -> np.ndarray:
 
 
 def _constraint_rates(one: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return G = dg/dy (m, R + N) and its first and second rate along the motion.
-
-    The first by the constraint's Hessian; the second by differences of the first along the motion's
-    own parabola, of fourth order.
-    """
+    """Return G = dg/dy (m, R + N) and its first and second rate along the motion."""
+    # The first by the constraints' Hessian; the second by differences of the first along the
+    # motion's own parabola, of fourth order.
     system, instants = one.system, one.system.at(one.t)
     motion = instants.motion(*one.rates)
     q, qd, qdd = (instants.split(x)[1] for x in one.rates)

@@ -439,10 +439,8 @@ def body_gradient(
 def _by_rotation(
     tree: Mechanism, links: list[Link], moves: dict[int, Load], zeta: np.ndarray
 ) -> dict[Site, np.ndarray]:
-    """Return the derivatives by every interface's theta (r, n) through forces of the world.
-
-    What turns a body turns such a force the other way in the body's components.
-    """
+    """Return the derivatives by every interface's theta (r, n) through forces of the world."""
+    # What turns a body turns such a force the other way in the body's components.
     found: dict[Site, np.ndarray] = {}
     if not tree.forces:
         return found

@@ -619,10 +619,8 @@ def _number_of_pieces(solid: Any) -> int:
 
 
 def _joined(solid: Any) -> Any:
-    """Return the pieces of a grid that have a part of both interfaces; None: there are none.
-
-    Further interfaces have a part of them, too.
-    """
+    """Return the pieces of a grid that have a part of both interfaces; None: there are none."""
+    # Further interfaces have a part of them, too.
     if solid.n_cells == 0:
         return None
     of_points, of_cells = _regions(solid)
