@@ -47,6 +47,8 @@ ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 # Worst shape of a cell over that when the mesh was made: a new one is due, or a step goes too far.
 WORN, SPOILT = 0.6, 0.2
+# Of the moves within so many cells of what would wear, tried in turn.
+KEPT_BACK, BESIDE = (0.5, 0.5, 0.0, 0.0), 1.0
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 
 
@@ -130,7 +132,21 @@ class FreeSurface:
         return np.asarray(self.frame.filter.solve(by_s.T, "T").T * self.frame.areas)
 
     def moved(self, s: np.ndarray) -> FreeSurface:
-        """Return the surface and its mesh with nodes moved outwards by s (count,), m."""
+        """Return the surface and its mesh with nodes moved outwards by s (count,), m.
+
+        Less near places where cells would wear or the surface cross itself: one thin wall must not
+        keep back all others, nor become one that cannot be meshed again.
+        """
+        for share in KEPT_BACK:
+            found = self._moved(s)
+            if not len(bad := found.bad(WORN)):
+                break
+            away = cKDTree(bad).query(self.mesh.points[self.nodes])[0]
+            s = np.where(away < BESIDE * self.part.domain.cell, share * s, s)
+        return found
+
+    def _moved(self, s: np.ndarray) -> FreeSurface:
+        """Return it with its nodes moved, as `moved`, wherever that leads."""
         step = np.zeros_like(self.mesh.points)
         step[self.nodes] = s[:, None] * self.along
         for a, follower in enumerate(self.frame.followers):
@@ -152,9 +168,19 @@ class FreeSurface:
     @property
     def is_valid(self) -> bool:
         """Whether its cells are sound and its surface does not cross itself."""
-        if self._worst(self.mesh) < SPOILT:
-            return False
-        return not len(crossings(Surface(self.mesh.points, self.mesh.boundary)))
+        return not len(self.bad(SPOILT))
+
+    def bad(self, least: float) -> np.ndarray:
+        """Return places (k, 3) of bad cells, and of triangles that others pass through, m.
+
+        Args:
+            least: shape of a cell over that of the worst one when the mesh was made.
+        """
+        points, made = self.mesh.points, replace(self.mesh, points=self.frame.places)
+        cells = self.mesh.cells[self.mesh.quality < least * made.quality.min()]
+        surface = Surface(points, self.mesh.boundary)
+        crossed = surface.corners[crossings(surface).ravel()]
+        return np.vstack([points[cells].mean(axis=1), crossed.mean(axis=1)])
 
     def is_worn(self, mesh: Tetrahedra) -> bool:
         """Whether the worst cell of a mesh is much worse than when it was made."""
