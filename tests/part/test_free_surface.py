@@ -79,6 +79,22 @@ def test_nodes_stay_on_the_faces_of_the_arm(form):
         assert moved.made.volume == pytest.approx(moved.size, rel=2e-3)
 
 
+def test_one_place_that_would_fold_does_not_keep_back_the_others(form):
+    free, (_, s) = form[4].outlines[1], moves_of(form)
+    if not isinstance(free, FreeSurface):
+        pytest.skip("plates are made of outlines")
+    places, cell = free.mesh.points[free.nodes], free.part.domain.cell
+    away = np.linalg.norm(places - places[0], axis=1)
+    folding = np.where(away < 0.5 * cell, 1.5 * cell, 0.1 * s)
+    moved = free.moved(folding)
+    assert moved.is_valid and not free._moved(folding).is_valid
+    went = ((moved.mesh.points - free.mesh.points)[free.nodes] * free.along).sum(axis=1)
+    went /= np.square(free.along).sum(axis=1)
+    far = away > 6.0 * cell
+    assert far.sum() > 0.5 * len(far) and np.allclose(went[far], folding[far], atol=1e-12)
+    assert np.abs(went[away < 0.5 * cell]).max() < 1.0 * cell
+
+
 def test_a_surface_that_would_cross_itself_gives_way_to_that_of_the_mesh(form, monkeypatch):
     state, (_, s) = form[4], moves_of(form)
     moved = state.outlines[1].moved(s)

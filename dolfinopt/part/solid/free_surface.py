@@ -47,8 +47,8 @@ ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
 EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 # Worst shape of a cell over that when the mesh was made: a new one is due, or a step goes too far.
 WORN, SPOILT = 0.6, 0.2
-# Of the moves within so many cells of what would wear, tried in turn.
-KEPT_BACK, BESIDE = (0.5, 0.5, 0.0, 0.0), 1.0
+# What is left of moves, within how many cells of what would wear; tried in turn.
+KEPT_BACK = (0.5, 1.0), (0.5, 1.0), (0.0, 1.0), (0.0, 2.0), (0.0, 4.0)
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 
 
@@ -137,12 +137,15 @@ class FreeSurface:
         Less near places where cells would wear or the surface cross itself: one thin wall must not
         keep back all others, nor become one that cannot be meshed again.
         """
-        for share in KEPT_BACK:
-            found = self._moved(s)
+        found = self._moved(s)
+        for share, cells in KEPT_BACK:
             if not len(bad := found.bad(WORN)):
                 break
-            away = cKDTree(bad).query(self.mesh.points[self.nodes])[0]
-            s = np.where(away < BESIDE * self.part.domain.cell, share * s, s)
+            tree, near = cKDTree(bad), cells * self.part.domain.cell
+            ends = (mesh.points[self.nodes] for mesh in (self.mesh, found.mesh))
+            beside = np.any([tree.query(places)[0] < near for places in ends], axis=0)
+            s = np.where(beside, share * s, s)
+            found = self._moved(s)
         return found
 
     def _moved(self, s: np.ndarray) -> FreeSurface:
