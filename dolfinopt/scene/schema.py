@@ -302,8 +302,10 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _check_tables(self) -> Scene:
-        # Closures first: which joints are driven depends on them.
-        for key in sorted(type(self).model_fields, key=lambda name: "closure" not in name):
+        # Closures first: which joints are driven depends on them; then forces, since an interface
+        # with a wrong name elsewhere seems to be of no use.
+        first = ("closure", "closures", "forces")
+        for key in (*first, *(key for key in type(self).model_fields if key not in first)):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):

@@ -7,10 +7,10 @@ import pytest
 from machines import CRANK, ROD, controlled, fork, loop, two_arm
 from mpi4py import MPI
 from remainders import built_of
-from runs import TWO_ARM, refusal
+from runs import ROOT, TWO_ARM, refusal, refused
 
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
-from dolfinopt.scene.load import pose_scenarios, scene_from_dict
+from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 
 pytestmark = pytest.mark.serial
 
@@ -172,3 +172,8 @@ def test_tables_of_applied_forces_need_time_and_columns(tmp_path):
     refusal(lambda: scene_from_dict(lone, source), "side", "[[forces]]")
     lone["forces"] = [{"arm": "link", "interface": "side", "force": [0.0, 1.0, 0.0]}]
     assert (0, 1) in scene_from_dict(lone, source).used_interfaces
+
+
+def test_a_wrong_interface_of_a_force_is_told_before_that_the_right_one_is_idle():
+    with refused("forces.0.interface", "nose", "lug"):
+        load_scene(ROOT / "demos" / "lifting_arm.toml", ('forces.0.interface="nose"',))
