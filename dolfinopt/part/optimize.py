@@ -648,12 +648,14 @@ class Search:
     Attributes:
         best: the best state so far: of the feasible ones that with the least objective.
         meshed: the last one whose mesh was made anew.
+        passed: outlines of that one and of those since then.
         steps: taken.
     """
 
     def __init__(self, problem: Problem, state: State):
         """Begin at a state."""
         self.problem, self.state, self.best, self.meshed = problem, state, state, state
+        self.passed = [dict(state.outlines)]
         self.steps, self.radius, self.morphed = 0, 1.0, 0
         self.x = np.zeros(0)
         self.mma: MMAState = initial_state(self.x)
@@ -705,12 +707,8 @@ class Search:
     def _step(self, slopes: np.ndarray) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         if self._is_worn():
-            try:
-                self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
-            except (ConvergenceError, InputError):  # curves that all but touch
-                self.best = self.meshed
+            if not self._mesh_anew():
                 return False
-            self.meshed, self.morphed = self.state, 0
             self._begin()
             slopes = self.problem.slopes(self.state)
         before = self.state
@@ -728,8 +726,24 @@ class Search:
             self.radius = min(1.0, verdict.factor * self.radius)
             if verdict.accepted:
                 self.x, self.mma, self.state = x, after, tried
+                self.passed.append(dict(tried.outlines))
                 self.morphed += 1
                 return True
+        return False
+
+    def _mesh_anew(self) -> bool:
+        """Go on with new meshes, of an earlier state where the last one has none; else end."""
+        for number, outlines in enumerate(reversed(self.passed)):
+            try:
+                self.state = self.problem.evaluated(outlines, {}, self.state.solutions)
+            except (ConvergenceError, InputError):  # curves, or walls, that all but touch
+                self.radius *= 0.5
+                continue
+            if number:  # those passed over cannot be parts
+                self.best = min(self.meshed, self.state, key=lambda one: one.rank)
+            self.meshed, self.morphed, self.passed = self.state, 0, [dict(self.state.outlines)]
+            return True
+        self.best = self.meshed
         return False
 
     def _proposed(
