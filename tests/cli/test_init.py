@@ -1,13 +1,12 @@
 """What helps to write a scene: templates, keys, the schema; and a script's interpreter."""
 
 import json
-import os
 import subprocess
 import sys
 
 import jsonschema
 import pytest
-from runs import ROOT, TWO_ARM, refusal, run, shell, tomllib
+from runs import ROOT, TWO_ARM, environment, refusal, run, shell, tomllib
 
 import dolfinopt
 from dolfinopt.cli.main import TEMPLATES
@@ -173,8 +172,8 @@ def test_launcher_runs_a_script(tmp_path, ranks):
         "import os, sys\nsys.stdout.write(f'{sys.argv[1:]} {os.environ[\"OMP_NUM_THREADS\"]}\\n')\n"
     )
     line = ["bash", str(launcher), *(["-n", str(ranks)] if ranks else []), "python"]
-    environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
-    options = {"capture_output": True, "text": True, "env": environment, "timeout": 60}
+    env = {k: v for k, v in environment().items() if k != "OMP_NUM_THREADS"}
+    options = {"capture_output": True, "text": True, "env": env, "timeout": 60}
     done = subprocess.run([*line, str(script), "a b", "--out"], **options)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == ["['a b', '--out'] 1"] * max(ranks, 1)

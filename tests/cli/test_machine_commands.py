@@ -60,7 +60,12 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys):
     WORLD.barrier()
     folders = (out / "state-space", shared_tmp_path / "scene")
     first, second = (np.load(one / "state_space.npz") for one in folders)
-    assert all(np.array_equal(first[key], second[key]) for key in first.files)
+    for key in first.files:  # numbers to rounding: where arrays lie in memory may tell
+        a, b = first[key], second[key]
+        if a.dtype.kind in "fc":
+            assert np.allclose(a, b, rtol=1e-9, atol=1e-12 * np.abs(a).max(initial=0.0))
+        else:
+            assert np.array_equal(a, b)
     matlab = loadmat(folders[0] / "state_space.mat")
     for key in "ABCD":
         assert np.array_equal(matlab[key], first[key])
