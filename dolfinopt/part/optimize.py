@@ -283,12 +283,21 @@ class Descent:
 
     def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
         """Return the best of what is judged, the state now among it, and the state's limits."""
-        scene, made = self.problem.scene, self.problem.parts_of(self.state.outlines)
-        try:
-            value, limits, hot = _judged(scene, made)
-        except (ConvergenceError, InputError):
+        # Curves, or walls, that all but touch cannot be meshed: then those before them are judged.
+        problem: Exception | None = None
+        for outlines in (self.state.outlines, *reversed(self.search.passed)):
+            scene, made = self.problem.scene, self.problem.parts_of(outlines)
+            try:
+                value, limits, hot = _judged(scene, made)
+            except (ConvergenceError, InputError) as error:
+                problem = error
+                continue
+            self.state = replace(self.state, outlines=outlines)
+            break
+        else:
             if self.best is None:
-                raise
+                assert problem is not None
+                raise problem
             return replace(self.best, iterations=self.done), self.best.limits
         self.problem = replace(self.problem, hot=hot)
         found = Found(start, made, self.done, value, limits, ending)
