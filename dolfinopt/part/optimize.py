@@ -227,8 +227,10 @@ Judgement = tuple[float, tuple[Limit, ...], dict[int, list[np.ndarray]]]
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Judgement:
     """Return objective, limits and the places of largest stress of parts on refined meshes."""
-    meshes = mesh_parts(parts)
-    coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
+    refine = any(one.REFINEMENTS for one in parts.values())
+    meshes, coarse = mesh_parts(parts, refine), None
+    if meshes.coarse:  # by what it differs they are refined
+        coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
     state, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
     hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     for place, one in stress.items():

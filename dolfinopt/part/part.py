@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -263,7 +264,7 @@ class Meshes:
     """Meshes of parts by their place in the chain.
 
     Attributes:
-        coarse: to tell by how much figures depend on the mesh.
+        coarse: to tell by how much figures depend on the mesh; none where one cannot be made.
         fine: those of the parts' scene.
     """
 
@@ -277,5 +278,8 @@ def mesh_parts(parts: Mapping[int, Part], coarse: bool = True) -> Meshes:
     Raises:
         InputError: Gmsh cannot mesh a part.
     """
-    larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
-    return Meshes(larger, {k: one.mesh() for k, one in parts.items()})
+    larger: dict[int, PartMesh] = {}
+    with suppress(InputError):  # of walls thinner than such cells
+        larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
+    fine = {k: one.mesh() for k, one in parts.items()}
+    return Meshes(larger if len(larger) == len(fine) else {}, fine)
