@@ -40,6 +40,7 @@ from dolfinopt.part.widths import Boundary, narrowest_place
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.stress import CornerStress
 
 
@@ -289,9 +290,9 @@ class SolidPart:
         """Return which places (n, 3) are away from where stress has no limit (n,)."""
         return is_regular(self.domain, places, margin)
 
-    def stress(self, state: DesignState) -> CornerStress:
+    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the tetrahedra of its arm."""
-        return corner_stress(state)
+        return corner_stress(state, fields)
 
 
 def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart:
