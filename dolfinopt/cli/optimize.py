@@ -67,7 +67,7 @@ def optimize(
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
     from dolfinopt.output.folders import working_alone
-    from dolfinopt.output.run import optimize as run
+    from dolfinopt.output.run_folder import optimize as run
     from dolfinopt.parallel import on_root
 
     if resume:

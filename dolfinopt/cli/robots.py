@@ -108,9 +108,14 @@ def _read(
     closures: Path | None,
 ) -> tuple[RobotScene, np.ndarray, np.ndarray]:
     """Return the scene, instants (n,) and rows (n, joints and rods) of its table."""
-    from dolfinopt.exchange.urdf.closures import NO_LOOPS, read_loops
     from dolfinopt.exchange.urdf.file import implausible_inertias
-    from dolfinopt.exchange.urdf.robot import default_tool, places_of, scene_bodies
+    from dolfinopt.exchange.urdf.robot import (
+        NO_LOOPS,
+        default_tool,
+        places_of,
+        read_loops,
+        scene_bodies,
+    )
     from dolfinopt.exchange.urdf.scene import RobotScene, read_trajectory
 
     chosen = tuple(name for word in links.split(",") if (name := word.strip()))
@@ -276,8 +281,7 @@ def _reduced(world: MPI.Comm, run: Path, scene: Scene) -> _Run:
 
 def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
     """Write all files, the robot last: where it is, the others belong to it (root only)."""
-    from dolfinopt.disk import write_atomically
-    from dolfinopt.locks import working_in
+    from dolfinopt.disk import working_in, write_atomically
     from dolfinopt.output.folders import prepare_folder, remove_stale
 
     prepare_folder(folder)

@@ -1,4 +1,4 @@
-"""summary.json: what a run found, what it cost, and what it was made with."""
+"""summary.json: what a run found, what it cost, what it was made with; budget.csv."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.members import Width, Widths, thinnest, thinnest_solid
 from dolfinopt.disk import write_text
+from dolfinopt.dynamics.budget import deflection_budget
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.budget import budget_of
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -41,6 +41,7 @@ from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
+    from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.output.run_folder import Simulated
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
@@ -631,3 +632,50 @@ def versions() -> dict[str, str]:
         "scipy": scipy.__version__,
         "python": platform.python_version(),
     }
+
+
+# -- table of the deflection's budget --------------------------------------------------------
+
+
+BUDGET_FILE = "budget.csv"
+
+
+def budget_of(trajectory: Trajectory | None) -> dict[str, Any] | None:
+    """Return the budget as summary.json has it; None without a motion or a deviation."""
+    found = None if trajectory is None else deflection_budget(trajectory)
+    return None if found is None else {**asdict(found), "shares": found.shares}
+
+
+def write_budget(folder: Path, budget: Mapping[str, Any] | None) -> None:
+    """Write the parts of a budget as a table (CSV), if there is one."""
+    if budget is None:
+        return
+    rows = [
+        f"{one['kind']},{one['name']},{one['deflection']:.10g},{one['share']:.10g}\n"
+        for one in budget["parts"]
+    ]
+    write_text(folder / BUDGET_FILE, "".join(["kind,part,deflection [m],share [-]\n", *rows]))
+
+
+def deflection_sentence(budget: Mapping[str, Any]) -> str:
+    """Return the shares of all kinds of parts in a line, the links' first."""
+    links, *others = [f"{name} {100.0 * x:.3g} %" for name, x in budget["shares"].items()]
+    held = links.replace("links ", "links hold ", 1)
+    return f"{held} of the deflection{''.join(f', {one}' for one in others)}"
+
+
+def deflection_table(budget: Mapping[str, Any]) -> list[str]:
+    """Return the parts as lines of a table."""
+    head = (
+        f"at {budget['instant']:.3f} s, {1e3 * budget['linear']:.4g} mm to first order "
+        f"({1e3 * budget['deviation']:.4g} mm simulated):"
+    )
+    width = max(len(one["name"]) for one in budget["parts"])
+    return [
+        head,
+        *(
+            f"  {one['kind']:<8} {one['name']:<{width}} {1e3 * one['deflection']:>10.4g} mm "
+            f"{100.0 * one['share']:>6.1f} %"
+            for one in budget["parts"]
+        ),
+    ]

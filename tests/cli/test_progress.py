@@ -4,8 +4,7 @@ import time
 
 import pytest
 
-from dolfinopt.cli.live_line import plain_lines
-from dolfinopt.cli.shared import elapsed
+from dolfinopt.cli.shared import elapsed, plain_lines
 from dolfinopt.optimization.state import FurtherRow, HistoryRow
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

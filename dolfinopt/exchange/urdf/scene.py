@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.closures import NO_LOOPS, RobotLoops
 from dolfinopt.exchange.urdf.robot import (
     CELLS,
     FEWEST,
     GROUND,
+    NO_LOOPS,
     Robot,
     RobotJoint,
+    RobotLoops,
     SceneBody,
     number,
     roll_pitch_yaw_of,
