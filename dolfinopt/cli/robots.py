@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.exchange.urdf.robot import Inertia, Robot, SceneBody
+    from dolfinopt.exchange.urdf.robot import Inertia, Robot
     from dolfinopt.exchange.urdf.scene import Origin, RobotScene
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.parallel import Partition
@@ -84,8 +84,18 @@ def import_robot(
     with together(world):
         if world.rank == 0:
             with ending_at_once():
+                from dolfinopt.exchange.urdf.scene import scene_of_robot
+                from dolfinopt.mesh.geometry import msh_bytes
+
                 model = _robot(robot, package_path)
-                found = _read(model, links, trajectory, tool, boxes, closures)
+                chosen = tuple(name for word in links.split(",") if (name := word.strip()))
+                if not chosen:
+                    raise InputError(
+                        f"--links {links!r}: expected names of links of {model.file}, A,B"
+                    )
+                write_mesh = None if boxes else msh_bytes
+                table = os.fspath(trajectory)
+                found = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
             _write_scene(out or Path(robot.stem), *found)
 
 
@@ -97,77 +107,6 @@ def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
         if not folder.is_dir():
             raise InputError(f"--package-path {folder}: expected a folder with ROS packages")
     return read_robot(file, package_path)
-
-
-def _read(
-    model: Robot,
-    links: str,
-    trajectory: Path,
-    tool: str | None,
-    boxes: bool,
-    closures: Path | None,
-) -> tuple[RobotScene, np.ndarray, np.ndarray]:
-    """Return the scene, instants (n,) and rows (n, joints and rods) of its table."""
-    from dolfinopt.exchange.urdf.file import implausible_inertias
-    from dolfinopt.exchange.urdf.robot import (
-        NO_LOOPS,
-        default_tool,
-        places_of,
-        read_loops,
-        scene_bodies,
-    )
-    from dolfinopt.exchange.urdf.scene import RobotScene, read_trajectory
-
-    chosen = tuple(name for word in links.split(",") if (name := word.strip()))
-    if not chosen:
-        raise InputError(f"--links {links!r}: expected names of links of {model.file}, A,B")
-    bodies = scene_bodies(model, chosen, tool)
-    loops = NO_LOOPS
-    if closures is not None:
-        places = places_of(model, chosen, tool or default_tool(model, chosen))
-        loops = read_loops(model, bodies, places, closures)
-    t, rows, said = read_trajectory(model, os.fspath(trajectory), loops)
-    warn([*said, *implausible_inertias(model)])
-    if not boxes:
-        bodies = tuple(_meshed(model, one) if one.is_solid else one for one in bodies)
-    start_joints = tuple(map(float, rows[0, : len(model.movable)]))
-    return RobotScene(model, bodies, float(t[-1]), loops, start_joints), t, rows
-
-
-def _meshed(model: Robot, body: SceneBody) -> SceneBody:
-    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
-    # The shape is that of the collision elements; of the visual ones where those are no solid.
-    from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
-    from dolfinopt.exchange.urdf.robot import SolidMesh
-    from dolfinopt.mesh.geometry import msh_bytes
-
-    link = model.links[body.link]
-    done: tuple[str, ...] = ()
-    try:
-        try:
-            found = cells_between_joints(link.shapes, body)
-        except NoSolid as error:
-            if link.visual is None:
-                raise
-            try:
-                found = cells_between_joints(link.visual(), body)
-            except NoSolid:
-                raise error from None
-            done = ("visual geometry",)
-    except NoSolid as error:
-        warn([f"{model.file}: link {body.link!r} becomes a box: {error}"])
-        return body
-    _, height, thickness = map(float, found.extents)
-    mesh = SolidMesh(
-        msh_bytes(found),
-        len(found.cells),
-        found.side,
-        found.volume,
-        found.ends_within(found.side),
-        found.offset(body.length),
-        (*done, *found.done),
-    )
-    return replace(body, size=(height, thickness), mesh=mesh)
 
 
 def _write_scene(folder: Path, scene: RobotScene, t: np.ndarray, rows: np.ndarray) -> None:

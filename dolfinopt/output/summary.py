@@ -37,12 +37,55 @@ from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.tables.closures import PARTS
-from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.output.run_folder import Simulated
+
+# Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
+SUMMARY_UNITS = {
+    "compliance": "N m",
+    "max_deviation": "m",
+    "max_deviation_time": "s",
+    "max_rotation": "rad",
+    "settling": "m",
+    "deflection_budget": "m, shares -",
+    "stress": "Pa",
+    "mass": "kg",
+    "designed_mass": "kg",
+    "grayness": "-",
+    "volume_fraction": "-",
+    "connected": "-",
+    "contacts": "-",
+    "minimum_member_measured": "m",
+    "minimum_gap_measured": "m",
+    "too_narrow": "m",
+    "first_frequency": "Hz",
+    "first_frequency_error": "-",
+    "loaded_frequency": "Hz",
+    "simulation_error_estimate": "-",
+    "kkt": "-",
+    "seconds": "s",
+    "peak_memory_mb": "MB",
+}
+
+CERTIFICATE_UNITS = {
+    "kkt": "-",
+    "gradient_angle": "degree",
+    "gradient_ratio": "-",
+    "excess": "-",
+    "seconds": "s",
+}
+
+HISTORY_UNITS = {
+    "max_deviation": "m",
+    "grayness": "-",
+    "volume_fraction": "-",
+    "change": "-",
+    "seconds": "s",
+    "kkt": "-",
+}
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -373,8 +416,8 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
     unit = objective_of(scene).unit
-    units: dict[str, Any] = {"objective": unit, **SUMMARY}
-    units["certificate"] = {**CERTIFICATE, "exact_objective": unit}
+    units: dict[str, Any] = {"objective": unit, **SUMMARY_UNITS}
+    units["certificate"] = {**CERTIFICATE_UNITS, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
         rigid = scene.rigid_units
@@ -384,7 +427,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     if scene.closures:
         kinds = {one.name: [unit for _, unit in PARTS[one.kind]] for one in scene.closures}
         units["closure_peak"] = {name: {u: u for u in own} for name, own in kinds.items()}
-    units["history.csv"] = {"objective": unit, **HISTORY}
+    units["history.csv"] = {"objective": unit, **HISTORY_UNITS}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)
     return units
