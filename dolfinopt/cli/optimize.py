@@ -31,7 +31,7 @@ from dolfinopt.cli.shared import (
 )
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import PASSING_RATE
-from dolfinopt.units import with_unit
+from dolfinopt.progress import with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI

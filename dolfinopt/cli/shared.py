@@ -40,7 +40,7 @@ from dolfinopt.output.folders import (
     prepare_folder,
     stale_parts,
 )
-from dolfinopt.units import NOT_MET, with_unit
+from dolfinopt.progress import NOT_MET, with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
