@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dolfinopt.arms.vibration import Carried, LoadedModes, full_first_frequency, loaded_modes
+from dolfinopt.arms.modes import Carried, LoadedModes, full_first_frequency, loaded_modes
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure

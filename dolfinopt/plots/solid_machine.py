@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
 from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
-from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.mechanism import GROUND, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.output.views import ArmView

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import arms_with_design, read_history
 from dolfinopt.output.run_folder import Simulated

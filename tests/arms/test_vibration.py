@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.vibration import (
+from dolfinopt.arms.modes import (
     CarriedInertia,
     Chain,
     LoadedModes,

@@ -20,14 +20,14 @@ from bodies import (
 )
 from runs import ROOT
 
-from dolfinopt.multibody.end_effector import (
+from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
+from dolfinopt.multibody.kinematics import (
     Posed,
     deviation,
     end_effector,
     end_effector_gradient,
     end_rotation,
 )
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.mechanism import AppliedForce, JointHardware, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.tangent import body_gradient, linearise

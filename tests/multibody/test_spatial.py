@@ -10,7 +10,7 @@ import pytest
 from bodies import changed, complex_derivative, random_tree
 from scipy.linalg import expm
 
-from dolfinopt.arms.vibration import FrozenTree
+from dolfinopt.arms.modes import FrozenTree
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.machine import exponential, roll_pitch_yaw, skew
 from dolfinopt.multibody.motion import RigidMotion

@@ -10,7 +10,7 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.output.views import AROUND, ArmView, designed
 from dolfinopt.part.solid.surface import surface_at
 from dolfinopt.plots import animation, solid_design, solid_machine
