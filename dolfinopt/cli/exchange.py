@@ -98,7 +98,6 @@ def export(
     if urdf:
         if design is not None or overrides:
             raise InputError("--urdf: expected no --design and no --set, they are the run's")
-
         export_robot(scene, out, overwrite, before)
         return
     if before is not None:
