@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.optimize import Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
-    from dolfinopt.scene.tables.part import Part as Asked
+    from dolfinopt.scene.tables.design import Part as Asked
 
 Say = Callable[[str], None]
 

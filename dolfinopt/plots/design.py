@@ -11,7 +11,6 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.shapes import boundary, sides, volume_fraction
 from dolfinopt.plots.style import (
     BLUE,
     COLOURS,
@@ -266,3 +265,39 @@ def _draw_plate(axes: Axes, loops: Sequence[np.ndarray], depth: np.ndarray) -> N
 def _compound(loops: Sequence[np.ndarray]) -> Path:
     """Return the face within an outline and without its holes."""
     return Path.make_compound_path(*(Path(np.vstack([one, one[:1]]), closed=True) for one in loops))
+
+
+# -- polygons: areas and outlines -------------------------------------------------------------
+
+
+def cell_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the areas (n,), m2, of polygons with corners (n, k, 2), m, in order around each."""
+    x, y = corners[..., 0], corners[..., 1]
+    after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    return 0.5 * np.abs(np.sum(x * after_y - after_x * y, axis=1))
+
+
+def volume_fraction(view: ArmView) -> float:
+    """Return the mean physical density of an arm, weighted with its cells' areas."""
+    area = cell_areas(view.corners)
+    return float(area @ view.density / area.sum())
+
+
+def sides(corners: np.ndarray) -> np.ndarray:
+    """Return all edges (m * k, 2, ...) of polygons (m, k, ...)."""
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
+    return edges.reshape(corners.shape[0] * corners.shape[1], 2, *corners.shape[2:])
+
+
+def boundary(corners: np.ndarray) -> np.ndarray:
+    """Return which of `sides` only one of the polygons (m, k, 2) has; corners may differ by 1e-7.
+
+    It stays the same in every deformation and place of the polygons.
+    """
+    flat = corners.reshape(-1, 2)
+    size = float(np.ptp(flat, axis=0).max()) or 1.0
+    column, row = np.round((flat - flat.min(axis=0)) / (1e-7 * size)).astype(np.int64).T
+    node = np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+    edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]
+    _, first, count = np.unique(edge, return_index=True, return_counts=True)
+    return first[count == 1]

@@ -1,6 +1,6 @@
 """Buckling of the arms along the motion: the factor by which the loads of an instant may grow.
 
-mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.buckling`), with K0 by the
+mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.modes`), with K0 by the
 static stress of an instant, u = U a: the fields U of all loads (`fem.stress`) times coefficients a.
 phi'K phi being 1, mu changes by
 
@@ -20,8 +20,8 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.buckling import BucklingModes, buckling_modes
 from dolfinopt.arms.design_state import DesignState
+from dolfinopt.arms.modes import BucklingModes, buckling_modes
 from dolfinopt.density.interpolation import interpolate
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.fem.prestress import Prestress, PrestressGradient, StressedModulus

@@ -13,12 +13,12 @@ from functools import partial
 import numpy as np
 
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
+from dolfinopt.arms.modes import LoadedModes, RigidIntegrals
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
 from dolfinopt.fem.stress import DisplacementGradient
-from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     by_modal_loads,
