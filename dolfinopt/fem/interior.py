@@ -153,6 +153,8 @@ class InteriorSystem:
             most = TETRAHEDRA_BAND_WORK_LIMIT if self._irregular else SOLID_BAND_WORK_LIMIT
         if size * float(self._bandwidth) ** 2 > most:
             return None
+        if size > FACTOR_ROWS and self._is_too_much(8.0 * size * (self._bandwidth + 1)):
+            return None
         return BandCholesky(self._entries.rows, self._entries.columns, size)
 
     @cached_property
@@ -178,14 +180,18 @@ class InteriorSystem:
 
     def _memory_is_short(self) -> bool:
         """Return whether a factor would take too much of a machine's free memory (collective)."""
-        T = self._T
-        here = MPI.Get_processor_name()
+        T, rows, here = self._T, self._T.num_dofs, MPI.Get_processor_name()
         share = T.comm.allgather(here).count(here) / T.comm.size
-        factor = share * FACTOR_BYTES * T.num_dofs * (T.num_dofs / FACTOR_ROWS) ** FACTOR_EXPONENT
-        # Other arms' ranks on this machine take theirs at the same time.
-        free = free_memory() * T.comm.allgather(here).count(here) / ranks_here()
-        short = T.num_dofs > FACTOR_ROWS and factor > FREE_MEMORY_SHARE * free
+        factor = share * FACTOR_BYTES * rows * (rows / FACTOR_ROWS) ** FACTOR_EXPONENT
+        short = rows > FACTOR_ROWS and self._is_too_much(factor)
         return bool(T.comm.allreduce(short, op=MPI.LOR))
+
+    def _is_too_much(self, needed: float) -> bool:
+        """Return whether the arm's ranks on this machine had better not take so many bytes."""
+        here = MPI.Get_processor_name()
+        # Other arms' ranks on this machine take theirs at the same time.
+        free = free_memory() * self._T.comm.allgather(here).count(here) / ranks_here()
+        return needed > FREE_MEMORY_SHARE * free
 
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:

@@ -71,8 +71,9 @@ WIDEST = 1200
 # Of cubes the first grow as rows to 1.55 and would meet at 500 000.
 TETRAHEDRA_ROWS = 500_000
 TETRAHEDRA_BAND_WORK_LIMIT = 1e9
-# Conjugate gradients, too, where factors take more than this part of the memory that is free. Bytes
-# a row of MUMPS' factor with so many rows, and the power of the rows with which they grow.
+# Conjugate gradients, too, where factors take more than this part of the memory that is free; no
+# band where it takes more. Bytes a row of MUMPS' factor with so many rows, and the power of the
+# rows with which they grow.
 FREE_MEMORY_SHARE = 0.5
 FACTOR_BYTES = 14e3
 FACTOR_ROWS = 50_000

@@ -173,6 +173,10 @@ def test_which_solver(monkeypatch):
         system.__dict__.pop("is_iterative", None)
         found.append(system.is_iterative)
     assert found == [False, True]
+    for bytes_, fits in ((1e12, True), (8.0 * rows * system._T.bandwidth, False)):
+        free[0] = bytes_
+        system.__dict__.pop("_band", None)
+        assert (system._band is not None) == fits
     assert system._T.bandwidth == 3 * (4 * 3 + 4 + 1 + 1) - 1
     monkeypatch.setattr(interior, "WIDEST", system._T.bandwidth - 1)
     system.__dict__.pop("is_iterative")
