@@ -263,8 +263,8 @@ def test_the_package_imports_nothing() -> None:
 
 
 @pytest.mark.serial
-def test_model_imports_nothing_of_studies_and_pictures() -> None:
-    others = DRAW | {"gmsh", "pandas", "scipy.stats"}
+def test_model_imports_nothing_of_studies_pictures_and_space() -> None:
+    others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.multibody.inverse_kinematics"}
     assert loaded(others | {"dolfinx"}, "from dolfinopt import Model") == {"dolfinx"}
 
 
