@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from runs import refused, run
+from runs import TWO_ARM, refused, run
 
 from dolfinopt.bench import field
 from dolfinopt.errors import ConvergenceError, InputError
@@ -21,6 +21,10 @@ def test_published_results_are_those_of_today(name):
         found = one.difference if one.of.table else one.value
         room = 0.01 * one.of.limit * abs(one.reference) if one.of.limit else 0.0
         assert found == pytest.approx(one.of.ours, rel=1e-4, abs=room), one.of.what
+
+
+def test_two_arm_is_the_demo():
+    assert CASES["two-arm"].scene.read_bytes() == TWO_ARM.read_bytes()
 
 
 @pytest.mark.parametrize(
