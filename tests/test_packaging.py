@@ -38,4 +38,4 @@ def test_pip_does_not_bring_another_dolfinx():
 def test_changelog_begins_with_this_version():
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     versions = re.findall(r"^## \[([^\]]+)\]", text, flags=re.MULTILINE)
-    assert [one for one in versions if one != "Unreleased"][0] == dolfinopt.__version__
+    assert next(one for one in versions if one != "Unreleased") == dolfinopt.__version__
