@@ -8,6 +8,7 @@ usage: ./dolfinopt.sh [-n RANKS] COMMAND ...               run a command, with -
        ./dolfinopt.sh [-n RANKS] python FILE ...           run a script with the same interpreter
        ./dolfinopt.sh [-n RANKS] test [PYTEST ARGUMENTS]   ruff, mypy, pytest on one rank and on RANKS (2)
        ./dolfinopt.sh test --all [PYTEST ARGUMENTS]        the same with the slow tests
+       ./dolfinopt.sh docs                                 build the documents into site/, strictly
        ./dolfinopt.sh --help                               list the commands
 
 The first call sets up what is missing: on Debian 12 or 13 DOLFINx and its libraries with apt
@@ -108,7 +109,7 @@ install_packages() {
 }
 
 # set_up STAMP PROJECT: PROJECT is what pip installs: with what `dolfinopt import` needs of robots,
-# or with that and what tests need.
+# or with that and what the documents or tests need.
 set_up() {
   local stamp=$1 project=$2 version
   is_ready "$stamp" && return # another call did it while this one waited for the lock
@@ -141,6 +142,7 @@ PYTHON
   step "checking the set-up" "$python" -c "import dolfinx.fem, gmsh, slepc4py, pyvista"
 
   fingerprint >"$venv/ready"
+  [ "$stamp" != ready-docs ] || cp "$venv/ready" "$venv/ready-docs"
   [ "$project" != "${here}[dev]" ] || cp "$venv/ready" "$venv/ready-dev"
 }
 
@@ -283,6 +285,17 @@ case ${1-} in
     fi
     ensure ready-dev "${here}[dev]"
     run_tests "$@"
+    ;;
+  docs)
+    if [ $# -gt 1 ] || [ -n "$ranks" ]; then
+      say "docs takes no arguments: ./dolfinopt.sh docs writes site/"
+      exit 2
+    fi
+    is_ready ready-dev || ensure ready-docs "${here}[robots,docs]"
+    # NO_MKDOCS_2_WARNING: of the theme, about a version that is not used.
+    NO_MKDOCS_2_WARNING=1 "$python" -m mkdocs build --strict --clean --quiet -f "$here/docs/mkdocs.yml" ||
+      exit
+    say "documents in $here/site/index.html"
     ;;
   python)
     shift

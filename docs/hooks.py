@@ -17,6 +17,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 import dolfinopt
+from dolfinopt.bench.field import Value, read_cases
 from dolfinopt.cli import commands
 from dolfinopt.scene.load import describe_keys
 
@@ -59,6 +60,7 @@ def on_files(files: Files, config: Any) -> Files:
         "reference/commands.md": command_reference(),
         "reference/python.md": python_reference(),
         "develop/modules.md": module_list(),
+        "validation/field.md": field_page(),
     }.items():
         files.append(File.generated(config, path, content=text))
     for picture in sorted((ROOT / "demos" / "pictures").iterdir()):
@@ -171,6 +173,46 @@ def python_reference() -> str:
     ):
         lines += [f"\n## {title}\n", *(f"::: dolfinopt.{name}\n" for name in chosen)]
     return "\n".join(lines)
+
+
+def field_page() -> str:
+    """Return the page of the benchmark, from its case files."""
+    lines = [
+        "# Benchmark of the field\n",
+        "Published problems of flexible machines in motion, with geometry, motion, design and",
+        "numbers together, so that programs can be compared. Statements, reference values and our",
+        "results are in the folder `benchmarks` of the source, free for any use (CC0).",
+        "`dolfinopt bench field` runs them and compares; `--all` includes the long ones, `--case",
+        "NAME` runs one. Of a history, the difference is the largest over time as a share of the",
+        "reference's largest value.\n",
+        "How the references were made: `benchmarks/reference/README.md`. To take part, see",
+        "`benchmarks/README.md`.\n",
+    ]
+    for case in read_cases():
+        lines += [f"\n## {case.title} {{#{case.name}}}\n", f"{_flowing(case.problem)}\n"]
+        lines += [f"Source: {_flowing(case.source)}. Case `{case.name}`.\n"]
+        lines += ["| value | unit | reference | dolfinopt | difference | limit | from |"]
+        lines += ["|---|---|---|---|---|---|---|"]
+        lines += [_field_row(one) for one in case.values]
+    return "\n".join(lines) + "\n"
+
+
+def _flowing(text: str) -> str:
+    """Return a text on one line, as Markdown; addresses and DOIs as links."""
+    text = " ".join(text.split()).replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_")
+    return re.sub(r"\bdoi:(10\.\d+/[\w./()-]*\w)", r"[doi:\1](https://doi.org/\1)", text)
+
+
+def _field_row(one: Value) -> str:
+    """Return the row of a value of the benchmark."""
+    way = {"near": "", "most": "at most ", "least": "at least "}[one.way]
+    if one.table:
+        cells = ["history", "history", f"{one.ours:.2g}", f"{one.limit:g}"]
+    else:
+        change = one.ours / one.reference - 1.0
+        limit = f"{way}{one.limit:g}" if one.way == "near" else f"{way}the reference"
+        cells = [f"{one.reference:.6g}", f"{one.ours:.6g}", f"{change:.1g}", limit]
+    return f"| {' | '.join([_flowing(one.what), one.unit, *cells, _flowing(one.origin)])} |"
 
 
 def module_list() -> str:

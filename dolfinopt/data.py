@@ -28,3 +28,11 @@ def page_folders() -> tuple[Path, ...]:
     """Return the folders of the templates of HTML pages: of all pages, and of report.html."""
     here = Path(__file__).parent
     return here / "study" / "pages", here / "paper" / "pages"
+
+
+def benchmark_folder() -> Path:
+    """Return the folder of the published problems and their reference values.
+
+    In a source tree it is a link to the folder `benchmarks` next to the package.
+    """
+    return Path(__file__).parent / "benchmarks"

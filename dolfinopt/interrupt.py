@@ -1,4 +1,4 @@
-"""Ctrl-C while nothing is at work yet, or no more: one line, and an end at once.
+"""Ctrl-C before start-up or after shutdown: one line, and an end at once.
 
 A `KeyboardInterrupt` would come out of any of hundreds of imports as a traceback, or be swallowed
 by one of them. Commands that compute take it as an exception, see `parallel.abort_together`.

@@ -75,6 +75,8 @@ class SimulationResult:
         trajectory: the motion over time; None but on rank 0.
         views: cells, densities and modes of all arms, for pictures; empty but on rank 0.
         filtered: what an optimised, projected design was projected from, as `design`; else empty.
+        stress_at_points: largest von Mises stress at the elements' Gauss points along the motion,
+            Pa, where `Model.simulate` was asked for it; else, and on other ranks than 0, nan.
     """
 
     scene: Scene
@@ -83,6 +85,7 @@ class SimulationResult:
     trajectory: Trajectory | None
     views: list[ArmView]
     filtered: dict[str, np.ndarray] = field(default_factory=dict)
+    stress_at_points: float = nan
 
     @property
     def objective(self) -> float:
@@ -324,7 +327,15 @@ class Model:
         evaluation, trajectory = evaluate(self.scene, partition, arms, x_phys, self._profile)
         found = stress_report(partition, arms, trajectory, self._profile) if stress else None
         views = gather_views(self.scene, partition, arms, x_phys, found)
-        return SimulationResult(self.scene, evaluation, self._gathered(x_phys), trajectory, views)
+        points = [one.peak_at_points.value for one in (found or {}).values()]
+        return SimulationResult(
+            self.scene,
+            evaluation,
+            self._gathered(x_phys),
+            trajectory,
+            views,
+            stress_at_points=max(points, default=nan),
+        )
 
     def gradient(self, x: Design = None, kind: str | None = None) -> dict[str, np.ndarray]:
         """Return the objective's gradient by the physical densities, as a design is given.
@@ -390,13 +401,13 @@ class Model:
             found.trajectory,
             gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
             self._gathered(found.x_filtered or {}, found.partition),
-            found.iterations,
-            found.converged,
-            found.stop_reason,
-            found.violated,
-            found.history,
-            found.initial_deviation,
-            found.certificate,
+            iterations=found.iterations,
+            converged=found.converged,
+            stop_reason=found.stop_reason,
+            violated=found.violated,
+            rows=found.history,
+            initial_deviation=found.initial_deviation,
+            certificate=found.certificate,
         )
 
     def check_parts(

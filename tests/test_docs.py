@@ -9,6 +9,7 @@ next one finds. A comment in front of a block may say what a test needs to know:
     <!-- test: --samples 64 -->       further words for every dolfinopt command of the block
 """
 
+import ast
 import os
 import re
 import shlex
@@ -25,6 +26,7 @@ from runs import tomllib
 import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.responses import response
 from dolfinopt.scene.load import describe_keys
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
@@ -36,6 +38,7 @@ TESTED = [
     ROOT / "CONTRIBUTING.md",
     *sorted((PAGES / "tutorials").glob("*.md")),
     *sorted((PAGES / "howto").glob("*.md")),
+    PAGES / "develop" / "add-response.md",
 ]
 SETTINGS = {  # of every scene that a page simulates, so that it takes a fraction of a second
     "cells": "[20, 3]",
@@ -77,6 +80,7 @@ def folder(tmp_path, monkeypatch):
     for scene in (tmp_path / "demos").glob("*.toml"):
         scene.write_text(made_small(scene.read_text()))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(response, "_known", dict(response._known))  # pages may register some
     return tmp_path
 
 
@@ -180,6 +184,23 @@ def test_scene_keys_of_a_page_exist(page):
 def test_commands_in_the_text_exist(page):
     for name in re.findall(r"`dolfinopt ([a-z]+)[ `]", page.read_text(encoding="utf-8")):
         assert name in commands.commands, name
+
+
+def test_messages_of_troubleshooting_are_those_of_the_program():
+    """What the page quotes between ellipses stands in the code, word for word."""
+    told = "\n".join(text for path in (ROOT / "dolfinopt").rglob("*.py") for text in strings(path))
+    page = (PAGES / "howto" / "troubleshooting.md").read_text(encoding="utf-8")
+    quoted = re.findall(r"^\| `([^`]+)` \|", page, flags=re.MULTILINE)
+    assert len(quoted) > 20
+    for part in "…".join(quoted).split("…"):
+        assert part.strip() in told, part
+
+
+def strings(path: Path) -> list[str]:
+    """Return the texts of a module; one with values put in is joined without them."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    constants = [one.value for one in ast.walk(tree) if isinstance(one, ast.Constant)]
+    return [text for text in constants if isinstance(text, str)]
 
 
 def test_blocks_are_found(tmp_path):

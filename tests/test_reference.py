@@ -1,4 +1,4 @@
-"""The whole chain against independent programs (tests/reference), and against differences."""
+"""The whole chain against independent programs (benchmarks/reference), and against differences."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 
-REFERENCE = Path(__file__).parent / "reference"
+REFERENCE = Path(__file__).parents[1] / "benchmarks" / "reference"
 TWO_ARM_VALUES = json.loads((REFERENCE / "two_arm_200x12.json").read_text())
 
 

@@ -175,7 +175,7 @@ class DesignState:
         scene: says how to reduce, and the damping.
         num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
         stiffened: whether its body has geometric stiffness.
-        kept: what responses know of it, by their name; theirs to fill.
+        kept: cache filled by responses, keyed by name.
     """
 
     def __init__(

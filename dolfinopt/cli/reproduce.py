@@ -12,6 +12,8 @@ import click
 from dolfinopt.cli.shared import out_option, plots_option, prepare, set_option, start, warn
 from dolfinopt.errors import ConvergenceError, InputError
 
+FIELD = "field"
+
 
 @click.command()
 @out_option("figures, report.html and cases; default: results/paper")
@@ -68,10 +70,18 @@ def reproduce(
 
 @click.command()
 @click.argument("names", metavar="[DIAGRAM]...", nargs=-1)
-@out_option("diagrams and bench.md; default: results/bench")
+@out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
-def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
-    """Measure run time against error.
+@click.option("--case", "cases", metavar="NAME", multiple=True, help="of field: this case alone")
+@click.option("--all", "everything", is_flag=True, help="of field: the long cases, too")
+def bench(
+    names: tuple[str, ...],
+    out: Path | None,
+    quick: bool,
+    cases: tuple[str, ...],
+    everything: bool,
+) -> None:
+    """Measure run time against error, or check the benchmark of the field.
 
     Diagrams of integrators, iterations, elements and errors, beside other programs; or those named
     alone: time, iteration, mesh, tolerance. Two run only when they are named: solid measures solid
@@ -79,14 +89,55 @@ def bench(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     three starts (half an hour).
 
     What is measured is kept in DIR; a call that was interrupted goes on.
+
+    `dolfinopt bench field` runs the published problems of the folder benchmarks and prints every
+    value beside its reference, with difference, limit and verdict; exit status 1 where a limit is
+    missed. By default the quick cases, some ten seconds.
     """
     world = start()
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
+    if FIELD in names:
+        if len(names) > 1 or quick:
+            other = "--quick" if quick else next(name for name in names if name != FIELD)
+            raise InputError(f"bench field: {other} does not go with it; call it alone")
+        _check_field(out, cases, everything)
+        return
+    if cases or everything:
+        raise InputError("bench: --case and --all belong to dolfinopt bench field")
+    _measure(names, out, quick)
+
+
+def _check_field(out: Path | None, names: tuple[str, ...], everything: bool) -> None:
+    """Run cases of the benchmark; print each one's values when it is done."""
+    from dolfinopt.bench.field import check, chosen_cases, table_of
+    from dolfinopt.disk import write_text
+
+    if names and everything:
+        raise InputError("bench field: --case and --all: give one of them")
+    found = []
+    for case in chosen_cases(names, everything):
+        checked = check(case)
+        found += checked
+        click.echo(f"{case.title} ({case.name})")
+        click.echo(table_of(checked).drop(columns="case").to_string(index=False) + "\n")
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_text(out / "field.csv", table_of(found).to_csv(index=False))
+    missed = [one for one in found if not one.met]
+    if missed:
+        named = ", ".join(f"{one.case.name}: {one.of.what}" for one in missed)
+        raise ConvergenceError(f"bench field: {len(missed)} of {len(found)} limits missed: {named}")
+    click.echo(f"{len(found)} values within their limits")
+
+
+def _measure(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
+    """Measure and draw diagrams."""
     from dolfinopt.bench.run import QUICKLY, Plan, named
     from dolfinopt.bench.run import bench as run
     from dolfinopt.paper.reproduction import load_paper
 
+    world = start()
     chosen = named(names)
     begun = time.perf_counter()
     folder = out or Path("results") / "bench"

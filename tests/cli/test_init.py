@@ -154,19 +154,41 @@ def test_schema_finds_what_is_wrong():
 # -- ./dolfinopt.sh python -------------------------------------------------------------------
 
 
+def set_up(folder, interpreter, *stamps):
+    """Return the launcher in a folder that is set up, with a script as interpreter."""
+    launcher = folder / "dolfinopt.sh"
+    launcher.write_bytes((ROOT / "dolfinopt.sh").read_bytes())
+    (folder / "pyproject.toml").touch()
+    python = folder / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.write_text(f"#!/bin/sh\n{interpreter}\n")
+    python.chmod(0o755)
+    stamp = f"cksum '{launcher}' '{folder}/pyproject.toml' /etc/debian_version 2>/dev/null"
+    ready = subprocess.run(["bash", "-c", stamp], capture_output=True).stdout
+    for name in stamps:
+        (folder / ".venv" / name).write_bytes(ready)
+    return launcher
+
+
+@pytest.mark.parametrize("stamp", ["ready-docs", "ready-dev"])
+@pytest.mark.parametrize("status", [0, 1])
+def test_launcher_builds_the_documents(tmp_path, stamp, status):
+    """Strictly, into site/; with the status of the build."""
+    launcher = set_up(tmp_path, f'echo "$@"; exit {status}', stamp)
+    options = {"capture_output": True, "text": True, "timeout": 60}
+    done = subprocess.run(["bash", str(launcher), "docs"], **options)
+    assert done.returncode == status
+    assert "mkdocs build --strict" in done.stdout
+    assert str(tmp_path / "docs" / "mkdocs.yml") in done.stdout
+    assert ("site/index.html" in done.stderr) is (status == 0)
+    done = subprocess.run(["bash", str(launcher), "docs", "here"], **options)
+    assert done.returncode == 2 and "docs takes no arguments" in done.stderr
+
+
 @pytest.mark.parametrize("ranks", [0, 2])
 def test_launcher_runs_a_script(tmp_path, ranks):
     """With the interpreter of the set-up, its settings, and all arguments."""
-    launcher = tmp_path / "dolfinopt.sh"
-    launcher.write_bytes((ROOT / "dolfinopt.sh").read_bytes())
-    (tmp_path / "pyproject.toml").touch()
-    python = tmp_path / ".venv" / "bin" / "python"
-    python.parent.mkdir(parents=True)
-    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
-    python.chmod(0o755)
-    stamp = f"cksum '{launcher}' '{tmp_path}/pyproject.toml' /etc/debian_version 2>/dev/null"
-    ready = subprocess.run(["bash", "-c", stamp], capture_output=True).stdout  # as when set up
-    (tmp_path / ".venv" / "ready").write_bytes(ready)
+    launcher = set_up(tmp_path, f'exec {sys.executable} "$@"', "ready")
     script = tmp_path / "my script.py"
     script.write_text(
         "import os, sys\nsys.stdout.write(f'{sys.argv[1:]} {os.environ[\"OMP_NUM_THREADS\"]}\\n')\n"

@@ -43,7 +43,7 @@ SPRINGS = {
 
 
 def robot(kind: str, folder) -> Tree:
-    """Return the two links of `tests/reference`, their motors alone controlled."""
+    """Return the two links of `benchmarks/reference`, their motors alone controlled."""
     parts = [
         gear | {"bearing_stiffness": k, "bearing_damping": [1e-4 * x for x in k]}
         for gear, k in zip(GEARS, SPRINGS[kind], strict=True)

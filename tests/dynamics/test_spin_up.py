@@ -23,7 +23,7 @@ from dolfinopt.reduction import METHODS, Options
 
 pytestmark = pytest.mark.serial  # one body on one rank
 
-REFERENCE = Path(__file__).parents[1] / "reference"
+REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
 RUN_UP = 15.0  # s
 
 

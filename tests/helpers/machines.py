@@ -1,4 +1,4 @@
-"""Machines: control, slider-crank, four-bar; what `tests/reference` says of them, and balances."""
+"""Machines: control, slider-crank, four-bar; their references, and balances."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ from dolfinopt.multibody.tangent import linearise
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 Tree = dict[str, Any]
-REFERENCE = Path(__file__).parents[1] / "reference"
+REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
 GAINS = {"stiffness": [2e5, 2e4, 2e4], "damping": [2e4, 600.0, 600.0]}
 
 
@@ -82,11 +82,11 @@ def loop(kind: str = "slider", **tables: Any) -> Scene:
     return scene_from_dict(loop_tree(kind, **tables))
 
 
-# -- machines of tests/reference -------------------------------------------------------------
+# -- machines of benchmarks/reference -------------------------------------------------------------
 
 
 def reference(name: str) -> dict[str, np.ndarray]:
-    """Return the columns of a table of `tests/reference` by name, without units."""
+    """Return the columns of a table of `benchmarks/reference` by name, without units."""
     file = REFERENCE / f"{name}.csv"
     with file.open(encoding="ascii") as lines:
         names = [column.split("[")[0].strip() for column in next(lines).split(",")]
@@ -99,7 +99,7 @@ def two_arm(*overrides: str, **changes: Any) -> Tree:
 
 
 def slider_crank(height: float, cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
-    """Return the slider-crank of `tests/reference`: steel rod of `height`, m, 2 turns in 0.1 s."""
+    """Return the slider-crank of the reference: steel rod of `height`, m, 2 turns in 0.1 s."""
     tree = with_keys(LOOP, {
         "motion": {"speed": 150.0},
         "closure": {"side": 1},
@@ -113,7 +113,7 @@ def slider_crank(height: float, cells: tuple[int, int] = (60, 4), **changes: Any
 
 
 def four_bar(cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
-    """Return the four-bar of `tests/reference`, of aluminium."""
+    """Return the four-bar of `benchmarks/reference`, of aluminium."""
     tree = slider_crank(0.010, cells)
     crank, bar = tree["arms"]
     tree["material"] = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
