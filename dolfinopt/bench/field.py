@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from mpi4py import MPI
 
 from dolfinopt.bench import crank
 from dolfinopt.data import benchmark_folder
@@ -294,7 +295,8 @@ def check(case: Case) -> list[Checked]:
         found = PROGRAMS[case.program]()
         return [_number(case, one, found[one.quantity]) for one in case.values]
     asked = any(one.quantity == "stress" for one in case.values)
-    result = Model(case.scene, *case.overrides).simulate(case.design, stress=asked)
+    model = Model(case.scene, *case.overrides, comm=MPI.COMM_SELF)
+    result = model.simulate(case.design, stress=asked)
     return [
         _history(case, one, result)
         if one.table
