@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from mpi4py import MPI
 
 from dolfinopt.bench import crank
 from dolfinopt.data import benchmark_folder
@@ -211,6 +212,21 @@ def _bodies(result: SimulationResult) -> Sequence[ShapeIntegrals]:
     return tuple(result.trajectory.mechanism.bodies)
 
 
+def _frequency(number: int) -> Callable[[SimulationResult], float]:
+    """Return the function to a frequency of the machine at its start, joints held, Hz."""
+
+    def value(result: SimulationResult) -> float:
+        assert result.trajectory is not None
+        system = result.trajectory.problem
+        still = np.zeros((1, system.num_coordinates))
+        matrix = system.at(np.zeros(1)).linearise(still, still, still).dense()[0]
+        K, _, M = np.split(matrix, 3, axis=1)
+        squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)
+        return float(np.sqrt(squares[number - 1]) / (2.0 * np.pi))
+
+    return value
+
+
 NUMBERS: dict[str, Callable[[SimulationResult], float]] = {
     "mass": lambda result: sum(
         body.mass
@@ -223,6 +239,7 @@ NUMBERS: dict[str, Callable[[SimulationResult], float]] = {
     "loaded frequency": _response("first_frequency"),
     "first frequency": lambda result: _bodies(result)[0].first_frequency,
     "mass of the first arm": lambda result: _bodies(result)[0].mass,
+    **{f"frequency {number}": _frequency(number) for number in (1, 2, 3)},
     "deviation": lambda result: result.max_deviation,
     "deviation's instant": lambda result: result.evaluation.max_deviation_time,
     "compliance": lambda result: result.compliance,
@@ -294,7 +311,8 @@ def check(case: Case) -> list[Checked]:
         found = PROGRAMS[case.program]()
         return [_number(case, one, found[one.quantity]) for one in case.values]
     asked = any(one.quantity == "stress" for one in case.values)
-    result = Model(case.scene, *case.overrides).simulate(case.design, stress=asked)
+    model = Model(case.scene, *case.overrides, comm=MPI.COMM_SELF)
+    result = model.simulate(case.design, stress=asked)
     return [
         _history(case, one, result)
         if one.table

@@ -6,13 +6,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from dolfinopt.cli.shared import out_option, plots_option, prepare, set_option, start, warn
 from dolfinopt.errors import ConvergenceError, InputError
 
-FIELD = "field"
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 
 @click.command()
@@ -68,6 +70,9 @@ def reproduce(
 # -- dolfinopt bench -------------------------------------------------------------------------
 
 
+FIELD = "field"
+
+
 @click.command()
 @click.argument("names", metavar="[DIAGRAM]...", nargs=-1)
 @out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
@@ -95,40 +100,45 @@ def bench(
     missed. By default the quick cases, some ten seconds.
     """
     world = start()
-    if world.size > 1:
-        raise InputError("bench: starts its ranks itself; call it without mpirun")
     if FIELD in names:
         if len(names) > 1 or quick:
             other = "--quick" if quick else next(name for name in names if name != FIELD)
             raise InputError(f"bench field: {other} does not go with it; call it alone")
-        _check_field(out, cases, everything)
+        _check_field(world, out, cases, everything)
         return
+    if world.size > 1:
+        raise InputError("bench: starts its ranks itself; call it without mpirun")
     if cases or everything:
         raise InputError("bench: --case and --all belong to dolfinopt bench field")
     _measure(names, out, quick)
 
 
-def _check_field(out: Path | None, names: tuple[str, ...], everything: bool) -> None:
-    """Run cases of the benchmark; print each one's values when it is done."""
+def _check_field(
+    world: MPI.Comm, out: Path | None, names: tuple[str, ...], everything: bool
+) -> None:
+    """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
     from dolfinopt.disk import write_text
+    from dolfinopt.parallel import on_root
 
     if names and everything:
         raise InputError("bench field: --case and --all: give one of them")
     found = []
     for case in chosen_cases(names, everything):
-        checked = check(case)
+        checked = on_root(world, check, case)
         found += checked
-        click.echo(f"{case.title} ({case.name})")
-        click.echo(table_of(checked).drop(columns="case").to_string(index=False) + "\n")
+        if world.rank == 0:
+            table = table_of(checked).drop(columns="case").to_string(index=False)
+            click.echo(f"{case.title} ({case.name})\n{table}\n")
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_text(out / "field.csv", table_of(found).to_csv(index=False))
+        prepare(world, out)
+        on_root(world, write_text, out / "field.csv", table_of(found).to_csv(index=False))
     missed = [one for one in found if not one.met]
     if missed:
         named = ", ".join(f"{one.case.name}: {one.of.what}" for one in missed)
         raise ConvergenceError(f"bench field: {len(missed)} of {len(found)} limits missed: {named}")
-    click.echo(f"{len(found)} values within their limits")
+    if world.rank == 0:
+        click.echo(f"{len(found)} values within their limits")
 
 
 def _measure(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
