@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
     from dolfinopt.optimization.loop import Result
-    from dolfinopt.output.run import optimize
+    from dolfinopt.output.run_folder import optimize
     from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import abort_together, gather_arms, partition_arms
     from dolfinopt.profiling import Profile
@@ -59,7 +59,7 @@ _HOME = {
     "OptimizationResult": "model",
     "SimulationResult": "model",
     "Result": "optimization.loop",
-    "optimize": "output.run",
+    "optimize": "output.run_folder",
     "abort_together": "parallel",
     "partition_arms": "parallel",
     "Scene": "scene.load",

@@ -38,17 +38,17 @@ from dolfinopt.mesh.budget import check_budget
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import physical, read_design
-from dolfinopt.output.run import optimize
+from dolfinopt.output.run_folder import optimize
 from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
+from dolfinopt.progress import with_unit
 from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
-from dolfinopt.units import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,4 +1,4 @@
-"""Work that takes long says how far it is: lines to the logger `dolfinopt.progress`."""
+"""What a run tells: how far long work is (logger `dolfinopt.progress`), figures with units."""
 
 from __future__ import annotations
 
@@ -42,3 +42,14 @@ def show_slow_work() -> None:
         log.addHandler(_Lines())
     log.propagate = False
     log.setLevel(logging.INFO)
+
+
+# -- figures with their units ----------------------------------------------------------------
+
+
+NOT_MET = "; not met: "  # before the constraints in a stop reason
+
+
+def with_unit(value: str, unit: str) -> str:
+    """Return a number with its unit, "-" of none left out."""
+    return value if unit == "-" else f"{value} {unit}"

@@ -15,11 +15,17 @@ from mpi4py import MPI
 from runs import ROOT, TWO_ARM, command, environment, overrides, refusal, run
 
 import dolfinopt as do
-from dolfinopt import disk, locks
+from dolfinopt import disk
 from dolfinopt.data import paper_scene
-from dolfinopt.disk import append_text, make_folder, write_arrays, write_atomically, write_text
+from dolfinopt.disk import (
+    append_text,
+    make_folder,
+    working_in,
+    write_arrays,
+    write_atomically,
+    write_text,
+)
 from dolfinopt.errors import InputError, OutputError
-from dolfinopt.locks import working_in
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
 from dolfinopt.output.folders import write_question
@@ -151,12 +157,12 @@ def without(number):
 
 def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
     """That is not a lock which another holds."""
-    for number in locks.ABSENT:
+    for number in disk.ABSENT:
         monkeypatch.setattr(fcntl, "lockf", without(number))
         with working_in(tmp_path):
             (line,) = capsys.readouterr().err.splitlines()
         assert f"has no locks ({os.strerror(number)}); continuing without" in line
-    for number in locks.HELD:
+    for number in disk.HELD:
         monkeypatch.setattr(fcntl, "lockf", without(number))
         with pytest.raises(InputError, match="another run works in this folder"):
             working_in(tmp_path).__enter__()

@@ -133,7 +133,7 @@ def alive(process):
 @pytest.mark.serial
 @pytest.mark.parametrize("option", ["", "--overwrite"])
 def test_an_interrupted_optimisation_says_how_to_go_on(tmp_path, monkeypatch, option):
-    from dolfinopt.output import run as module
+    from dolfinopt.output import run_folder as module
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt

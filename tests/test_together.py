@@ -13,14 +13,13 @@ from remainders import build
 from runs import TWO_ARM, environment, overrides
 
 import dolfinopt as do
-from dolfinopt.arms import arm, design_state, kinds
+from dolfinopt.arms import arm, design_state
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.output import checkpoint, design, run, summary, views
-from dolfinopt.output import run_folder as results
+from dolfinopt.output import checkpoint, design, run_folder, summary, views
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
@@ -240,7 +239,7 @@ PLACES = [
     (building, LONE, mesh, "_arm_mesh"),
     (building, LONE, IncompatibleElement, "operators"),
     (building, LONE, arm, "Substructure"),
-    (evaluating, LONE, kinds, "interpolate"),
+    (evaluating, LONE, design_state, "interpolate"),
     (evaluating, LONE, design_state, "shape_integrals"),
     (evaluating, LONE, static, "static_response", STATIC),
     (evaluating, LONE, static, "static_response", TIP),
@@ -266,7 +265,7 @@ PLACES = [
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes
     (optimising, LONE, arm.Arm, "preserving_threshold"),
-    (optimising, 0, run, "HistoryWriter"),
+    (optimising, 0, run_folder, "HistoryWriter"),
     (optimising, 0, design.HistoryWriter, "append", 1),
     (optimising, 0, checkpoint, "write_arrays", 0),
     (optimising, 0, checkpoint, "write_arrays", 1),
@@ -274,11 +273,11 @@ PLACES = [
     (resuming, LONE, checkpoint, "_match"),
     (writing, LONE, arm.Arm, "volume_fraction"),
     (writing, 0, views, "_views"),
-    (writing, 0, results, "write_design"),
-    (writing, 0, results, "write_trajectory"),
+    (writing, 0, run_folder, "write_design"),
+    (writing, 0, run_folder, "write_trajectory"),
     (writing, 0, summary, "versions"),
-    (writing, 0, results, "write_summary"),
-    (writing_designs, 0, results, "write_fields"),
+    (writing, 0, run_folder, "write_summary"),
+    (writing_designs, 0, run_folder, "write_fields"),
     (writing_gradients, 0, design, "write_arrays"),
     (reading_designs, LONE, design, "_fit"),
     (taylor, LONE, arm.Arm, "physical"),
@@ -338,7 +337,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
         (mesh, "_arm_mesh"),
         (elements, "_full"),
         (elasticity, "AffineMatrix"),
-        (kinds, "interpolate"),
+        (design_state, "interpolate"),
     ],
 )
 def test_a_shared_arm(owner, name, monkeypatch):

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.design_state import DesignState, InitialVectors, options, same_basis
-from dolfinopt.arms.kinds import kind_of
-from dolfinopt.arms.vibration import Carried, LoadedModes
+from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
+from dolfinopt.arms.modes import Carried, LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import AxisSymmetry, Extrusion, HelmholtzFilter
 from dolfinopt.density.interpolation import Interpolated

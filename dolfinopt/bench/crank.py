@@ -16,7 +16,7 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.mechanism import Closure, Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar

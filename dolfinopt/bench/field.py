@@ -22,7 +22,7 @@ from dolfinopt.bench import crank
 from dolfinopt.data import benchmark_folder
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
-from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if sys.version_info >= (3, 11):

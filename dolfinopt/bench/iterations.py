@@ -13,7 +13,7 @@ from dolfinopt.bench.measure import Cells, Plan, in_processes, mpirun, timed
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.bench.programs import PlainStatics, pymoto_iteration
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.output.run import optimize
+from dolfinopt.output.run_folder import optimize
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import changed
 

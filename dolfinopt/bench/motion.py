@@ -18,7 +18,7 @@ from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.output.run import optimize
+from dolfinopt.output.run_folder import optimize
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import changed, reduced

@@ -17,7 +17,7 @@ from dolfinopt.arms.arm import uniform_design
 from dolfinopt.bench.measure import Plan, arms_of, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
 from dolfinopt.data import template_folder
-from dolfinopt.output.run import optimize
+from dolfinopt.output.run_folder import optimize
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS

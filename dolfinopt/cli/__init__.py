@@ -1,4 +1,4 @@
-"""The `dolfinopt` command: one file a command, what they share in options.py and shared.py."""
+"""The `dolfinopt` command: a file for the commands of one kind, what they share in shared.py."""
 
 from dolfinopt.cli.main import commands, main
 

@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.cli.bench import bench
-from dolfinopt.cli.export import export
+from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.reproduce import reproduce
-from dolfinopt.cli.robots import import_robot
+from dolfinopt.cli.reproduce import bench, reproduce
 from dolfinopt.cli.shared import PATH, Start, end_before_start, led_by_another
 from dolfinopt.cli.studies import compare, sweep, uncertainty
 from dolfinopt.data import template_folder

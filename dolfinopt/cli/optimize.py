@@ -31,7 +31,7 @@ from dolfinopt.cli.shared import (
 )
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import PASSING_RATE
-from dolfinopt.units import with_unit
+from dolfinopt.progress import with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -67,7 +67,7 @@ def optimize(
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
     from dolfinopt.output.folders import working_alone
-    from dolfinopt.output.run import optimize as run
+    from dolfinopt.output.run_folder import optimize as run
     from dolfinopt.parallel import on_root
 
     if resume:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.optimize import Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
-    from dolfinopt.scene.tables.part import Part as Asked
+    from dolfinopt.scene.tables.design import Part as Asked
 
 Say = Callable[[str], None]
 
@@ -276,13 +276,16 @@ class Made:
     def draw(self, folder: Path) -> None:
         """Write the picture of the parts, and those of what they do if that is known."""
         from dolfinopt.output.views import designed
+        from dolfinopt.part.optimize import TRUSSES
         from dolfinopt.plots.curves import check_figure
         from dolfinopt.plots.design import parts_figure, stress_figure
         from dolfinopt.plots.style import save
 
         scene = self.scene
         masses = [scene.material_of(k).density * one.volume for k, one in self.parts.items()]
-        save(parts_figure(list(self.parts.values()), scene.name, masses), folder / "part.png")
+        own = self.shape is not None and self.shape.best.start.startswith(TRUSSES)
+        picture = parts_figure(list(self.parts.values()), scene.name, masses, own)
+        save(picture, folder / "part.png")
         if self.check is not None:
             save(check_figure(self.check, scene), folder / "deviation.png")
             stress = stress_figure(designed(self.check.views), f"{scene.name}: stress of the parts")

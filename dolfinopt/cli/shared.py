@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import (
     AbstractContextManager,
     ExitStack,
+    contextmanager,
     nullcontext,
     redirect_stdout,
 )
@@ -38,7 +40,7 @@ from dolfinopt.output.folders import (
     prepare_folder,
     stale_parts,
 )
-from dolfinopt.units import NOT_MET, with_unit
+from dolfinopt.progress import NOT_MET, with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -219,11 +221,11 @@ def draw(
 
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     """Print what the deviation comes from, the run's warnings, and its figures in one line."""
-    from dolfinopt.output import budget
+    from dolfinopt.output.summary import deflection_sentence, deflection_table
 
     optimised, parts = summary["kkt"] is not None, summary["deflection_budget"]
     if parts is not None:
-        for line in [budget.sentence(parts), *([] if optimised else budget.table(parts))]:
+        for line in [deflection_sentence(parts), *([] if optimised else deflection_table(parts))]:
             click.echo(line)
     warn(summary["warnings"])
     found = summary["reduction"]
@@ -347,8 +349,6 @@ def progress(
     """Return a live line on the root's terminal, lines every few seconds where it has none."""
     if world.rank != 0:
         return nullcontext(None)
-
-    from dolfinopt.cli.live_line import live_line, plain_lines  # NumPy: help needs none
 
     shown = live_line if sys.stderr.isatty() else plain_lines
     return shown(scene.optimizer.max_iterations)
@@ -514,3 +514,83 @@ def end_before_start(error: BaseException) -> int:
 
 
 # -- how far an optimisation is: a live line on a terminal, a line every few seconds elsewhere ---
+
+
+WIDE = 110  # characters a line
+EVERY = 5.0  # s between two lines where there is no terminal
+
+
+def _words(row: HistoryRow, iterations: int) -> str:
+    """Return a row of the history, or of the further iterations after it, in words."""
+    from dolfinopt.optimization.state import FurtherRow  # NumPy: help needs none
+
+    count, kind = iterations, ""
+    if isinstance(row, FurtherRow):
+        count, kind = row.of, "exact gradient, further "
+    return (
+        f"{kind}{row.iteration}/{count} objective {row.objective:.4g} "
+        f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
+        f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
+        + (f", {row.tightest}" if row.tightest else "")
+    )
+
+
+@contextmanager
+def plain_lines(iterations: int, every: float = EVERY) -> Iterator[Callable[[HistoryRow], None]]:
+    """Yield a function that takes a history row; print the last one every few seconds.
+
+    A thread prints, so that a single long iteration is not silent either.
+
+    Args:
+        iterations: at most.
+        every: s from one line on standard error to the next.
+    """
+    begun, ended = time.monotonic(), threading.Event()
+    last = ["setting up"]
+
+    def run() -> None:
+        while not ended.wait(every):
+            line = f"{last[0]}, {time.monotonic() - begun:.0f} s"
+            print(line, file=sys.stderr, flush=True)
+
+    def show(row: HistoryRow) -> None:
+        last[0] = _words(row, iterations)
+
+    thread = threading.Thread(target=run, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        thread.join()
+
+
+@contextmanager
+def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
+    """Yield a function that shows a history row: figures, bar, and time left.
+
+    The time left assumes all `iterations`; convergence may end the run before.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.table import Column
+
+    from dolfinopt.optimization.state import FurtherRow
+
+    console = Console(stderr=True)
+    # Eighty characters hold the figures; a bar wants more.
+    columns: list[ProgressColumn] = [
+        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(compact=True),
+    ]
+    if console.width >= WIDE:
+        columns.insert(1, BarColumn(bar_width=None))
+    with Progress(*columns, console=console, expand=console.width >= WIDE) as progress:
+        task = progress.add_task("setting up", total=iterations)
+
+        def show(row: HistoryRow) -> None:
+            total = row.of if isinstance(row, FurtherRow) else iterations
+            words = _words(row, iterations)
+            progress.update(task, total=total, completed=row.iteration, description=words)
+
+        yield show

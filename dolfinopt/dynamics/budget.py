@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.end_effector import end_effector_gradient
+from dolfinopt.multibody.kinematics import end_effector_gradient
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory

@@ -38,9 +38,9 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths.tables import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.forces import FORCE_COLUMNS, Force
 from dolfinopt.scene.tables.interfaces import interface_number
 from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
+from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
 
 
 def soft_joints(scene: Scene) -> dict[int, JointParts]:

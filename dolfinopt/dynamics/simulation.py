@@ -27,15 +27,15 @@ from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.end_effector import (
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
+from dolfinopt.multibody.kinematics import (
     deviation,
     end_effector,
     end_effector_gradient,
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
 from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (

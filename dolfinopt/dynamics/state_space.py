@@ -23,7 +23,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import LOOP_STEP_SHARE, POLE_STENCIL, POLE_STEP
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.end_effector import end_effector_gradient
+from dolfinopt.multibody.kinematics import end_effector_gradient
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.scene.load import Scene

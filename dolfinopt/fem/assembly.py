@@ -420,17 +420,31 @@ class Cells:
 
     def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
-        values = self.centred(right)
-        products = self.stiffness_times(values)
-        if left is not right:
-            values = self.centred(left)
-        return _sum_of_products(values, products)
+        rows, others = self.by_component(left), self.by_component(right)
+        out = np.empty(self.count)
+        for cells in self._runs(len(rows)):
+            values = self.differences(rows, cells)
+            out[cells] = self.difference_products(values, self.differences(others, cells), cells)
+        return out
 
     def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' m_e right_k (n_cells,) likewise."""
-        values, count = self.values(right), self.count
-        flat = values.reshape(len(values), -1, count)
-        return _sum_of_products(self.values(left), times(self.mass, flat))
+        rows, others = self.by_component(left), self.by_component(right)
+        out = np.empty(self.count)
+        for cells in self._runs(len(rows)):
+            corners = self._corners[:, cells]
+            values, more = (
+                np.stack([each.take(corner, axis=1, mode="clip") for corner in corners])
+                for each in (rows, others)
+            )
+            out[cells] = _sum_of_products(values, times(of_cells(self.mass, cells), more))
+        return out
+
+    def _runs(self, columns: int) -> list[slice]:
+        """Return runs of so many cells that values of so many columns stay in the cache."""
+        entries = STRESS_CHUNK_ENTRIES // max(1, self.num_nodes * columns)
+        step = max(entries, STRESS_CHUNK_CELLS)
+        return [slice(k, min(k + step, self.count)) for k in range(0, self.count, step)]
 
     def stiffness_times(self, values: np.ndarray) -> np.ndarray:
         """Return k_e times nodal values (n, d, k, n_cells), see `values`."""

@@ -193,8 +193,8 @@ class Substructure:
         return ShapeDerivative(self.mesh, self.cells)
 
     @cached_property
-    def stress_operator(self) -> np.ndarray:
-        """That of `fem.stress` at the element centres (n_cells, s, dn), 1/m."""
+    def stress_operator(self) -> sp.csr_matrix:
+        """That of `fem.stress` at the element centres (s n_cells, d n_nodes), 1/m."""
         corners = compat.cell_corner_count(self.mesh.mesh)
         centres = element_centres(corners, self.mesh.dim)
         return stress_operator(self.mesh, self.operators, centres)
@@ -330,7 +330,8 @@ class ElasticArm:
 
     def stiffness_times(self, field: np.ndarray) -> np.ndarray:
         """Return K u (n_nodes, d, k) of this rank's cells; N for u in m."""
-        return (self.K.matrix @ field.reshape(-1, field.shape[2])).reshape(field.shape)
+        flat = field.reshape(field.shape[0] * field.shape[1], field.shape[2])
+        return (self.K.matrix @ flat).reshape(field.shape)
 
     def mass_times(self, field: np.ndarray) -> np.ndarray:
         """Return M u (n_nodes, d, k) of this rank's cells; kg m for u in m."""

@@ -93,7 +93,7 @@ class UnitLoads:
     def accelerations(self) -> np.ndarray:
         """The fields (n_nodes, d, k) whose inertia the first k loads are."""
         points = self.arm.points
-        found = _accelerations(np.ones_like(points), points)
+        found = accelerations(np.ones_like(points), points)
         return found if self.modes is None else np.concatenate([found, self.modes], axis=2)
 
     def by_levers(self, face: FaceGradient) -> np.ndarray:
@@ -113,12 +113,7 @@ class UnitLoads:
         return known[1]
 
     def gradient(
-        self,
-        V: np.ndarray,
-        by_K0: np.ndarray,
-        *,
-        static: bool = False,
-        by_fields: np.ndarray | None = None,
+        self, V: np.ndarray, by_K0: np.ndarray, *, static: bool = False
     ) -> GeometricGradient:
         """Differentiate a function of K0 by modes and material (collective on the arm's ranks).
 
@@ -131,34 +126,21 @@ class UnitLoads:
             by_K0: (p, q, q) derivatives.
             static: whether V begins with the constraint modes, by which `by_modes` then
                 differentiates u_F, too, and `by_stiffness` by S.
-            by_fields: (n_nodes, d, p) derivatives of the same function by `fields`, where it
-                depends on them otherwise, too; contributions of this rank's cells.
         """
-        arm, inertial, work = self.arm, self.num_inertial, None
+        arm, inertial = self.arm, self.num_inertial
         modes = arm.constraint_modes()
         compliance = np.linalg.inv(modes.stiffness)
-        if len(by_K0) == 0:  # of a linear body
-            assert by_fields is not None
-            forces = np.zeros_like(by_fields)
-            by_V, direct = np.zeros_like(V), np.zeros_like(arm.young)
-        else:
-            known, fold = self._stiffened(V), static and by_fields is None
-            by_V, forces, direct, work = known.gradient(by_K0, compliance if fold else None)
-        if by_fields is not None:
-            forces = forces + by_fields
-        by_stiffness, face = np.zeros_like(compliance), None
-        if len(by_K0):
-            face = self._face.gradient(self._face_tensors, V, by_K0)
-            by_V = by_V + face.by_modes
-            direct = direct + self._face.stiffness_products(face.y, self.fields)
-            forces = forces + face.by_fields[:, :, : forces.shape[2]]
-            if work is not None:  # those of the interface's loads are folded already
-                outboard = face.by_fields[:, :, inertial:]
-                work = work + _fold(outboard, by_V, modes.field, compliance)
-        if static:
-            if work is None:
-                work = _fold(forces[:, :, inertial:], by_V, modes.field, compliance)
-                forces = forces[:, :, :inertial]
+        known = self._stiffened(V)
+        by_V, forces, direct, work = known.gradient(by_K0, compliance if static else None)
+        by_stiffness = np.zeros_like(compliance)
+        face = self._face.gradient(self._face_tensors, V, by_K0)
+        by_V = by_V + face.by_modes
+        direct = direct + self._face.stiffness_products(face.y, self.fields)
+        forces = forces + face.by_fields[:, :, : forces.shape[2]]
+        if static:  # those of the interface's loads are folded already
+            assert work is not None
+            outboard = face.by_fields[:, :, inertial:]
+            work = work + _fold(outboard, by_V, modes.field, compliance)
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
         adjoint = static_response(arm, *arm.restrict(forces))
         found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face)
@@ -197,7 +179,7 @@ class GeometricGradient:
             rank's cells; those of the others are among those by modes and S.
         adjoint: (n_nodes, d, k) of these fields.
         by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
-        face: of the interfaces' rotations; None of a linear body.
+        face: of the interfaces' rotations.
     """
 
     loads: UnitLoads
@@ -208,7 +190,7 @@ class GeometricGradient:
     by_fields: np.ndarray
     adjoint: np.ndarray
     by_stiffness: np.ndarray
-    face: FaceGradient | None = None
+    face: FaceGradient
 
     def by_young_beside(self, left: np.ndarray, V: np.ndarray) -> np.ndarray:
         """Return `by_young` plus sum_k left_k' k_e V_k (n_cells,), in one product.
@@ -229,8 +211,7 @@ class GeometricGradient:
     def stiffness(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Fields l and r of l . dK r, modes held, but for what stiffens the cells themselves."""
         every = self.loads.fields
-        pairs = [(-self.adjoint, every[:, :, : self.adjoint.shape[2]])]
-        return pairs if self.face is None else [*pairs, (self.face.y, every)]
+        return [(-self.adjoint, every[:, :, : self.adjoint.shape[2]]), (self.face.y, every)]
 
     def at_interfaces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives by the outboard interfaces' shape, modes held (collective).
@@ -245,15 +226,13 @@ class GeometricGradient:
         residual[:, :, :count] -= arm.mass_times(accelerations[:, :, :count])
         by_fields = self.by_fields - arm.stiffness_times(self.adjoint)
         rigid = by_fields @ T.coordinates(fields).T - residual @ T.coordinates(self.adjoint).T
-        if self.face is None:
-            return rigid, np.zeros_like(arm.points)
         return rigid, loads.by_levers(self.face)
 
     @cached_property
     def _by_loads(self) -> np.ndarray:
         """By the loads f_p that are inertia (n_nodes, d, k)."""
         adjoint = self.adjoint[:, :, : self.loads.num_inertial]
-        return adjoint if self.face is None else adjoint - self.face.y[:, :, : adjoint.shape[2]]
+        return np.asarray(adjoint - self.face.y[:, :, : adjoint.shape[2]])
 
     @property
     def by_inertia(self) -> np.ndarray:
@@ -307,14 +286,18 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
     Twelve in space.
     Collective on the arm's ranks.
     """
-    modes = arm.constraint_modes()
     ones, places = np.moveaxis(arm.rigid_inertia, 2, 0)
-    inertial = static_response(arm, *arm.restrict(_accelerations(ones, places)), "accelerations")
-    interface = combine(modes.field, np.linalg.inv(modes.stiffness))
-    return UnitLoads(arm, np.concatenate([inertial, interface], axis=2))
+    inertial = static_response(arm, *arm.restrict(accelerations(ones, places)), "accelerations")
+    return UnitLoads(arm, np.concatenate([inertial, interface_fields(arm)], axis=2))
 
 
-def _accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
+def interface_fields(arm: ElasticArm) -> np.ndarray:
+    """Return the static fields (n_nodes, d, b) of unit loads of the outboard interfaces."""
+    modes = arm.constraint_modes()
+    return combine(modes.field, np.linalg.inv(modes.stiffness))
+
+
+def accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them."""
     # 1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
     # space. Of 1 and X (n_nodes, d), or M times these: M knows no direction. M (-y, x) is (-(M

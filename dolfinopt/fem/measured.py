@@ -36,6 +36,14 @@ DEFLECTION_ROUNDING_ERROR = 1e-8  # of a deflection, by factors of long arms
 # off by at most a few 1e-7, from rounding.
 HARMLESS_CONTRAST = 1e6
 
+# -- stress: directions of a motion's loads ----------------------------------------------------
+
+# Of the largest one, by the length of the accelerations, below which a direction in which the loads
+# vary along a motion is none.
+MOTION_RANK_SHARE = 1e-11
+# Part of the loads up to which so many directions are solved for in their place.
+FEWER_DIRECTIONS = 0.75
+
 # -- interior: the choice of a solver --------------------------------------------------------
 
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 1600 x 96 cells

@@ -12,15 +12,16 @@ Source: Neves, Rodrigues & Guedes, Struct. Optim. 10 (1995) 71-78; Gao & Ma, Com
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
+from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import FaceRotation, by_inertia
-from dolfinopt.fem.stress import LoadFields, moved, moved_transposed
+from dolfinopt.fem.stress import DisplacementGradient, LoadFields, moved_back, moved_products
 
 TENSOR = {2: [0, 2, 2, 1], 3: [0, 3, 5, 3, 1, 4, 5, 4, 2]}  # places of sigma_ab in `elasticity`'s
 
@@ -45,7 +46,7 @@ class Prestress:
     Attributes:
         fields: of all loads on the design.
         modulus: of the cells.
-        a: (p, m) coefficients of `LoadFields.columns`.
+        a: (p, m) coefficients of modes and loads, see `LoadFields.split`.
     """
 
     fields: LoadFields
@@ -60,14 +61,12 @@ class Prestress:
     @cached_property
     def u(self) -> np.ndarray:
         """The displacements (n_nodes, d, p), m."""
-        return self.fields.columns @ self.a.T
+        return self.fields.displacements(self.a)
 
     @cached_property
     def inertia(self) -> np.ndarray:
         """The accelerations (n_nodes, d, p) whose inertia is among the loads, m/s2."""
-        frame = self.fields.loads.accelerations
-        _, unit, elastic = self.fields.split(self.a)
-        return frame @ unit[:, : frame.shape[2]].T + moved(self.fields.V) @ elastic.T
+        return self.fields.inertia(self.a)
 
     @cached_property
     def _face(self) -> FaceRotation:
@@ -110,26 +109,26 @@ class Prestress:
         by_modes, by_u, direct, _ = known.gradient(by_K0)
         face = self._face.gradient(self.rotation, V, by_K0)
         by_u = by_u + face.by_fields
-        by_columns, columns = by_u @ self.a, fields.columns
-        by_a = np.tensordot(by_u, columns, ((0, 1), (0, 1)))
+        through = fields.gradient(self.a, by_u)
         # y . (K u - M w) of the interface's nodes, w being the inertia.
         by_w = -arm.mass_times(face.y)
-        frame, by_frame, by_elastic = fields.loads.accelerations, *fields.split(by_a)[1:]
-        count = frame.shape[2]
-        by_frame[:, :count] += np.tensordot(by_w, frame, ((0, 1), (0, 1)))
-        by_elastic += np.tensordot(by_w, moved(fields.V), ((0, 1), (0, 1)))
-        _, unit, elastic = fields.split(self.a)
-        fields.split(by_columns)[0][:] += moved_transposed(by_w @ elastic)
+        _, frame, outboard, elastic = fields.split(self.a)
+        by_parts = [
+            np.zeros((len(self.a), fields.V.shape[2])),
+            np.tensordot(by_w, fields.accelerations, ((0, 1), (0, 1))),
+            np.zeros(outboard.shape),
+            moved_products(by_w, fields.V),
+        ]
         return PrestressGradient(
             stress=self,
             modes=V,
             by_K0=by_K0,
             direct=direct * self.modulus.slope,
             by_modes=by_modes,
-            by_columns=by_columns,
-            by_a=arm.comm.allreduce(by_a),
+            through=replace(through, by_modes=through.by_modes + moved_back(by_w, elastic)),
+            by_a=through.by_a + arm.comm.allreduce(np.hstack(by_parts)),
             y=face.y,
-            places=by_inertia(-face.y @ unit[:, :count])[:, :, 1],
+            places=by_inertia(combine(-face.y, frame))[:, :, 1],
             levers=self._face.by_levers(face.by_S, self.u, self.inertia),
         )
 
@@ -143,7 +142,7 @@ class PrestressGradient:
         modes, by_K0: (n_nodes, d, q) and (p, q, q), as given.
         direct: (n_cells,) by Young's modulus through s, modes and fields held.
         by_modes: (n_nodes, d, q) by the modes, interfaces' coordinates aside.
-        by_columns: (n_nodes, d, m) by `LoadFields.columns`.
+        through: by the displacements, and by the modes otherwise than as `modes`.
         by_a: (p, m) by their coefficients; of all ranks.
         y: (n_nodes, d, p) fields of y . (dK u - dM w) at the interfaces, w being `inertia`.
         places: (n_nodes, d) p of p . M dX.
@@ -155,7 +154,7 @@ class PrestressGradient:
     by_K0: np.ndarray
     direct: np.ndarray
     by_modes: np.ndarray
-    by_columns: np.ndarray
+    through: DisplacementGradient
     by_a: np.ndarray
     y: np.ndarray
     places: np.ndarray

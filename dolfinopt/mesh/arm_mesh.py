@@ -435,7 +435,8 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
         taken |= own
         found.append(InterfaceFacets(one.name, np.unique(facets[own]), point))
         places = np.concatenate(mesh.comm.allgather(middles[own]))
-        solid |= cKDTree(places).query(mesh.centroid)[0] < passive
+        across = 2 if arm.extruded else 3  # of a plate, through its thickness
+        solid |= cKDTree(places[:, :across]).query(mesh.centroid[:, :across])[0] < passive
     return replace(mesh, further=tuple(found), passive=solid)
 
 

@@ -11,7 +11,7 @@ import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -49,6 +49,7 @@ from dolfinopt.mesh.gmsh_session import (
     find_groups,
     gmsh_on_root,
     group_named,
+    in_child,
     mesh_surfaces,
     rename_groups,
     silent_terminal,
@@ -730,10 +731,63 @@ def tetrahedra_of(
     Raises:
         InputError: Gmsh cannot mesh it; says why.
     """
+    return in_child(_tetrahedra_of, points, triangles, size, interfaces, edge)
+
+
+def _tetrahedra_of(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    size: float,
+    interfaces: tuple[np.ndarray, np.ndarray],
+    edge: float,
+) -> Tetrahedra:
+    with _meshing() as gmsh:
+        return _meshed(gmsh, points, triangles, size, interfaces, edge)
+
+
+def filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
+    """Return tetrahedra within the boundary of a mesh, whose triangles stay.
+
+    Args:
+        mesh: whose cells may be bad; its boundary does not cross itself.
+        size: of the cells inside, m.
+
+    Raises:
+        InputError: Gmsh cannot mesh it; says why.
+    """
+    return in_child(_filled_anew, mesh, size)
+
+
+def _filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
+    facets = mesh.boundary
+    rim = np.unique(facets)
+    number = np.full(len(mesh.points), -1)
+    number[rim] = np.arange(len(rim))
+    with _meshing() as gmsh:
+        model = gmsh.model
+        model.add("surface")
+        model.addDiscreteEntity(2, 1)
+        model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
+        model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
+        solid = _generated(gmsh, [1], size)
+        found = _cells(model, solid, {group: [] for group in ENDS})
+    if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
+        raise InputError("its cells do not fill it")
+    return replace(
+        found,
+        inboard=number[mesh.inboard],
+        outboard=number[mesh.outboard],
+        further={name: number[own] for name, own in mesh.further.items()},
+    )
+
+
+@contextmanager
+def _meshing() -> Iterator[Any]:
+    """Yield Gmsh on this process alone, whose errors are InputErrors then."""
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
         try:
             with silent_terminal():
-                return _meshed(gmsh, points, triangles, size, interfaces, edge)
+                yield gmsh
         except InputError:
             raise
         except Exception as error:
@@ -741,6 +795,18 @@ def tetrahedra_of(
                 raise
             text = " ".join(str(error).split()) or "Gmsh failed"
             raise InputError(f"its surface cannot be meshed ({text})") from None
+
+
+def _generated(gmsh: Any, faces: list[int], size: float) -> int:
+    """Mesh the solid within faces; return its number."""
+    geo = gmsh.model.geo
+    solid = geo.addVolume([geo.addSurfaceLoop(faces)])
+    geo.synchronize()
+    for key in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
+        gmsh.option.setNumber(key, size)
+    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+    gmsh.model.mesh.generate(3)
+    return int(solid)
 
 
 def _meshed(
@@ -762,12 +828,7 @@ def _meshed(
     chosen = {}
     for group, mark in zip(ENDS, interfaces, strict=True):
         chosen[group] = _faces_of(model, faces, points, triangles, mark)
-    solid = model.geo.addVolume([model.geo.addSurfaceLoop(faces)])
-    model.geo.synchronize()
-    for key in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
-        gmsh.option.setNumber(key, size)
-    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
-    model.mesh.generate(3)
+    solid = _generated(gmsh, faces, size)
     for group, own in chosen.items():
         if not own:
             raise InputError(f"the {NAMES[group]} interface is lost in its faces")
@@ -807,16 +868,13 @@ def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahed
     number[used] = np.arange(len(used))
     points = np.empty((len(number), 3))
     points[tags.astype(int)] = places.reshape(-1, 3)
+    nodes_of = model.mesh.getElementsByType
     facets = [
-        np.concatenate(
-            [
-                number[model.mesh.getElementsByType(TRIANGLE, face)[1].astype(int)].reshape(-1, 3)
-                for face in interfaces[group]
-            ]
-        )
-        for group in ENDS
+        number[np.concatenate([[], *(nodes_of(TRIANGLE, face)[1] for face in own)]).astype(int)]
+        for own in (interfaces[group] for group in ENDS)
     ]
-    return Tetrahedra(points[used], cells.reshape(-1, 4), *facets)
+    inboard, outboard = (one.reshape(-1, 3) for one in facets)
+    return Tetrahedra(points[used], cells.reshape(-1, 4), inboard, outboard)
 
 
 class InterfaceMesh(Protocol):

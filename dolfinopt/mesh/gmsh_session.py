@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from mpi4py import MPI
 
@@ -18,6 +21,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.file_check import open_file
 from dolfinopt.mesh.measured import UNREAD_STATEMENTS_LIMIT
 from dolfinopt.parallel import together
+
+Result = TypeVar("Result")
 
 # Gmsh's numbers of straight triangles and quadrilaterals.
 LINE, TRIANGLE, QUADRILATERAL = 1, 2, 3
@@ -82,6 +87,39 @@ def _finish_reading(gmsh: Any) -> None:
                 continue
             finally:
                 gmsh.finalize()
+
+
+def in_child(work: Callable[..., Result], *given: Any) -> Result:
+    """Return what `work` returns in a process of its own, which Gmsh may end.
+
+    Raises:
+        InputError: the process was ended; or what `work` raises.
+    """
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    with warnings.catch_warnings():
+        # Of threads of the parent, none of which hold what Gmsh needs.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = multiprocessing.get_context("fork").Process(
+            target=_report, args=(theirs, work, given), daemon=True
+        )
+        child.start()
+    theirs.close()
+    try:
+        found = ours.recv()
+    except EOFError:
+        found = InputError("Gmsh gave up on it")
+    child.join()
+    if isinstance(found, Exception):
+        raise found
+    return cast(Result, found)
+
+
+def _report(pipe: Connection, work: Callable[..., Any], given: tuple[Any, ...]) -> None:
+    """Send what `work` returns, or raises."""
+    try:
+        pipe.send(work(*given))
+    except Exception as error:
+        pipe.send(error)
 
 
 @contextmanager

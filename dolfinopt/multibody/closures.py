@@ -32,7 +32,7 @@ import numpy as np
 
 from dolfinopt.multibody.body_motion import Load
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, compose, product
-from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.measured import INDEPENDENT_SHARE
 from dolfinopt.multibody.mechanism import Closure, Mechanism, Site
 

@@ -10,8 +10,17 @@ import numpy as np
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
 from dolfinopt.multibody.dimension import series
-from dolfinopt.multibody.joints import Friction, bearing_body, with_bearings
-from dolfinopt.multibody.mechanism import GROUND, Joint, JointHardware, Mechanism, Site, plane_chain
+from dolfinopt.multibody.mechanism import (
+    GROUND,
+    Friction,
+    Joint,
+    JointHardware,
+    Mechanism,
+    Site,
+    bearing_body,
+    plane_chain,
+    with_bearings,
+)
 from dolfinopt.multibody.motion import (
     RigidMotion,
     along_table,
@@ -425,7 +434,7 @@ def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
         InputError: the table cannot be used, or the path cannot be followed.
     """
     if scene.motion.path != "joints" or scene.closures:
-        from dolfinopt.multibody.spatial.end_effector import follower
+        from dolfinopt.multibody.inverse_kinematics import follower
 
         return RigidMotion(*follower(scene).at(t))
     return RigidMotion(*along_table(t, scene.motion, columns_of(scene)))
@@ -485,6 +494,6 @@ def family_of(scene: Scene) -> Family:
     """Return how the scene becomes a machine."""
     if scene.dimension == 2:
         return IN_PLANE
-    from dolfinopt.multibody.spatial.end_effector import curve_in_space
+    from dolfinopt.multibody.inverse_kinematics import curve_in_space
 
     return Family(build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)

@@ -33,19 +33,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.mbdyn import Invariants, ModalElement
-from dolfinopt.exchange.sid import (
-    GENERAL,
-    SYMMETRIC,
-    UNIT,
-    ZERO,
-    Node,
-    StandardInputData,
-    Taylor,
-    read_sid,
-    structure_of,
-    taylor,
-)
+from dolfinopt.exchange import mbdyn, sid
 from dolfinopt.multibody.machine import ONE, PERMUTATION, skew
 from dolfinopt.multibody.measured import (
     CENTRIFUGAL_EXCESS_SHARE,
@@ -68,7 +56,7 @@ Place = tuple[float, float, float]
 # -- to SID ----------------------------------------------------------------------------------
 
 
-def to_sid(body: ShapeIntegrals, comment: str = "") -> StandardInputData:
+def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
     """Return a body in space as standard input data; a plane one is brought there by `in_space`.
 
     The first node, "1", is the inboard joint, the last one, "2", the outboard interface; further
@@ -84,15 +72,15 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> StandardInputData:
     held = _node("1", np.zeros(3), np.zeros((6, q)), np.zeros((0, q, q)))
     interfaces = enumerate(outboard_interfaces(body), start=2)
     tip, *further = (_node(str(k), *interface) for k, interface in interfaces)
-    return StandardInputData(
+    return sid.StandardInputData(
         mass=body.mass,
         names=tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1)),
         nodes=(held, *further, tip),
         comment=comment,
-        Me=taylor(body.M, nq=q, structure=SYMMETRIC),
-        ksigma=taylor(np.zeros((q, 1)), nq=q, structure=ZERO),
-        Ke=taylor(body.K, nq=q, structure=SYMMETRIC),
-        De=taylor(body.D, nq=q, structure=structure_of(body.D)),
+        Me=sid.taylor(body.M, nq=q, structure=sid.SYMMETRIC),
+        ksigma=sid.taylor(np.zeros((q, 1)), nq=q, structure=sid.ZERO),
+        Ke=sid.taylor(body.K, nq=q, structure=sid.SYMMETRIC),
+        De=sid.taylor(body.D, nq=q, structure=sid.structure_of(body.D)),
         **_inertia_matrices(body),
     )
 
@@ -106,23 +94,23 @@ def outboard_interfaces(
         yield point, body.outboard[rows], body.K0_outboard[rows]
 
 
-def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> Node:
+def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> sid.Node:
     """Return a node from its place, its displacements and rotations (6, q) and their K0."""
     q = modes.shape[1]
     phi, psi = modes[:3], modes[3:]
     phi_q, psi_q = (_clean(-K0[:3]), _clean(-K0[3:])) if len(K0) else (None, None)
     turn = _clean(skew(psi.T)).transpose(1, 0, 2)  # row, coordinate, column
-    return Node(
+    return sid.Node(
         name=name,
         rframe="body ref",
-        origin=taylor(point[:, None], phi[:, :, None].copy(), nq=q, structure=GENERAL),
-        phi=taylor(phi, phi_q, nq=q, structure=GENERAL),
-        psi=taylor(psi, psi_q, nq=q, structure=GENERAL),
-        AP=taylor(ONE, turn, nq=q, structure=GENERAL if turn.any() else UNIT),
+        origin=sid.taylor(point[:, None], phi[:, :, None].copy(), nq=q, structure=sid.GENERAL),
+        phi=sid.taylor(phi, phi_q, nq=q, structure=sid.GENERAL),
+        psi=sid.taylor(psi, psi_q, nq=q, structure=sid.GENERAL),
+        AP=sid.taylor(ONE, turn, nq=q, structure=sid.GENERAL if turn.any() else sid.UNIT),
     )
 
 
-def _inertia_matrices(body: ShapeIntegrals) -> dict[str, Taylor]:
+def _inertia_matrices(body: ShapeIntegrals) -> dict[str, sid.Taylor]:
     """Return what moves the frame, and what that does to the coordinates."""
     q = body.num_modes
     W = body.W.reshape(3, 3, 1 + q, 1 + q)
@@ -143,11 +131,11 @@ def _inertia_matrices(body: ShapeIntegrals) -> dict[str, Taylor]:
         "Oe": (centrifugal(Y), centrifugal(Y_q)),
     }
     return {
-        name: taylor(
+        name: sid.taylor(
             _clean(value),
             None if more is None else _clean(more).reshape(len(value), q, value.shape[1]),
             nq=q,
-            structure=GENERAL,
+            structure=sid.GENERAL,
         )
         for name, (value, more) in found.items()
     }
@@ -232,7 +220,7 @@ def lumped_nodes(arm: ElasticArm, basis: Basis, thickness: float) -> LumpedNodes
     return LumpedNodes(points, masses, modes)
 
 
-def modal_element(body: ShapeIntegrals, nodes: LumpedNodes | None = None) -> ModalElement:
+def modal_element(body: ShapeIntegrals, nodes: LumpedNodes | None = None) -> mbdyn.ModalElement:
     """Return the element: node 1 is the inboard joint, then the outboard interfaces, then `nodes`.
 
     The interfaces are points without mass that move as the interfaces do.
@@ -250,7 +238,7 @@ def modal_element(body: ShapeIntegrals, nodes: LumpedNodes | None = None) -> Mod
         points, modes = np.concatenate([points, nodes.points]), np.concatenate([modes, nodes.modes])
     centre, inertia = body.inertia_about_centre()
     loads, stiffening = _stiffening(body, np.concatenate(K0))
-    return ModalElement(
+    return mbdyn.ModalElement(
         labels=tuple(str(k) for k in range(1, len(points) + 1)),
         points=points,
         modes=modes,
@@ -267,11 +255,11 @@ def modal_element(body: ShapeIntegrals, nodes: LumpedNodes | None = None) -> Mod
     )
 
 
-def _invariants(body: ShapeIntegrals) -> Invariants:
+def _invariants(body: ShapeIntegrals) -> mbdyn.Invariants:
     q = body.num_modes
     W = body.W.reshape(3, 3, 1 + q, 1 + q)
     first, mixed = W[:, :, 0, 1:], W[:, :, 1:, 1:]  # int X_a Phi_b, int Phi_a Phi_b
-    return Invariants(
+    return mbdyn.Invariants(
         three=body.w[:, 1:],
         four=np.einsum("cab,abj->cj", PERMUTATION, first),
         five=np.einsum("cab,abjk->cjk", PERMUTATION, mixed),
@@ -321,7 +309,7 @@ def load_body(
             other interfaces.
     """
     further = further or {}
-    body = from_sid(read_sid(path), dimension, further=tuple(further), source=str(path))
+    body = from_sid(sid.read_sid(path), dimension, further=tuple(further), source=str(path))
     if length is None:
         return body
     axis: Place = (length, 0.0, 0.0)
@@ -354,7 +342,7 @@ def without_stiffening(body: ShapeIntegrals, source: str) -> ShapeIntegrals:
 
 
 def from_sid(
-    data: StandardInputData,
+    data: sid.StandardInputData,
     dimension: int,
     inboard: str | None = None,
     outboard: str | None = None,
@@ -420,13 +408,13 @@ def _axes(dimension: int) -> tuple[slice, slice]:
     return slice(dimension), slice(2 if dimension == 2 else 0, 3)
 
 
-def _first_order(matrix: Taylor) -> np.ndarray:
+def _first_order(matrix: sid.Taylor) -> np.ndarray:
     """Return M1 (nrow, nq, ncol), zero of order 0."""
     nrow, ncol = matrix.M0.shape
     return matrix.M1 if matrix.order else np.zeros((nrow, matrix.M1.shape[1], ncol))
 
 
-def _plane_moments(data: StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
+def _plane_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return W (2, 1 + q, 1 + q), and K0 (2, q, q) by wd and -w^2 or none."""
     q = data.num_modes
     r, j, G = data.Cr.M0[:, 2], 0.0 - data.Oe.M0[:, 2], 0.5 * data.Ge.M0[:, 2::3]
@@ -440,7 +428,7 @@ def _plane_moments(data: StandardInputData, stiffened: bool) -> tuple[np.ndarray
     return W, np.stack([-turn, _centrifugal_excess(data, 2)])
 
 
-def _spatial_moments(data: StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
+def _spatial_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return W (9, 1 + q, 1 + q), and K0_ab (9, q, q) or none; told apart as above."""
     q = data.num_modes
     J = data.inertia(np.zeros(q))
@@ -476,7 +464,7 @@ def _from_rows(Oe: np.ndarray, Cr: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return symmetric, np.einsum("abc,...c->ab...", -PERMUTATION, Cr)
 
 
-def _centrifugal_excess(data: StandardInputData, dimension: int) -> np.ndarray:
+def _centrifugal_excess(data: sid.StandardInputData, dimension: int) -> np.ndarray:
     """Return sum_a K0_aa (q, q): what Oe has beyond the inertia Me of rotation, a = x, y (, z)."""
     if data.Oe.order == 0:
         return np.zeros_like(data.Me.M0)
@@ -489,8 +477,8 @@ def _centrifugal_excess(data: StandardInputData, dimension: int) -> np.ndarray:
 
 
 def _ends(
-    data: StandardInputData, inboard: str | None, outboard: str | None, source: str
-) -> tuple[Node, Node]:
+    data: sid.StandardInputData, inboard: str | None, outboard: str | None, source: str
+) -> tuple[sid.Node, sid.Node]:
     """Return the two interface nodes of a body that bends; by default the first and the last."""
     if data.num_modes == 0:
         raise InputError(
@@ -513,7 +501,7 @@ def _ends(
     return first, last
 
 
-def _named(data: StandardInputData, name: str, source: str) -> Node:
+def _named(data: sid.StandardInputData, name: str, source: str) -> sid.Node:
     """Return the node of that name."""
     for node in data.nodes:
         if node.name.casefold() == name.casefold():
@@ -522,7 +510,7 @@ def _named(data: StandardInputData, name: str, source: str) -> Node:
     raise InputError(f"{source}: no node {name!r}; it has {names}")
 
 
-def _check_nodes(first: Node, tips: Sequence[Node], dimension: int, source: str) -> None:
+def _check_nodes(first: sid.Node, tips: Sequence[sid.Node], dimension: int, source: str) -> None:
     """Check that the frame is held at the first node, and that the others are parallel to it."""
     last = tips[0]
     if not np.abs(last.origin.M0).max() > 0.0:
@@ -551,7 +539,7 @@ def _check_nodes(first: Node, tips: Sequence[Node], dimension: int, source: str)
             )
 
 
-def _check_body(data: StandardInputData, dimension: int, source: str) -> None:
+def _check_body(data: sid.StandardInputData, dimension: int, source: str) -> None:
     """Check what any mechanical body fulfils, and that nothing is left out."""
     inertia = data.inertia(np.zeros(data.num_modes))
     coriolis = data.Ge.M0.reshape(data.num_modes, -1, 3)
@@ -588,7 +576,7 @@ def _check_body(data: StandardInputData, dimension: int, source: str) -> None:
         _check_symmetric({"Oe": data.Oe.M1.transpose(2, 0, 1)}, source)
 
 
-def _check_plane(data: StandardInputData, inertia: np.ndarray, source: str) -> None:
+def _check_plane(data: sid.StandardInputData, inertia: np.ndarray, source: str) -> None:
     """Check that plane motion stays in the plane."""
     for name, values, whole in (
         ("row 3 of mdCM", data.mdCM.M0[2], data.mdCM.M0),
@@ -603,7 +591,7 @@ def _check_plane(data: StandardInputData, inertia: np.ndarray, source: str) -> N
             )
 
 
-def _check_definite(data: StandardInputData, numbers: Mapping[str, float], source: str) -> None:
+def _check_definite(data: sid.StandardInputData, numbers: Mapping[str, float], source: str) -> None:
     """Check that a mechanical body may have these masses and stiffnesses; `numbers` are > 0."""
     for name, number in numbers.items():
         if not number > 0.0:
@@ -617,7 +605,7 @@ def _check_definite(data: StandardInputData, numbers: Mapping[str, float], sourc
 
 
 def _is_stiffened(
-    data: StandardInputData, tips: Sequence[Node], dimension: int, source: str
+    data: sid.StandardInputData, tips: Sequence[sid.Node], dimension: int, source: str
 ) -> bool:
     """Return whether matrices hold geometric stiffness: all or none of them."""
     # A body that its own inertia stiffens, but no load at its outboard node, or the other way

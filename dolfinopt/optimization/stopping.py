@@ -24,9 +24,9 @@ from dolfinopt.optimization.measured import (
     TRIAL_STEP_SHARE,
 )
 from dolfinopt.optimization.problem import Problem
+from dolfinopt.progress import NOT_MET
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.scene.load import Scene
-from dolfinopt.units import NOT_MET
 
 Sum = Callable[[Mapping[int, np.ndarray]], np.ndarray]
 

@@ -9,9 +9,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import FULL, unwritten, write_text
+from dolfinopt.disk import FULL, unwritten, working_in, write_text
 from dolfinopt.errors import InputError
-from dolfinopt.locks import working_in
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, named_files
 

@@ -1,4 +1,4 @@
-"""summary.json: what a run found, what it cost, and what it was made with."""
+"""summary.json: what a run found, what it cost, what it was made with; budget.csv."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.members import Width, Widths, thinnest, thinnest_solid
 from dolfinopt.disk import write_text
+from dolfinopt.dynamics.budget import deflection_budget
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.budget import budget_of
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -37,11 +37,55 @@ from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.tables.closures import PARTS
-from dolfinopt.units import CERTIFICATE, HISTORY, SUMMARY
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
+    from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.output.run_folder import Simulated
+
+# Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
+SUMMARY_UNITS = {
+    "compliance": "N m",
+    "max_deviation": "m",
+    "max_deviation_time": "s",
+    "max_rotation": "rad",
+    "settling": "m",
+    "deflection_budget": "m, shares -",
+    "stress": "Pa",
+    "mass": "kg",
+    "designed_mass": "kg",
+    "grayness": "-",
+    "volume_fraction": "-",
+    "connected": "-",
+    "contacts": "-",
+    "minimum_member_measured": "m",
+    "minimum_gap_measured": "m",
+    "too_narrow": "m",
+    "first_frequency": "Hz",
+    "first_frequency_error": "-",
+    "loaded_frequency": "Hz",
+    "simulation_error_estimate": "-",
+    "kkt": "-",
+    "seconds": "s",
+    "peak_memory_mb": "MB",
+}
+
+CERTIFICATE_UNITS = {
+    "kkt": "-",
+    "gradient_angle": "degree",
+    "gradient_ratio": "-",
+    "excess": "-",
+    "seconds": "s",
+}
+
+HISTORY_UNITS = {
+    "max_deviation": "m",
+    "grayness": "-",
+    "volume_fraction": "-",
+    "change": "-",
+    "seconds": "s",
+    "kkt": "-",
+}
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -372,8 +416,8 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
     unit = objective_of(scene).unit
-    units: dict[str, Any] = {"objective": unit, **SUMMARY}
-    units["certificate"] = {**CERTIFICATE, "exact_objective": unit}
+    units: dict[str, Any] = {"objective": unit, **SUMMARY_UNITS}
+    units["certificate"] = {**CERTIFICATE_UNITS, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
         rigid = scene.rigid_units
@@ -383,7 +427,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     if scene.closures:
         kinds = {one.name: [unit for _, unit in PARTS[one.kind]] for one in scene.closures}
         units["closure_peak"] = {name: {u: u for u in own} for name, own in kinds.items()}
-    units["history.csv"] = {"objective": unit, **HISTORY}
+    units["history.csv"] = {"objective": unit, **HISTORY_UNITS}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)
     return units
@@ -631,3 +675,50 @@ def versions() -> dict[str, str]:
         "scipy": scipy.__version__,
         "python": platform.python_version(),
     }
+
+
+# -- table of the deflection's budget --------------------------------------------------------
+
+
+BUDGET_FILE = "budget.csv"
+
+
+def budget_of(trajectory: Trajectory | None) -> dict[str, Any] | None:
+    """Return the budget as summary.json has it; None without a motion or a deviation."""
+    found = None if trajectory is None else deflection_budget(trajectory)
+    return None if found is None else {**asdict(found), "shares": found.shares}
+
+
+def write_budget(folder: Path, budget: Mapping[str, Any] | None) -> None:
+    """Write the parts of a budget as a table (CSV), if there is one."""
+    if budget is None:
+        return
+    rows = [
+        f"{one['kind']},{one['name']},{one['deflection']:.10g},{one['share']:.10g}\n"
+        for one in budget["parts"]
+    ]
+    write_text(folder / BUDGET_FILE, "".join(["kind,part,deflection [m],share [-]\n", *rows]))
+
+
+def deflection_sentence(budget: Mapping[str, Any]) -> str:
+    """Return the shares of all kinds of parts in a line, the links' first."""
+    links, *others = [f"{name} {100.0 * x:.3g} %" for name, x in budget["shares"].items()]
+    held = links.replace("links ", "links hold ", 1)
+    return f"{held} of the deflection{''.join(f', {one}' for one in others)}"
+
+
+def deflection_table(budget: Mapping[str, Any]) -> list[str]:
+    """Return the parts as lines of a table."""
+    head = (
+        f"at {budget['instant']:.3f} s, {1e3 * budget['linear']:.4g} mm to first order "
+        f"({1e3 * budget['deviation']:.4g} mm simulated):"
+    )
+    width = max(len(one["name"]) for one in budget["parts"])
+    return [
+        head,
+        *(
+            f"  {one['kind']:<8} {one['name']:<{width}} {1e3 * one['deflection']:>10.4g} mm "
+            f"{100.0 * one['share']:>6.1f} %"
+            for one in budget["parts"]
+        ),
+    ]

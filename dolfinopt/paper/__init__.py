@@ -1,4 +1,4 @@
 """The reproduction of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
 
-`reproduction` has the cases and figures; `statements` compares what comes out with the paper.
+`reproduction` has the cases and figures, and compares what comes out with the paper.
 """

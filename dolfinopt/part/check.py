@@ -313,7 +313,7 @@ class Check:
     Attributes:
         units: of the table's rows.
         density, crisp, part: the forms; None of a crisp design that falls apart.
-        coarse: the part on a mesh with sides twice as long.
+        coarse: the part on a mesh with longer sides; None where there is none.
         stress_change: relative, of the largest stress by the last refinement where it is largest.
         meshes: of the parts by their place in the chain, as fine as their stress needs.
         views: the parts' arms with their stress, for pictures.
@@ -326,7 +326,7 @@ class Check:
     density: Column
     crisp: Column | None
     part: Column
-    coarse: Column
+    coarse: Column | None
     stress_change: float
     meshes: Mapping[int, PartMesh]
     views: list[ArmView]
@@ -369,12 +369,12 @@ class Check:
     def refinement(self) -> dict[str, float]:
         """Relative change of every figure of the part by a refinement of its mesh.
 
-        That of the whole mesh; of stress by the last one where it is largest.
+        That of the whole mesh; of stress by the last one where it is largest. NaN: not known.
         """
-        found = {
-            name: _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
-            for name in self.units
-        }
+        found = dict.fromkeys(self.units, float("nan"))
+        if self.coarse is not None:
+            for name in self.units:
+                found[name] = _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
         return found | {STRESS: self.stress_change}
 
     @property
@@ -418,11 +418,13 @@ class Check:
     @property
     def notes(self) -> list[str]:
         """What is said of the mesh and of stress, a sentence each."""
-        change = ", ".join(
-            f"{name} by {_percent(100.0 * self.refinement[name])}"
-            for name in (*self._judged, STRESS)
-        )
-        found = [f"mesh: the last refinement changed {change}"]
+        found = []
+        if self.coarse is not None:
+            change = ", ".join(
+                f"{name} by {_percent(100.0 * self.refinement[name])}"
+                for name in (*self._judged, STRESS)
+            )
+            found.append(f"mesh: the last refinement changed {change}")
         if self.part.stress is not None:
             found.append(
                 f"largest stress of the part: {_told(self.part.stress, self.part.stressed)}"
@@ -440,12 +442,18 @@ class Check:
                 "densities; see part.png, and make the design crisp (design.projection) or its "
                 "cells finer"
             )
-        if not self.converged:
+        if self.coarse is None:
+            found.append(
+                "how far figures of the part depend on the mesh is not known: Gmsh cannot mesh it "
+                "with larger cells; simulate part.toml with finer ones, or ask for thicker members "
+                "(part.minimum_member)"
+            )
+        elif not self.converged:
             found.append(
                 f"the part's {' or '.join(self._judged)} still depends on the mesh: "
                 f"{self.notes[0].removeprefix('mesh: ')}"
             )
-        if not self.stress_converged:
+        if self.coarse is not None and not self.stress_converged:
             found.append(
                 "the part's largest stress is not converged: the last refinement changed it by "
                 f"{_percent(100.0 * self.refinement[STRESS])}"
@@ -537,14 +545,17 @@ def _told(peak: Peak, arm: str) -> str:
 
 
 def refined(
-    scene: Scene, parts: Mapping[int, Part], meshes: Mapping[int, PartMesh], before: Column
+    scene: Scene,
+    parts: Mapping[int, Part],
+    meshes: Mapping[int, PartMesh],
+    before: Column | None,
 ) -> tuple[Simulated, Column, dict[int, PartStress], float, Mapping[int, PartMesh]]:
     """Return what parts do on meshes that are refined where their stress is largest.
 
     Args:
         scene, parts: as for `check_parts`.
         meshes: fine ones.
-        before: what they do on coarse ones.
+        before: what they do on coarse ones; None: not known.
 
     Returns:
         The machine, its figures, its stress, the relative change of the largest one by the last
@@ -558,7 +569,9 @@ def refined(
     for round_ in range(most + 1):
         fine = simulate_parts(scene, parts, meshes)
         column, stress = part_column(scene, fine, parts)
-        change = _ratio(column.values[STRESS], before.values[STRESS]) - 1.0
+        change = float("nan")
+        if before is not None:
+            change = _ratio(column.values[STRESS], before.values[STRESS]) - 1.0
         if round_ == most or not abs(change) > settled:
             break
         for place, one in stress.items():
@@ -592,7 +605,9 @@ def check_parts(
     say("the machine with the densities")
     density, crisp = design_columns(scene, folder)
     say("the machine with the parts, larger cells")
-    coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
+    coarse = None
+    if meshes.coarse:
+        coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
     say("the machine with the parts")
     fine, column, stress, change, bodies = refined(scene, parts, meshes.fine, coarse)
     cells = {place: one.cells for place, one in stress.items()}

@@ -30,6 +30,7 @@ from dolfinopt.scene.tables.arms import WALL_KEYS
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.mesh.arm_mesh import ArmMesh
 
 
@@ -180,11 +181,11 @@ class HollowPart:
             found &= across > APART * self.thickness.min()
         return np.asarray(found)
 
-    def stress(self, state: DesignState) -> CornerStress:
+    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the cells, on both surfaces of the wall."""
         count = len(state.mesh.mesh.geometry.x)
         every = np.ones((state.mesh.num_cells, 8), dtype=bool)
-        return mean_at_corners(state, VERTICES, every, np.ones(count, dtype=bool))
+        return mean_at_corners(state, fields, VERTICES, every, np.ones(count, dtype=bool))
 
 
 def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULTS) -> HollowPart:

@@ -53,6 +53,7 @@ STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
 TRIALS = 30  # struts of an arm that are left out in trial, at most
 GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
+TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 ENDED = " iterations"  # what the ending says of a search that was not allowed more
 PRUNINGS = 3  # times that struts are left out from one start
 ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
@@ -170,7 +171,7 @@ def optimize_parts(
     found: list[Found] = []
     interrupted = False
     for number in range(1 + starts):
-        name = f"trusses {number}" if number else "the densities' parts"
+        name = f"{TRUSSES} {number}" if number else "the densities' parts"
         descent = None
         try:
             if number:
@@ -227,8 +228,10 @@ Judgement = tuple[float, tuple[Limit, ...], dict[int, list[np.ndarray]]]
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Judgement:
     """Return objective, limits and the places of largest stress of parts on refined meshes."""
-    meshes = mesh_parts(parts)
-    coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
+    refine = any(one.REFINEMENTS for one in parts.values())
+    meshes, coarse = mesh_parts(parts, refine), None
+    if meshes.coarse:  # by what it differs they are refined
+        coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
     state, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
     hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     for place, one in stress.items():
@@ -322,6 +325,7 @@ class Descent:
     def _searched(self) -> str:
         """Go from the state to the best one that steps lead to; return why it ended."""
         self.search = Search(self.problem, self.state)
+        self.state = self.state.released
         # Limits that a finer mesh has tightened are a few per cent, and no matter of layout.
         first = self.best is None
         most = ceil(FIRST * self.iterations) if first else self.iterations
@@ -487,6 +491,11 @@ class State:
         return (excess if excess > EXCESS else 0.0), self.values[0]
 
     @property
+    def released(self) -> State:
+        """The same without the machine's matrices, which take a GB of a solid."""
+        return replace(self, simulated=replace(self.simulated, arms={}))
+
+    @property
     def solutions(self) -> Any:
         """Its motion, from which that of a state nearby is found."""
         return self.simulated.trajectory.solutions
@@ -594,6 +603,8 @@ class Problem:
 
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
+        if not state.simulated.arms:  # they were released
+            state = self.evaluated(state.outlines, state.bodies, state.solutions)
         one = state.simulated
         given = one.scene, one.partition, one.arms, one.trajectory
         sign = -1.0 if objective_of(self.scene).turned else 1.0
@@ -663,7 +674,8 @@ class Search:
 
     def __init__(self, problem: Problem, state: State):
         """Begin at a state."""
-        self.problem, self.state, self.best, self.meshed = problem, state, state, state
+        self.problem, self.state = problem, state
+        self.best = self.meshed = state.released
         self.passed = [dict(state.outlines)]
         self.steps, self.radius, self.morphed = 0, 1.0, 0
         self.x = np.zeros(0)
@@ -681,8 +693,7 @@ class Search:
     def run(self, iterations: int, tell: Tell, first: int) -> str:
         """Take so many steps at most; return why the search ended."""
         while self.steps < iterations:
-            slopes = self.problem.slopes(self.state)
-            if not self._step(slopes):
+            if not self._step():
                 return "no step betters the parts"
             self.steps += 1
             self._keep()
@@ -693,7 +704,7 @@ class Search:
 
     def _keep(self) -> None:
         if self.state.rank < self.best.rank:
-            self.best = self.state
+            self.best = self.state.released
         self.falls.append(self.best.values[0])
 
     def _settled(self) -> bool:
@@ -713,13 +724,14 @@ class Search:
             f"{words}, trust region {self.radius:.2g}"
         )
 
-    def _step(self, slopes: np.ndarray) -> bool:
+    def _step(self) -> bool:
         """Take a step that lowers the merit; return whether there is one."""
         if self._is_worn():
             if not self._mesh_anew():
                 return False
             self._begin()
-            slopes = self.problem.slopes(self.state)
+        slopes = self.problem.slopes(self.state)
+        self.state = self.state.released  # for the matrices of those that are tried
         before = self.state
         stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
         room = {k: one.room() for k, one in before.outlines.items()}
@@ -742,6 +754,7 @@ class Search:
 
     def _mesh_anew(self) -> bool:
         """Go on with new meshes, of an earlier state where the last one has none; else end."""
+        self.state = self.state.released
         for number, outlines in enumerate(reversed(self.passed)):
             try:
                 self.state = self.problem.evaluated(outlines, {}, self.state.solutions)
@@ -749,8 +762,9 @@ class Search:
                 self.radius *= 0.5
                 continue
             if number:  # those passed over cannot be parts
-                self.best = min(self.meshed, self.state, key=lambda one: one.rank)
-            self.meshed, self.morphed, self.passed = self.state, 0, [dict(self.state.outlines)]
+                self.best = min(self.meshed, self.state.released, key=lambda one: one.rank)
+            self.meshed, self.morphed = self.state.released, 0
+            self.passed = [dict(self.state.outlines)]
             return True
         self.best = self.meshed
         return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.mesh.arm_mesh import ArmMesh
     from dolfinopt.part.stress import CornerStress
 
@@ -155,8 +157,13 @@ class Part(Protocol):
             margin: least distance from the interfaces, m.
         """
 
-    def stress(self, state: DesignState) -> CornerStress:
-        """Return the stress at the corners of the cells of an arm with such a mesh."""
+    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+        """Return the stress at the corners of the cells of an arm with such a mesh.
+
+        Args:
+            state: its design.
+            fields: of its loads; all of them by default.
+        """
 
 
 def make_parts(
@@ -263,7 +270,7 @@ class Meshes:
     """Meshes of parts by their place in the chain.
 
     Attributes:
-        coarse: to tell by how much figures depend on the mesh.
+        coarse: to tell by how much figures depend on the mesh; none where one cannot be made.
         fine: those of the parts' scene.
     """
 
@@ -277,5 +284,8 @@ def mesh_parts(parts: Mapping[int, Part], coarse: bool = True) -> Meshes:
     Raises:
         InputError: Gmsh cannot mesh a part.
     """
-    larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
-    return Meshes(larger, {k: one.mesh() for k, one in parts.items()})
+    larger: dict[int, PartMesh] = {}
+    with suppress(InputError):  # of walls thinner than such cells
+        larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
+    fine = {k: one.mesh() for k, one in parts.items()}
+    return Meshes(larger if len(larger) == len(fine) else {}, fine)

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
-from dolfinopt.fem.stress import stress_operator
+from dolfinopt.fem.stress import LoadFields, stress_operator
 from dolfinopt.mesh import compat
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
@@ -25,6 +25,7 @@ from dolfinopt.responses.stress import (
     Stress,
     arm_loads,
     every,
+    every_instant,
     maxima,
     motions_of,
     screen,
@@ -76,10 +77,11 @@ def stress_of_parts(
     motions = motions_of(trajectory)
     found: dict[int, PartStress] = {}
     for k, loads in arm_loads(scene, motions).items():
-        points = parts[k].stress(arms[k].current)
+        state = arms[k].current
+        points = parts[k].stress(state, state.load_fields_of(every_instant(loads)))
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
         for one in loads:
-            a, t = one.coefficients, motions[one.motion].t
+            a, t = points.coefficients(one), motions[one.motion].t
             best = points.peak(a, t, np.flatnonzero(counts))
             known = found.get(one.place)
             if known is not None and known.peak.value >= best.value:
@@ -128,37 +130,45 @@ class CornerStress(PointStress):
         return replace(self, A=self.A * (weights > 0.0)[:, None], weights=weights)
 
     def through(
-        self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
+        self,
+        state: DesignState,
+        a: np.ndarray,
+        by: np.ndarray,
+        by_logs: np.ndarray,
+        by_weights: np.ndarray,
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to nodes, see `PointStress`; which count is held."""
-        state, at = self.state, self.corners.ravel()
-        by_A = by_A * (self.weights > 0.0)[:, None]
-        shares = self.shares.ravel()
-        by_own = by_A[:, at] * shares[:, None]
-        apart = np.einsum("cim,cim->i", by_own, self.own - self.A[:, at])
+        at, columns = self.corners.ravel(), self.fields.to_columns.T @ a.T
+        by_own = by[:, at] * self.shares.ravel()[:, None]
+        apart = np.einsum("cim,cim->i", by_own, self.own @ columns - (self.A @ columns)[:, at])
         by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area
         young = state.solid.young_modulus
         operator = young * stress_operator(state.mesh, state.elastic.operators, self.vertices)
-        fields = state.load_fields
-        stress = StressProduct(self.vertices, young * by_own, fields.columns)
-        return fields.stress_transposed(operator, by_own), Products(volumes=by_areas, stress=stress)
+        by_u = self.fields.stress_transposed(operator, by_own)
+        stress = StressProduct(self.vertices, young * by_own, self.fields.displacements(a))
+        return by_u, Products(volumes=by_areas, stress=stress)
 
 
 def mean_at_corners(
-    state: DesignState, vertices: np.ndarray, counts: np.ndarray, outer: np.ndarray
+    state: DesignState,
+    fields: LoadFields | None,
+    vertices: np.ndarray,
+    counts: np.ndarray,
+    outer: np.ndarray,
 ) -> CornerStress:
     """Return the stress at the corners of a design's cells.
 
     Args:
         state: meshed in quadratic triangles or tetrahedra, of solid material.
+        fields: of its loads; None for all of them.
         vertices: (d + 1, d) of the reference cell.
         counts: (n_cells, d + 1) whether a cell counts at its corner.
         outer: (n,) True for nodes of the outline.
     """
-    mesh = state.mesh
+    mesh, fields = state.mesh, fields or state.load_fields
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
     operator = stress_operator(mesh, state.elastic.operators, vertices)
-    own = state.load_fields.stress(state.solid.young_modulus * operator)
+    own = fields.stress(state.solid.young_modulus * operator)
     points = mesh.mesh.geometry.x[:, : mesh.dim]
     area = (mesh.area[:, None] * counts).ravel()
     shares = area / np.bincount(corners.ravel(), area, len(points))[corners.ravel()]
@@ -166,7 +176,7 @@ def mean_at_corners(
     mean = sp.csr_matrix((shares, (corners.ravel(), columns)), (len(points), corners.size))
     A = np.stack([mean @ one for one in own])
     shares = shares.reshape(corners.shape)
-    return CornerStress(state, A, outer.astype(float), points, corners, vertices, own, shares)
+    return CornerStress(fields, A, outer.astype(float), points, corners, vertices, own, shares)
 
 
 # -- as a response: what shape optimisation limits ------------------------------------------------
@@ -186,8 +196,8 @@ class OutlineStress(Stress):
         super().__init__(options, limited=True)
         self._parts = parts
 
-    def points_of(self, index: int, state: DesignState) -> CornerStress:
+    def points_of(self, index: int, state: DesignState, fields: LoadFields) -> CornerStress:
         """Return the stress of an arm's design on its outline."""
         part = self._parts[index]
-        found = part.stress(state)
+        found = part.stress(state, fields)
         return found.counted(part.regular(found.places, self.options.stress_margin))

@@ -15,8 +15,16 @@ from PIL import Image
 from dolfinopt.disk import write_atomically
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.machine import Cast, draw_ground
-from dolfinopt.plots.shapes import PlaneMotion, chain, close_loop, plane, plane_motion, reach
+from dolfinopt.plots.machine import (
+    Cast,
+    PlaneMotion,
+    chain,
+    close_loop,
+    draw_ground,
+    plane,
+    plane_motion,
+    reach,
+)
 from dolfinopt.plots.style import (
     COLOURS,
     DENSITY,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.trajectory import drive_units, free_drives
 from dolfinopt.plots.style import (

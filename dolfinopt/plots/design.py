@@ -11,7 +11,6 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots.shapes import boundary, sides, volume_fraction
 from dolfinopt.plots.style import (
     BLUE,
     COLOURS,
@@ -38,6 +37,7 @@ MILLI, MEGA = 1e3, 1e-6
 LOW = 0.45  # inches, least height of an arm's axes
 PLATE = 1.0  # inches, likewise of a plate
 FOOT = 1.35  # inches, for the label of x and the scale of colours
+LABEL_FOOT = 0.6  # for the label of x alone
 MARGIN = 0.012  # of the arms' length, around them
 FACE, BRIGHT, DARK = "#b8c4cc", np.array([0.62, 0.68, 0.72]), np.array([0.20, 0.26, 0.31])
 DEPTH = np.array([0.35, 0.35])  # by which a plate's back is moved, of its thickness
@@ -105,13 +105,16 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     return figure
 
 
-def parts_figure(parts: Sequence[Part], title: str, masses: Sequence[float]) -> Figure:
+def parts_figure(
+    parts: Sequence[Part], title: str, masses: Sequence[float], own: bool = False
+) -> Figure:
     """Return the picture of parts below each other, mm: plates over the densities of their arms.
 
     Args:
         parts: from the cart outwards, all plane or all solid.
         title: above the picture.
         masses: of the parts, kg.
+        own: whether plates have a layout of their own: the densities are left out then.
     """
     from dolfinopt.part.hollow import HollowPart
     from dolfinopt.part.plane.part import PlanePart
@@ -124,10 +127,15 @@ def parts_figure(parts: Sequence[Part], title: str, masses: Sequence[float]) -> 
         solids = [part for part in parts if isinstance(part, (SolidPart, HollowPart))]
         return solid_parts_figure(solids, title, masses)
     corners = [MILLI * part.domain.corners for part in plates]
-    figure, rows = _arm_rows(corners, f"{title}: part over density", "mm", FOOT)
+    words = "part" if own else "part over density"
+    figure, rows = _arm_rows(corners, f"{title}: {words}", "mm", LABEL_FOOT if own else FOOT)
     for axes, part, cells, mass in zip(rows, plates, corners, masses, strict=True):
-        _fill(axes, cells, part.domain.x_phys)
-        for loop in _loops(part):
+        loops = _loops(part)
+        if own:
+            axes.add_patch(PathPatch(_compound(loops), fc=FACE, ec="none"))
+        else:
+            _fill(axes, cells, part.domain.x_phys)
+        for loop in loops:
             axes.plot(*np.vstack([loop, loop[:1]]).T, color=ORANGE, lw=1.3, clip_on=False)
         shape = part.shape
         words = (
@@ -135,7 +143,8 @@ def parts_figure(parts: Sequence[Part], title: str, masses: Sequence[float]) -> 
             f"{len(shape.loops) - 1} holes, {len(shape.curves)} curves"
         )
         axes.set_title(words, loc="left", fontsize=10, parse_math=False)
-    colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
+    if not own:
+        colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
     return figure
 
 
@@ -250,5 +259,45 @@ def _draw_plate(axes: Axes, loops: Sequence[np.ndarray], depth: np.ndarray) -> N
         light = normal @ [0.6, 0.8] / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
         shade: Any = 0.5 * (1.0 + light[:, None]) * (BRIGHT - DARK) + DARK
         axes.add_collection(PolyCollection(quads, fc=shade, ec=shade, lw=0.4, clip_on=False))
-    face = Path.make_compound_path(*(Path(np.vstack([one, one[:1]]), closed=True) for one in loops))
-    axes.add_patch(PathPatch(face, fc=FACE, ec="#20303a", lw=0.7, clip_on=False))
+    axes.add_patch(PathPatch(_compound(loops), fc=FACE, ec="#20303a", lw=0.7, clip_on=False))
+
+
+def _compound(loops: Sequence[np.ndarray]) -> Path:
+    """Return the face within an outline and without its holes."""
+    return Path.make_compound_path(*(Path(np.vstack([one, one[:1]]), closed=True) for one in loops))
+
+
+# -- polygons: areas and outlines -------------------------------------------------------------
+
+
+def cell_areas(corners: np.ndarray) -> np.ndarray:
+    """Return the areas (n,), m2, of polygons with corners (n, k, 2), m, in order around each."""
+    x, y = corners[..., 0], corners[..., 1]
+    after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    return 0.5 * np.abs(np.sum(x * after_y - after_x * y, axis=1))
+
+
+def volume_fraction(view: ArmView) -> float:
+    """Return the mean physical density of an arm, weighted with its cells' areas."""
+    area = cell_areas(view.corners)
+    return float(area @ view.density / area.sum())
+
+
+def sides(corners: np.ndarray) -> np.ndarray:
+    """Return all edges (m * k, 2, ...) of polygons (m, k, ...)."""
+    edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
+    return edges.reshape(corners.shape[0] * corners.shape[1], 2, *corners.shape[2:])
+
+
+def boundary(corners: np.ndarray) -> np.ndarray:
+    """Return which of `sides` only one of the polygons (m, k, 2) has; corners may differ by 1e-7.
+
+    It stays the same in every deformation and place of the polygons.
+    """
+    flat = corners.reshape(-1, 2)
+    size = float(np.ptp(flat, axis=0).max()) or 1.0
+    column, row = np.round((flat - flat.min(axis=0)) / (1e-7 * size)).astype(np.int64).T
+    node = np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+    edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]
+    _, first, count = np.unique(edge, return_index=True, return_counts=True)
+    return first[count == 1]

@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 
+from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.mechanism import GROUND, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
-from dolfinopt.multibody.spatial.end_effector import Frames, body_frames
 from dolfinopt.output.views import ArmView
 from dolfinopt.part.solid.surface import Surface
 from dolfinopt.plots.animation import FRAMES, frame_numbers, round_magnification
@@ -414,3 +415,89 @@ class SolidStage:
     def close(self) -> None:
         """Free the window."""
         self.studio.plotter.close()
+
+
+# -- where the bodies are ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Frames of all bodies against the world's; b bodies in the mechanism's order.
+
+    Attributes:
+        origin: (n, b, 3) of every body's frame, where its joint is, m.
+        rotation: (n, b, 3, 3) from every body's frame to the world's.
+        outboard: (n, b, 3) of every body's first outboard interface, m.
+        parents: of every body, or `GROUND`.
+        axes: (n, b, 3) unit vectors along the joints' axes.
+        held: (n, b, 3) of the interface that every body hangs on; the world's origin of those on
+            the ground, m.
+        end: (n, 3) of the end-effector, m.
+        tied: (n, k, 2, 3) of both frames of the k closures, m.
+        ties: the closures.
+    """
+
+    origin: np.ndarray
+    rotation: np.ndarray
+    outboard: np.ndarray
+    parents: tuple[int, ...]
+    axes: np.ndarray
+    held: np.ndarray
+    end: np.ndarray
+    tied: np.ndarray
+    ties: tuple[Tie, ...] = ()
+
+    def __getitem__(self, part: slice | np.ndarray) -> Frames:
+        """Return those at some of the instants."""
+        return Frames(
+            self.origin[part],
+            self.rotation[part],
+            self.outboard[part],
+            self.parents,
+            self.axes[part],
+            self.held[part],
+            self.end[part],
+            self.tied[part],
+            self.ties,
+        )
+
+
+def body_frames(
+    mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray, loops: Loops | None = None
+) -> Frames:
+    """Return the frames of all bodies but bearings, which are points.
+
+    Args:
+        mechanism: b bodies besides bearings.
+        q_r: (n, joints) rigid coordinates; rad or m.
+        q_e: (n, N) elastic coordinates.
+        loops: closures, or None.
+    """
+    posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
+    tied, ties = np.zeros((len(q_r), 0, 2, 3)), () if loops is None else loops.ties
+    if loops is not None:
+        tied = ClosedLoops(loops, posed).places
+    origin, rotation, outboard, axes, held = [], [], [], [], []
+    parents = []
+    for i, joint in enumerate(joints[: mechanism.num_arms]):
+        # A bearing hangs where the joint it holds would without it.
+        below = joint if joint.parent < mechanism.num_arms else joints[joint.parent]
+        parents.append(below.parent)
+        _, place, R = posed.body(i)
+        R = np.broadcast_to(R if R.ndim == 3 else R[..., None], (3, 3, len(q_r)))
+        origin.append(place.T)
+        rotation.append(R.transpose(2, 0, 1))
+        outboard.append(posed.interface(i, 0)[0].T)
+        axes.append(rotation[-1] @ joint.axis)
+        held.append(posed.interface(below.parent, below.interface)[0].T)
+    return Frames(
+        origin=np.stack(origin, axis=1),
+        rotation=np.stack(rotation, axis=1),
+        outboard=np.stack(outboard, axis=1),
+        parents=tuple(parents),
+        axes=np.stack(axes, axis=1),
+        held=np.stack(held, axis=1),
+        end=posed.interface(*mechanism.way[-1])[0].T,
+        tied=tied,
+        ties=ties,
+    )

@@ -1,6 +1,6 @@
 """Buckling of the arms along the motion: the factor by which the loads of an instant may grow.
 
-mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.buckling`), with K0 by the
+mu = 1 / factor is the largest eigenvalue of -K0 phi = mu K phi (`arms.modes`), with K0 by the
 static stress of an instant, u = U a: the fields U of all loads (`fem.stress`) times coefficients a.
 phi'K phi being 1, mu changes by
 
@@ -20,11 +20,12 @@ import numpy as np
 from scipy.signal import find_peaks
 
 from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.buckling import BucklingModes, buckling_modes
 from dolfinopt.arms.design_state import DesignState
+from dolfinopt.arms.modes import BucklingModes, buckling_modes
 from dolfinopt.density.interpolation import interpolate
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.fem.prestress import Prestress, PrestressGradient, StressedModulus
+from dolfinopt.fem.stress import DisplacementGradient
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BUCKLING_MODES,
@@ -254,7 +255,7 @@ class Buckling(Response):
             return [
                 {
                     k: exact_gradient(
-                        analysis.designs[k], by_body[k], one.by_columns, analysis.by, one.beside
+                        analysis.designs[k], by_body[k], one.displaced, analysis.by, one.beside
                     )
                     if k in by_body
                     else analysis.by(analysis.designs[k], Products())  # nothing buckles
@@ -305,8 +306,7 @@ class _ArmGradient:
     """Derivatives of the p-norm by one design."""
 
     by_loads: Sequence[ByLoads] = ()  # see `bodies_by_loads`
-    # (n_nodes, d, m) by `LoadFields.columns`; None where nothing counts
-    by_columns: np.ndarray | None = None
+    displaced: DisplacementGradient | None = None  # None where nothing counts
     beside: Products | None = None  # by the design itself
 
 
@@ -344,7 +344,7 @@ def _gradient_of_arm(
         interfaces=partial(_at_interfaces, one, pair),
         prestress=one,
     )
-    return _ArmGradient(_joined(by_loads), one.by_columns, beside)
+    return _ArmGradient(_joined(by_loads), one.through, beside)
 
 
 def _joined(every: Sequence[ByLoads]) -> list[ByLoads]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import fixed_body
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.arms.vibration import Chain, LoadedModes, RigidIntegrals, rigid_integrals
+from dolfinopt.arms.modes import Chain, LoadedModes, RigidIntegrals, rigid_integrals
 from dolfinopt.multibody.machine import family_of
 from dolfinopt.multibody.motion import rigid_motion
 from dolfinopt.parallel import on_all_ranks, on_root, together
@@ -28,7 +28,7 @@ from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import NEEDS
 
 if TYPE_CHECKING:
-    from dolfinopt.multibody.spatial.frozen import FrozenTree
+    from dolfinopt.arms.modes import FrozenTree
 
 NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
@@ -162,7 +162,7 @@ def _chain(analysis: Analysis) -> Chain:
 
 def _tree(analysis: Analysis) -> FrozenTree:
     """Freeze the machine in space in the pose at the middle of its motion (collective)."""
-    from dolfinopt.multibody.spatial.frozen import FrozenTree, rigid_integrals_in_space
+    from dolfinopt.arms.modes import FrozenTree, rigid_integrals_in_space
 
     scene, partition = analysis.scene, analysis.partition
     with together(partition.world):

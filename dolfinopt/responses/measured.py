@@ -23,10 +23,9 @@ RICHER_RATIO = 2
 TRIED_COORDINATES_LIMIT = 48  # of an arm
 TIME_ERROR_SHARE = 0.03  # of the tolerance, that time steps may add to a motion
 
-# -- sensitivity, stress: directions of loads ------------------------------------------------
+# -- sensitivity: directions of loads --------------------------------------------------------
 
 LOAD_CASES_RANK_SHARE = 1e-14  # of the largest direction: less is the rounding of its sums
-FROZEN_LOADS_RANK_SHARE = 1e-7  # of the largest direction, that counts as none for a gradient
 
 # -- stress: p-mean and screening ------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from dolfinopt.arms.arm import fixed_body
-from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, scaled
 from dolfinopt.parallel import Partition
 from dolfinopt.responses.by_design import by_design

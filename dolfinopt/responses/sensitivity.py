@@ -7,18 +7,18 @@ are made as well.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.arms.vibration import LoadedModes, RigidIntegrals
+from dolfinopt.arms.modes import LoadedModes, RigidIntegrals
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
-from dolfinopt.fem.stress import ElasticFieldGradient
-from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.fem.stress import DisplacementGradient
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     by_modal_loads,
@@ -59,7 +59,7 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
 def exact_gradient(
     state: DesignState,
     cotangents: ShapeIntegrals,
-    by_columns: np.ndarray | None = None,
+    displaced: DisplacementGradient | None = None,
     by: By = by_design,
     beside: Products | None = None,
 ) -> np.ndarray:
@@ -72,45 +72,20 @@ def exact_gradient(
     Args:
         state: of the arm.
         cotangents: the function's derivatives by the body's integrals; those by D join K's.
-        by_columns: (n_nodes, d, columns) its derivatives by `LoadFields.columns`, where it
-            depends on these, too; contributions of this rank's cells.
+        displaced: its derivatives by displacements, where it depends on these, too.
         by: what it is the derivative by.
-        beside: what the function depends on beside body and columns, these held.
+        beside: what the function depends on beside body and displacements, these held.
 
     Returns:
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        found = _body_products(state, cotangents, by_columns)
-        return by(state, found if beside is None else _with(found, beside))
-
-
-def _with(body: Products, beside: Products) -> Products:
-    """Return the products of a function of a body and of what else it depends on."""
-    assert beside.geometric is None
-    if beside.places is None and beside.interfaces is None:
-        places, interfaces = body.places, body.interfaces
-    else:
-        assert body.places is not None and beside.places is not None
-        places, interfaces = body.places + beside.places, partial(_both, body, beside)
-    return replace(
-        beside,
-        stiffness=(*body.stiffness, *beside.stiffness),
-        mass=(*body.mass, *beside.mass),
-        geometric=body.geometric,
-        places=places,
-        interfaces=interfaces,
-    )
-
-
-def _both(body: Products, beside: Products) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `Products.interfaces` does of both (collective)."""
-    assert body.interfaces is not None and beside.interfaces is not None
-    return tuple(a + b for a, b in zip(body.interfaces(), beside.interfaces(), strict=True))
+        found = _body_products(state, cotangents, displaced)
+        return by(state, found if beside is None else found + beside)
 
 
 def _body_products(
-    state: DesignState, cotangents: ShapeIntegrals, by_columns: np.ndarray | None
+    state: DesignState, cotangents: ShapeIntegrals, displaced: DisplacementGradient | None
 ) -> Products:
     """Return what carries a change of one arm's design to a function of its body (collective)."""
     elastic, basis = state.elastic, state.basis
@@ -123,14 +98,13 @@ def _body_products(
     partners = mass_partners(elastic.points, V, cotangents)
     by_V = elastic.mass_times(partners.by_modes)
     by_V += elastic.stiffness_times(combine(V, by_K + by_K.T))
-    geometric = inertial = by_unit_loads = None
-    if by_columns is not None:
-        modes, by_unit_loads, by_elastic = state.load_fields.split(by_columns)
-        inertial = state.load_fields.gradient(by_elastic)
-        by_V += modes + inertial.by_modes
-    if cotangents.is_stiffened or by_unit_loads is not None:
+    if displaced is not None:
+        by_V += displaced.by_modes
+    geometric = None
+    if cotangents.is_stiffened:
         static = state.scene.reduction.method == "craig-bampton"
-        geometric = _geometric_gradient(state, cotangents, by_modes, by_unit_loads)
+        by_K0 = np.concatenate([cotangents.K0, by_modes, cotangents.K0_outboard])
+        geometric = state.stiffening_loads.gradient(V, by_K0, static=static)
         by_V += geometric.by_modes
         if static:  # K's first block is S; the constraint modes' interior is in equilibrium
             b = len(geometric.by_stiffness)
@@ -143,21 +117,20 @@ def _body_products(
     )
     partners.left[:, :, 1:-1] += fields.mass
     places = partners.by_points
-    if geometric is not None:
-        # The partners of X and 1_x stand at the ends, those of the modes between them.
-        partners.left[:, :, [-1, 0]] += geometric.by_inertia
-        places = places + geometric.by_inertia[:, :, 1]
-        if cotangents.is_stiffened:
-            partners.left[:, :, 1:-1] += geometric.by_modal_inertia
-    interfaces = partial(_at_interfaces, state, by_V, fields, geometric, inertial)
     stiffness: list[Pair] = [(combine(V, by_K.T) - fields.stiffness, V)]
+    for one in (geometric, displaced):
+        if one is not None:
+            # The partners of X and 1_x stand at the ends, those of the modes between them.
+            partners.left[:, :, [-1, 0]] += one.by_inertia
+            places = places + one.by_inertia[:, :, 1]
+            partners.left[:, :, 1:-1] += one.by_modal_inertia
+    if displaced is not None:
+        stiffness.append((-displaced.adjoint, displaced.static))
+    interfaces = partial(_at_interfaces, state, by_V, fields, geometric, displaced)
     mass: list[Pair] = [(partners.left, partners.right)]
     if fields.frame is not None:
         mass.append((fields.frame, frame_fields(elastic)))
         places = places + by_frame_fields(fields.frame)
-    if inertial is not None:
-        stiffness.append(inertial.stiffness)
-        mass.append(inertial.mass)
     return Products(tuple(stiffness), tuple(mass), geometric, places, interfaces)
 
 
@@ -166,7 +139,7 @@ def _at_interfaces(
     by_V: np.ndarray,
     fields: AdjointFields,
     geometric: GeometricGradient | None,
-    inertial: ElasticFieldGradient | None,
+    displaced: DisplacementGradient | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what `Products.interfaces` does of a function of a body (collective)."""
     # Modes and all other fields are T times what they are solved for, and so are their adjoints;
@@ -178,8 +151,7 @@ def _at_interfaces(
         by_S = geometric.by_stiffness + geometric.by_stiffness.T  # see `_body_products`
         b = len(by_S)
         by_V[:, :, :b] += elastic.stiffness_times(combine(V[:, :, :b], by_S))
-        if geometric.face is not None:
-            by_V -= geometric.face.by_modes  # the rotations are coordinates, whatever T
+        by_V -= geometric.face.by_modes  # the rotations are coordinates, whatever T
     rigid = by_V @ basis.outboard.T
     rigid -= elastic.stiffness_times(V) @ T.coordinates(fields.stiffness).T
     rigid += basis.MV @ T.coordinates(fields.mass).T
@@ -190,7 +162,9 @@ def _at_interfaces(
     if geometric is not None:
         more, levers = geometric.at_interfaces()
         rigid += more
-    return rigid if inertial is None else rigid + inertial.at_interfaces(), levers
+    if displaced is not None:
+        rigid += displaced.at_interfaces()
+    return rigid, levers
 
 
 def pairs_at_interfaces(
@@ -213,22 +187,6 @@ def pairs_at_interfaces(
         for left, right in pairs:
             rigid += times(left) @ T.coordinates(right).T + times(right) @ T.coordinates(left).T
     return rigid, np.zeros_like(elastic.points)
-
-
-def _geometric_gradient(
-    state: DesignState, by: ShapeIntegrals, by_modes: np.ndarray, by_fields: np.ndarray | None
-) -> GeometricGradient:
-    """Differentiate by geometric stiffness and by the fields of the unit loads, see `UnitLoads`."""
-    static = state.scene.reduction.method == "craig-bampton"
-    loads = state.unit_loads
-    if by.is_stiffened:
-        loads = state.stiffening_loads
-        if by_fields is not None:
-            none = np.zeros((*by_fields.shape[:2], by.num_modes))
-            parts = np.split(by_fields, [loads.num_frame], axis=2)
-            by_fields = np.concatenate([parts[0], none, parts[1]], axis=2)
-    by_K0 = np.concatenate([by.K0, by_modes, by.K0_outboard])
-    return loads.gradient(state.basis.V, by_K0, static=static, by_fields=by_fields)
 
 
 def static_gradient(state: DesignState, response: StaticResponse, by: By = by_design) -> np.ndarray:

@@ -13,9 +13,8 @@ from mpi4py import MPI
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
-from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.geometric_stiffness import static_response
-from dolfinopt.fem.stress import element_centres
+from dolfinopt.fem.stress import LoadFields, element_centres
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
@@ -24,7 +23,6 @@ from dolfinopt.responses.measured import (
     CHUNK_INSTANTS,
     CHUNK_POINTS,
     COARSE_INSTANTS,
-    FROZEN_LOADS_RANK_SHARE,
     MAP_ERROR_SHARE,
     NEGLIGIBLE_COLUMNS_SHARE,
     NEGLIGIBLE_DIRECTION_SHARE,
@@ -59,15 +57,19 @@ class PointStress(ABC):
     """Stress at some points of one design by the coefficients of its load fields.
 
     Attributes:
-        state: the design.
-        A: (3, n_points, m) components whose length is the stress, Pa per coefficient; zero at
-            points that do not count.
+        fields: of the design's loads.
+        A: (3, n_points, m) components whose length is the stress, Pa per coefficient of
+            `LoadFields.columns`; zero at points that do not count.
         weights: (n_points,) of those that count in the p-mean.
     """
 
-    state: DesignState
+    fields: LoadFields
     A: np.ndarray
     weights: np.ndarray
+
+    def coefficients(self, loads: ArmLoads) -> np.ndarray:
+        """Return those (n, m) of `LoadFields.columns`."""
+        return np.asarray(loads.coefficients @ self.fields.to_columns)
 
     def power_sum(self, a: np.ndarray, unit: float, exponent: float) -> float:
         """Return sum_n sum_e weight_e (s_en / unit)^p over this rank's cells; a is (n, m)."""
@@ -79,39 +81,40 @@ class PointStress(ABC):
 
     def power_sum_gradient(
         self, a: np.ndarray, unit: float, exponent: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Differentiate `power_sum` over p, times unit: sum weight (s / unit)^(p-1) ds.
 
         Returns:
-            By the coefficients (n, m); by A (3, n_points, m); by the logarithms of s, all instants
-            together (n_points,); of this rank's points.
+            By the components (3, n_points, n); by the logarithms of s, all instants together
+            (n_points,); of this rank's points.
         """
-        by_a, by_A = np.empty_like(a), np.zeros_like(self.A)
-        squared = np.zeros(len(self.weights))  # dJ . s
-        for part in _runs(len(a)):
-            e = self.A @ (a[part] / unit).T
-            squares = np.square(e).sum(axis=0)
-            factor = self.weights[:, None] * _power(squares, 0.5 * exponent - 1.0)
-            squared += unit * np.sum(factor * squares, axis=1)
-            e *= factor
-            flat = e.reshape(-1, e.shape[2])
-            by_a[part] = flat.T @ self.A.reshape(len(flat), -1)
-            by_A += e @ a[part]
-        return by_a, by_A, squared
+        e = self.A @ (a / unit).T
+        squares = np.square(e).sum(axis=0)
+        factor = self.weights[:, None] * _power(squares, 0.5 * exponent - 1.0)
+        e *= factor
+        squares *= factor
+        return e, unit * squares.sum(axis=1)  # dJ . s
 
     @abstractmethod
     def through(
-        self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
+        self,
+        state: DesignState,
+        a: np.ndarray,
+        by: np.ndarray,
+        by_logs: np.ndarray,
+        by_weights: np.ndarray,
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to the design.
 
         Args:
-            by_A: (3, n_points, m), the design's fields alone being free.
+            state: the design.
+            a: (n, m) see `LoadFields.split`.
+            by: (3, n_points, n) by the components of the stress.
             by_logs: (n_points,) by the logarithms of the stress.
             by_weights: (n_points,).
 
         Returns:
-            The derivatives by `LoadFields.columns` (n_nodes, d, m), contributions of this rank's
+            The derivatives by the displacements (n_nodes, d, n), contributions of this rank's
             cells, and by what else the stress depends on.
         """
 
@@ -127,34 +130,40 @@ class CellStress(PointStress):
     root: np.ndarray
 
     def through(
-        self, by_A: np.ndarray, by_logs: np.ndarray, by_weights: np.ndarray
+        self,
+        state: DesignState,
+        a: np.ndarray,
+        by: np.ndarray,
+        by_logs: np.ndarray,
+        by_weights: np.ndarray,
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to the design, see `PointStress`."""
-        state, x = self.state, self.state.share
-        by_stress = state.solid.young_modulus * by_A * self.root[:, None]
+        x = state.share
+        by_stress = state.solid.young_modulus * self.root[:, None] * by
         operator = state.elastic.substructure.stress_operator
-        columns = state.load_fields.stress_transposed(operator, by_stress)
+        by_u = self.fields.stress_transposed(operator, by_stress)
         centre = element_centres(compat.cell_corner_count(state.mesh.mesh), state.mesh.dim)
         by_x = np.divide(0.5 * by_logs, x, out=np.zeros_like(x), where=x > 0.0)
-        stress = StressProduct(centre, by_stress, state.load_fields.columns)
-        return columns, Products(densities=by_x, volumes=by_weights, stress=stress)
+        stress = StressProduct(centre, by_stress, self.fields.displacements(a))
+        return by_u, Products(densities=by_x, volumes=by_weights, stress=stress)
 
 
-def cell_stress(state: DesignState, margin: float = 0.0) -> CellStress:
+def cell_stress(state: DesignState, fields: LoadFields, margin: float = 0.0) -> CellStress:
     """Return the stress of a design at its element centres (collective on the arm's ranks).
 
     Args:
         state: of the arm.
+        fields: of its loads.
         margin: cells closer than this to an interface do not count, m.
     """
-    fields, substructure = state.load_fields, state.elastic.substructure
+    substructure = state.elastic.substructure
     with state.elastic.profile.phase("stress"):
         root, weights = np.sqrt(state.share), state.mesh.area.copy()
         if margin > 0.0:
             weights[substructure.interface_distance < margin] = 0.0
-        A = fields.stress(state.solid.young_modulus * substructure.stress_operator)
-        A *= (root * (weights > 0.0))[:, None]
-        return CellStress(state, A, weights, root)
+        A = fields.stress(substructure.stress_operator)
+        A *= (state.solid.young_modulus * root * (weights > 0.0))[:, None]
+        return CellStress(fields, A, weights, root)
 
 
 def _power(x: np.ndarray, exponent: float) -> np.ndarray:
@@ -191,12 +200,17 @@ class ArmLoads:
     Attributes:
         place: of the arm in the chain.
         motion: number among `motions_of`.
-        coefficients: (n, q + 7 + 2 q) of `LoadFields.columns`.
+        coefficients: (n, q + 7 + 2 q) of modes and loads, see `LoadFields.split`.
     """
 
     place: int
     motion: int
     coefficients: np.ndarray
+
+
+def every_instant(loads: Sequence[ArmLoads]) -> np.ndarray:
+    """Return the coefficients (n, m) of all instants of all motions."""
+    return np.concatenate([one.coefficients for one in loads])
 
 
 def motions_of(trajectory: Trajectory) -> tuple[Trajectory, ...]:
@@ -338,39 +352,41 @@ class Stress(Response):
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of the p-mean, see `objective.gradient` (collective)."""
         found, p = self._found(analysis), self.options.stress_exponent
-        parts = {}
-        with together(analysis.partition.world):
+        partition, parts = analysis.partition, {}
+        with together(partition.world):
             for k, chosen in found.chosen.items():
-                parts[k] = _gradient_of_arm(analysis.partition, found, chosen, found.cells[k], p)
+                state = analysis.designs[k]
+                parts[k] = _gradient_of_arm(partition, found, chosen, state, found.cells[k], p)
         if self.options.gradient == "esl":
-            with together(analysis.partition.world):
-                return [
-                    {k: _esl_gradient(one, found.cells[k], analysis.by) for k, one in parts.items()}
-                ]
-        mine = {
-            k: [
-                (one.loads.motion, one.loads.place, one.instants, by)
-                for one, by in zip(part.chosen, part.by_loads, strict=True)
-            ]
-            for k, part in parts.items()
-        }
+            with together(partition.world):
+                row = {}
+                for k, one in parts.items():
+                    row[k] = _esl_gradient(one, analysis.designs[k], found.cells[k], analysis.by)
+                return [row]
+        through = {}
+        with together(partition.world), analysis.profile.phase("gradient"):
+            for k, one in parts.items():
+                if len(one.a):
+                    through[k] = found.cells[k].fields.gradient(one.a, one.by_u)
+        mine = {k: parts[k].by_loads(each.by_a) for k, each in through.items()}
         by_body = bodies_by_loads(analysis, mine)
-        with together(analysis.partition.world):
+        with together(partition.world):
             row = {}
             for k, one in parts.items():
-                state, cotangents = found.cells[k].state, by_body[k]
-                columns, beside = one.through(found.cells[k])
-                row[k] = exact_gradient(state, cotangents, columns, analysis.by, beside)
+                row[k] = exact_gradient(
+                    analysis.designs[k], by_body[k], through.get(k), analysis.by, one.beside
+                )
             return [row]
 
-    def points_of(self, index: int, state: DesignState) -> PointStress:
+    def points_of(self, index: int, state: DesignState, fields: LoadFields) -> PointStress:
         """Return the stress of an arm's design where it counts (collective on the arm's ranks).
 
         Args:
             index: of the arm.
             state: its design.
+            fields: of its loads.
         """
-        return cell_stress(state, self.options.stress_margin)
+        return cell_stress(state, fields, self.options.stress_margin)
 
     def _found(self, analysis: Analysis) -> _Found:
         """Return what is known of the design, once for value and gradient (collective)."""
@@ -403,7 +419,8 @@ class Stress(Response):
         largest = 0.0
         with together(partition.world):
             for k, state in analysis.designs.items():
-                cells[k] = self.points_of(k, state)
+                fields = state.load_fields_of(every_instant(by_owner[k]))
+                cells[k] = self.points_of(k, state, fields)
                 with analysis.profile.phase("stress"):
                     seen[k], own = _screened(partition, cells[k], by_owner[k])
                     area = partition.comm.allreduce(float(cells[k].weights.sum()))
@@ -419,7 +436,10 @@ class Stress(Response):
         sums = {k: 0.0 for k in chosen}
         with together(partition.world), analysis.profile.phase("stress"):
             for k, each in chosen.items() if largest else ():
-                mine = sum(cells[k].power_sum(one.a, largest, p) for one in each)
+                fields = cells[k].fields
+                mine = sum(
+                    cells[k].power_sum(one.a @ fields.to_columns, largest, p) for one in each
+                )
                 sums[k] = partition.comm.allreduce(mine)
         total = sum(on_all_ranks(partition, sums).values())
         weight = sum(on_all_ranks(partition, weights).values())
@@ -434,7 +454,7 @@ def _screened(
     found, largest = [], 0.0
     for one in loads:
         coarse = every(len(one.coefficients))
-        screened = screen(partition.comm, cells.A, one.coefficients, coarse)
+        screened = screen(partition.comm, cells.A, cells.coefficients(one), coarse)
         largest = max(largest, screened.largest)
         instants, values = coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]
         found.append(_Chosen(one, instants, values, len(instants)))
@@ -482,46 +502,51 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _ArmGradient:
-    """Derivatives of the p-mean by one design."""
+    """Derivatives of the p-mean by one design; k instants of all motions count."""
 
-    # by the loads' coefficients, of every one of `chosen`; of all of the arm's cells
-    by_loads: Sequence[np.ndarray]
-    chosen: Sequence[_Chosen]  # which
-    # see `PointStress.through`
-    by_A: np.ndarray
-    by_logs: np.ndarray
-    by_weights: np.ndarray
+    chosen: Sequence[_Chosen]  # which instants
+    a: np.ndarray  # (k, m) there, see `LoadFields.split`
+    # See `PointStress.through`.
+    by_u: np.ndarray
+    beside: Products
 
-    def through(self, points: PointStress) -> tuple[np.ndarray, Products]:
-        """Return derivatives by the load fields, and what it is made of beside these."""
-        return points.through(self.by_A, self.by_logs, self.by_weights)
+    def by_loads(self, by_a: np.ndarray) -> list[ByLoads]:
+        """Return derivatives (k, m) by the coefficients, one entry for every one of `chosen`."""
+        ends = np.cumsum([len(one.instants) for one in self.chosen])[:-1]
+        return [
+            (one.loads.motion, one.loads.place, one.instants, by)
+            for one, by in zip(self.chosen, np.split(by_a, ends), strict=True)
+        ]
 
 
 def _gradient_of_arm(
-    partition: Partition, found: _Found, chosen: Sequence[_Chosen], cells: PointStress, p: float
+    partition: Partition,
+    found: _Found,
+    chosen: Sequence[_Chosen],
+    state: DesignState,
+    cells: PointStress,
+    p: float,
 ) -> _ArmGradient:
     """Differentiate by what one arm's stress is made of (collective on the arm's ranks)."""
-    by_loads, by_A = [], np.zeros_like(cells.A)
+    a = np.concatenate([one.a for one in chosen])
     by_logs, by_weights = np.zeros((2, len(cells.weights)))
-    factor = 0.0
-    if found.total:
-        factor = float(found.total ** (1.0 / p - 1.0) * found.weight ** (-1.0 / p))
-    with cells.state.elastic.profile.phase("stress"):
-        for one in chosen:
-            if not found.total:
-                by_loads.append(np.zeros_like(one.a))
-                continue
-            by_a, more, by = cells.power_sum_gradient(one.a, found.largest, p)
-            by_loads.append(factor * partition.comm.allreduce(by_a))
-            by_A += factor * more
-            by_logs += factor * by
-    if found.total:
-        # Of total / weight, to the power 1 / p: a point's part in either is its weight times a sum.
-        counts = cells.weights > 0.0
-        np.divide(by_logs, cells.weights, out=by_weights, where=counts)
-        by_weights -= found.smooth / found.weight * sum(one.count for one in chosen)
-        by_weights *= counts / p
-    return _ArmGradient(by_loads, chosen, by_A, by_logs, by_weights)
+    with state.elastic.profile.phase("stress"):
+        if found.total:
+            factor = float(found.total ** (1.0 / p - 1.0) * found.weight ** (-1.0 / p))
+            columns = a @ cells.fields.to_columns
+            by, by_logs = cells.power_sum_gradient(columns, found.largest, p)
+            by *= factor
+            by_logs *= factor
+            # Of total / weight, to the power 1 / p: a point's part in either is its weight times a
+            # sum.
+            counts = cells.weights > 0.0
+            np.divide(by_logs, cells.weights, out=by_weights, where=counts)
+            by_weights -= found.smooth / found.weight * sum(one.count for one in chosen)
+            by_weights *= counts / p
+        else:
+            by = np.zeros((*cells.A.shape[:2], len(a)))
+        by_u, beside = cells.through(state, a, by, by_logs, by_weights)
+        return _ArmGradient(chosen, a, by_u, beside if len(a) else replace(beside, stress=None))
 
 
 # Of one arm along one motion: number of the motion, place in the chain, instants (k,), and
@@ -563,32 +588,18 @@ def bodies_by_loads(
     return by_body
 
 
-def _esl_gradient(part: _ArmGradient, cells: PointStress, by: By) -> np.ndarray:
+def _esl_gradient(part: _ArmGradient, state: DesignState, cells: PointStress, by: By) -> np.ndarray:
     """Return the derivative by the design of one arm, all loads of its instants frozen."""
-    # With K u_n = f_n held, dJ = dJ/dx - sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n: as many
-    # solves as the loads have directions.
-    state = cells.state
-    arm, fields = state.elastic, state.load_fields.columns
-    a = np.concatenate([one.a for one in part.chosen])
-    by_columns, beside = part.through(cells)
-    if not len(a):
-        return by(state, beside)
-    scale = np.sqrt(np.square(cells.A).sum(axis=0).max(axis=0, initial=0.0))
-    if arm.comm.size > 1:
-        scale = np.max(arm.comm.allgather(scale), axis=0)
-    scale[scale == 0.0] = 1.0
-    _, sizes, directions = np.linalg.svd(a * scale, full_matrices=False)
-    if arm.comm.size > 1:
-        sizes, directions = arm.comm.bcast((sizes, directions), root=0)
-    kept = directions[sizes > FROZEN_LOADS_RANK_SHARE * sizes[0]]
-    # a = y D with D = kept / scale: derivatives by columns are those by y D.
-    right = combine(by_columns, (kept * scale).T)
-    left = combine(fields, (kept / scale).T)
+    # With K u_n = f_n held, dJ = dJ/dx - sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n.
+    arm = state.elastic
+    if not len(part.a):
+        return by(state, part.beside)
     with arm.profile.phase("gradient"):
-        adjoint = static_response(arm, *arm.restrict(right))
-        pairs = ((-adjoint, left),)
-        interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((right, left),))
-        return by(state, replace(beside, stiffness=pairs, interfaces=interfaces))
+        u = cells.fields.displacements(part.a)
+        adjoint = static_response(arm, *arm.restrict(part.by_u))
+        pairs = ((-adjoint, u),)
+        interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((part.by_u, u),))
+        return by(state, part.beside + Products(stiffness=pairs, interfaces=interfaces))
 
 
 # -- the largest of very many lengths |A_e a_n| over points e and instants n, looking at few

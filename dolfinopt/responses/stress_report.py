@@ -17,12 +17,14 @@ from dolfinopt.responses.stress import (
     arm_loads,
     cell_stress,
     every,
+    every_instant,
     maxima,
     screen,
 )
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.profiling import Profile
 
@@ -104,8 +106,9 @@ def stress_report(
     with profile.phase("stress"), together(partition.world):
         for k, arm in arms.items():
             state = arm.current
-            cells = cell_stress(state, arm.scene.objective.stress_margin)
-            found = [_arm_stress(partition, cells, one) for one in by_owner[k]]
+            fields = state.load_fields_of(every_instant(by_owner[k]))
+            cells = cell_stress(state, fields, arm.scene.objective.stress_margin)
+            found = [_arm_stress(partition, state, cells, one) for one in by_owner[k]]
             peaks[k] = [one for one, _ in found]
             values[k] = np.stack([value for _, value in found], axis=1)
     profile.counts = counts
@@ -137,23 +140,24 @@ def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
 
 
 def _arm_stress(
-    partition: Partition, cells: CellStress, loads: ArmLoads
+    partition: Partition, state: DesignState, cells: CellStress, loads: ArmLoads
 ) -> tuple[_Peaks, np.ndarray]:
     """Return one arm's peaks; of cells largest value and instant's number (n, 2) (collective)."""
-    comm, a, coarse = partition.comm, loads.coefficients, every(len(loads.coefficients))
+    comm, a, coarse = partition.comm, cells.coefficients(loads), every(len(loads.coefficients))
     by_cell, when = maxima(comm, cells.A, a)
     largest = screen(comm, cells.A, a, coarse)
     # The map is right to a thousandth: of nearly equal cells the largest is that of the peak.
     by_cell = np.minimum(by_cell, np.nextafter(largest.largest, 0.0))
     if largest.point >= 0:
         by_cell[largest.point], when[largest.point] = largest.largest, largest.instant
-    where = cells.state.mesh.centroid
+    where = state.mesh.centroid
     centre = largest.largest, _shared(partition, where, largest.point), largest.instant
-    state, mesh = cells.state, cells.state.mesh
+    mesh = state.mesh
     points = stress_points(compat.cell_geometry_nodes(mesh.mesh, 0).shape[1], mesh.dim)
     operator = stress_operator(mesh, state.elastic.operators, points)
-    A = state.load_fields.stress(state.solid.young_modulus * operator)
-    A *= np.repeat(cells.root * (cells.weights > 0.0), len(points))[:, None]
+    A = cells.fields.stress(operator)
+    solid = state.solid.young_modulus * cells.root * (cells.weights > 0.0)
+    A *= np.repeat(solid, len(points))[:, None]
     largest = screen(comm, A, a, coarse)
     place = _shared(partition, places_of(mesh, points).reshape(-1, mesh.dim), largest.point)
     peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant))

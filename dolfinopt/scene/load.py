@@ -54,8 +54,7 @@ from dolfinopt.scene.tables.arms import (
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
 from dolfinopt.scene.tables.closures import Closures, as_closure
 from dolfinopt.scene.tables.design import Law
-from dolfinopt.scene.tables.forces import Force
-from dolfinopt.scene.tables.machine import Joint
+from dolfinopt.scene.tables.machine import Force, Joint
 from dolfinopt.scene.tables.motion import Motion
 from dolfinopt.scene.tables.objective import NEEDS, Objective, WorstBy
 from dolfinopt.scene.tables.simulation import Reduction

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.end_effector import lengths
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.output.views import designed
 from dolfinopt.plots.style import look, png

@@ -34,14 +34,20 @@ from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import read_history
 from dolfinopt.output.folders import working_alone
-from dolfinopt.output.run import optimize
-from dolfinopt.output.run_folder import write_result, write_simulation
+from dolfinopt.output.run_folder import optimize, write_result, write_simulation
 from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.scene.load import Scene
-from dolfinopt.study import simulate
-from dolfinopt.study.cases import Case, Outcome, Outcomes
+from dolfinopt.study.cases import (
+    Case,
+    Outcome,
+    Outcomes,
+    scales_bodies,
+    simulate_samples,
+    simulate_scenarios,
+    with_sample,
+)
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
 SUMMARY, HISTORY = "summary.json", "history.csv"
@@ -234,7 +240,7 @@ def _optimise(case: Case, place: _Place) -> None:
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
-    found = simulate.simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
+    found = simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
     for batch in job:
         place.check()
         for case in batch:
@@ -258,15 +264,13 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
     for case in cases:
         place.check()
         begun, scene = time.perf_counter(), case.scene
-        scenes = [
-            simulate.with_sample(scene, one, k) for k, one in enumerate(case.samples, case.first)
-        ]
+        scenes = [with_sample(scene, one, k) for k, one in enumerate(case.samples, case.first)]
         keys = (change.partition("=")[0] for one in case.samples for change in one)
-        scaled = simulate.scales_bodies(scene, keys)
+        scaled = scales_bodies(scene, keys)
         if scaled and nominal is None:
-            (nominal,) = simulate.simulate_scenarios([scene], design)
+            (nominal,) = simulate_scenarios([scene], design)
         rows, messages = [], {}
-        found = simulate.simulate_samples(nominal if scaled else None, scenes, design)
+        found = simulate_samples(nominal if scaled else None, scenes, design)
         for number, trajectory in enumerate(found, case.first):
             if isinstance(trajectory, ConvergenceError):
                 messages[number] = str(trajectory)

@@ -15,7 +15,8 @@ from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.vibration import (
+from dolfinopt.arms.modes import (
+    CarriedInertia,
     Chain,
     LoadedModes,
     RigidIntegrals,
@@ -23,7 +24,6 @@ from dolfinopt.arms.vibration import (
     rigid_integrals,
 )
 from dolfinopt.fem.interface import floats
-from dolfinopt.multibody.spatial.frozen import CarriedInertia
 from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient
 

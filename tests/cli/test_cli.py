@@ -15,8 +15,8 @@ from runs import ROOT, TWO_ARM, environment, overrides, refusal, run, shell
 
 import dolfinopt as do
 from dolfinopt.cli import shared
+from dolfinopt.disk import RUN
 from dolfinopt.errors import InputError
-from dolfinopt.locks import RUN
 from dolfinopt.output.folders import RUN_FILES
 
 TINY = overrides("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
@@ -257,7 +257,7 @@ def test_a_run_that_cannot_begin_leaves_the_old_results(shared_tmp_path):
 
 HOLDER = """
 import pathlib, sys
-from dolfinopt.locks import working_in
+from dolfinopt.disk import working_in
 with working_in(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.readline()

@@ -4,8 +4,7 @@ import time
 
 import pytest
 
-from dolfinopt.cli.live_line import plain_lines
-from dolfinopt.cli.shared import elapsed
+from dolfinopt.cli.shared import plain_lines
 from dolfinopt.optimization.state import FurtherRow, HistoryRow
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -43,9 +42,3 @@ def test_a_short_run_says_nothing(capsys):
     with plain_lines(10, every=60.0) as show:
         show(HistoryRow(1, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
     assert capsys.readouterr().err == ""
-
-
-def test_the_clock_runs_from_the_start_of_the_process():
-    first = elapsed()
-    assert first > 0.2  # Python, NumPy and pytest were loaded before this module
-    assert elapsed() >= first

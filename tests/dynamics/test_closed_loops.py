@@ -20,7 +20,7 @@ from machines import (
     with_keys,
 )
 
-from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.kinematics import end_effector
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 

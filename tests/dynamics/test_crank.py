@@ -9,7 +9,7 @@ import pytest
 
 from dolfinopt.bench.crank import CRANK, END, ROD, crank, desired, rod, solved, unknowns
 from dolfinopt.dynamics import radau
-from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank

@@ -12,7 +12,7 @@ from runs import scene
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
-from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
 

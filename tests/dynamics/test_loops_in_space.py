@@ -32,7 +32,7 @@ from scipy.integrate import solve_ivp
 import dolfinopt as do
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.end_effector import Posed
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.parallel import on_root
 
 WORLD = MPI.COMM_WORLD

@@ -10,7 +10,7 @@ from spatial_beams import DURATION, quintic_motion, reference_chain
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.end_effector import deviation, end_rotation
+from dolfinopt.multibody.kinematics import deviation, end_rotation
 from dolfinopt.multibody.mechanism import Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.paths.time_laws import quintic

@@ -12,7 +12,7 @@ from runs import ROOT, refusal, run
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
-from dolfinopt.cli.robots import _check_robot, link_inertia
+from dolfinopt.cli.exchange import _check_robot, link_inertia
 from dolfinopt.cli.shared import _minimised
 from dolfinopt.exchange.urdf.file import NewLink, implausible_inertias, read_robot, robot_text
 from dolfinopt.exchange.urdf.robot import Inertia, Robot, default_tool, scene_bodies

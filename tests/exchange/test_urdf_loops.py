@@ -9,7 +9,8 @@ import pytest
 from robots import tree_of
 from runs import refused, run
 
-from dolfinopt.cli.robots import _read, _robot
+from dolfinopt.exchange.urdf.file import read_robot
+from dolfinopt.exchange.urdf.scene import scene_of_robot
 from dolfinopt.multibody.machine import joint_motion
 from dolfinopt.scene.load import load_scene
 
@@ -110,4 +111,4 @@ def test_refused(tmp_path, table: str, words: tuple[str, ...]) -> None:
         tmp_path, table.replace("{kind}", "pin").replace("{link}", "rocker")
     )
     with refused("loops.toml", *words):
-        _read(_robot(robot, ()), "tool", motion, None, True, loops)
+        scene_of_robot(read_robot(robot), ("tool",), None, str(motion), loops, None, warn=print)

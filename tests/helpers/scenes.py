@@ -34,6 +34,17 @@ def put(data, path, value):
         node[last] = value
 
 
+def put_at(data, path, value):
+    """Set a value at a path of keys and numbers, tables made where there are none; None: away."""
+    node = data
+    for key in path[:-1]:
+        node = node.setdefault(key, {}) if isinstance(node, dict) else node[key]
+    if value is None:
+        del node[path[-1]]
+    else:
+        node[path[-1]] = value
+
+
 def changed(*pairs, n_arms=2):
     """Return the minimal data with values at dotted paths: path, value, path, value ..."""
     data = minimal(n_arms)

@@ -1,5 +1,6 @@
 """Geometry files: arms with bores, a user's own, and one line for each that cannot be an arm."""
 
+import os
 import re
 
 import numpy as np
@@ -10,11 +11,12 @@ from runs import refusal
 from scipy.spatial import cKDTree
 
 from dolfinopt.data import mesh_folder
+from dolfinopt.errors import InputError
 from dolfinopt.mesh import checks, compat, geometry
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import FlatMesh, check_mesh
 from dolfinopt.mesh.geometry import _joint_curves, read_shapes
-from dolfinopt.mesh.gmsh_session import gmsh_on_root
+from dolfinopt.mesh.gmsh_session import gmsh_on_root, in_child
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD
@@ -652,3 +654,11 @@ def test_truncated_step_file_leaves_the_terminal_alone(shared_tmp_path, capfd):
     capfd.readouterr()
     refused(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_gmsh_may_end_its_own_process_alone():
+    with pytest.raises(InputError, match="gave up"):
+        in_child(os._exit, 1)
+    assert in_child(abs, -1) == 1
+    with pytest.raises(ZeroDivisionError):
+        in_child(divmod, 1, 0)

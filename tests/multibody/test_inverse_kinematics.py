@@ -11,9 +11,9 @@ from runs import refused, tomllib
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.dynamics.build import check_motion
+from dolfinopt.multibody.inverse_kinematics import Follower, end_path, relative_vectors
 from dolfinopt.multibody.machine import end_chain, exponential, joint_motion
 from dolfinopt.multibody.motion import breakpoints
-from dolfinopt.multibody.spatial.end_effector import Follower, end_path, relative_vectors
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

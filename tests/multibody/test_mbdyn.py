@@ -15,7 +15,7 @@ from runs import TWO_ARM, tomllib
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
-from dolfinopt.exchange.mbdyn import Invariants, fem_text, write_fem
+from dolfinopt.exchange.mbdyn import fem_text, write_fem
 from dolfinopt.exchange.sid import read_sid, sid_text
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
@@ -155,30 +155,6 @@ def test_mbdyn_stiffens_by_loads_outboard(stiff_cloud):
     load, still = np.random.default_rng(8).normal(size=(2, 3)), np.zeros(3)
     found = mbdyn_stiffening(groups, still, still, still, *load)
     assert_close(found, -np.tensordot(load.ravel(), stiff_cloud.K0_outboard, 1))
-
-
-def test_invariants_are_sums_over_points(cloud):
-    """As MBDyn would make them of lumped masses (modal.cc), were the points its nodes."""
-    m, X, Phi = cloud.masses, cloud.points, np.moveaxis(cloud.modes, 2, 1)  # (n, q, 3)
-    tilde = np.cross(np.eye(3), Phi[..., None, :])  # (n, q, 3, 3), v -> Phi x v
-    place = np.cross(np.eye(3), X[:, None])
-    v = np.array([0.3, -1.0, 2.0])
-    assert_close(tilde[2, 1] @ v, np.cross(Phi[2, 1], v))
-    expected = Invariants(
-        three=np.einsum("n,njc->cj", m, Phi),
-        four=np.einsum("n,njc->cj", m, np.cross(X[:, None], Phi)),
-        five=np.einsum("n,njkc->cjk", m, np.cross(Phi[:, :, None], Phi[:, None])),
-        eight=-np.einsum("n,nab,njbc->acj", m, place, tilde),
-        nine=np.einsum("n,njab,nkbc->acjk", m, tilde, tilde),
-    )
-    element = modal_element(cloud.body())
-    for found, one in zip(element.invariants, expected, strict=True):
-        assert_close(found, one)
-    centre = m @ X / m.sum()
-    assert_close(element.centre, centre)
-    away = X - centre
-    inertia = np.einsum("n,nij->ij", m, [(x @ x) * np.eye(3) - np.outer(x, x) for x in away])
-    assert_close(element.inertia, inertia)
 
 
 @pytest.mark.parametrize("stiff", [False, True])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.joints import bearing_body, with_bearings
 from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
@@ -18,6 +17,7 @@ from dolfinopt.multibody.machine import (
     roll_pitch_yaw,
     spatial_mechanism,
 )
+from dolfinopt.multibody.mechanism import bearing_body, with_bearings
 from dolfinopt.multibody.motion import RigidMotion
 
 pin = pytest.importorskip("pinocchio")

@@ -169,22 +169,6 @@ def test_names_hold_frequencies():
     assert data.names[0].startswith("Eigen Mode    1 : ")
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_forces_are_those_of_the_points(seed):
-    """Any motion of the frame, without the package's integrals."""
-    rng = np.random.default_rng(seed)
-    cloud = random_cloud(rng, 3, 3)
-    s = random_state(rng, 3)
-    force, moment, rows = np.zeros(3), np.zeros(3), np.zeros(3)
-    for X, mass, Phi in zip(cloud.points, cloud.masses, cloud.modes, strict=True):
-        p = X + Phi @ s.q
-        turned = np.cross(s.g, p) + np.cross(s.w, np.cross(s.w, p))
-        load = mass * (s.a + turned + 2.0 * np.cross(s.w, Phi @ s.qd) + Phi @ s.qdd)
-        force, moment, rows = force + load, moment + np.cross(p, load), rows + Phi.T @ load
-    for found, expected in zip(forces_of_sid(sid_of(cloud.body()), s), (force, moment, rows)):
-        assert_close(found, expected)
-
-
 def moving(body: ShapeIntegrals, s: State) -> BodyMotion:
     frame = tuple(x[:, None] for x in (s.a, s.w, s.g))
     return BodyMotion(Constants(body), frame, np.stack([s.q, s.qd, s.qdd], axis=1)[:, :, None])

@@ -130,7 +130,7 @@ def test_loops_in_space_leave_their_forces_and_what_follows(tmp_path):
     assert not any("closures" in one for one in summary["warnings"])
     # With an arm beside it all of the linkage is rigid.
     tree = four_bar()
-    tree["arms"] = [*tree["arms"][:2], bar("rocker", 0.25), flexible("tool", 0.05)]
+    tree["arms"] = [*tree["arms"][:2], bar("rocker", 0.25), flexible("tool", 0.5)]
     tree["joints"].append({"name": "hold", "type": "fixed", "parent": "crank", "child": "tool"})
     scene = closed(tmp_path, "t,turn\n0,0.5\n1,1.0\n", tree, reduction={"coordinates": 6})
     arrays, table, summary, _ = left_by(scene, folders[1])

@@ -11,7 +11,7 @@ from runs import refusal, run
 from dolfinopt.data import paper_scene
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.paper import reproduction as paper
-from dolfinopt.paper.statements import bend, check_paper, failed_checks, percent, power, span
+from dolfinopt.paper.reproduction import bend, check_paper, failed_checks, percent, power, span
 from dolfinopt.study.cases import Case
 
 pytestmark = pytest.mark.serial  # cases are dealt out to ranks in tests/study

@@ -13,7 +13,7 @@ from runs import overrides, run
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.paper import reproduction as paper
-from dolfinopt.paper.statements import TABLE, check_paper, failed_checks
+from dolfinopt.paper.reproduction import TABLE, check_paper, failed_checks
 from dolfinopt.study.cases import Outcomes
 
 pytestmark = pytest.mark.serial  # cases are dealt out to ranks in tests/study

@@ -57,6 +57,15 @@ def test_part_is_converged_and_says_what_it_loses(made):
     assert "deviation" in check.loss and len(check.loss.splitlines()) == 1
 
 
+def test_part_without_a_coarse_mesh_tells_that_its_error_is_not_known(made):
+    check = replace(made[2], coarse=None, stress_change=float("nan"))
+    assert np.isnan(check.refinement["compliance"]) and not check.converged
+    assert check.to_dict()["check"]["refinement"]["compliance"] is None
+    assert not any("refinement" in note for note in check.notes)
+    (warning,) = (text for text in check.warnings if "mesh" in text)
+    assert "not known" in warning and "part.minimum_member" in warning
+
+
 def test_buckling_of_the_part_stands_in_the_table(made):
     check = made[2]
     row = check.table().loc["buckling"]

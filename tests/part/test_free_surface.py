@@ -10,8 +10,9 @@ from parts import write_run
 from runs import ROOT, run
 
 import dolfinopt as do
+from dolfinopt.errors import InputError
 from dolfinopt.part.optimize import Problem
-from dolfinopt.part.part import make_parts
+from dolfinopt.part.part import make_parts, mesh_parts
 from dolfinopt.part.solid.free_surface import FreeSurface, free_form
 
 pytestmark = pytest.mark.serial
@@ -103,6 +104,29 @@ def test_a_surface_that_would_cross_itself_gives_way_to_that_of_the_mesh(form, m
     monkeypatch.setattr("dolfinopt.part.solid.free_surface.crossings", lambda _: np.ones((1, 2)))
     assert moved.made.watertight
     assert moved.made.volume == pytest.approx(moved.size, rel=1e-12)
+
+
+def test_a_surface_that_gmsh_cannot_mesh_keeps_its_triangles(form, monkeypatch):
+    """Its mesh is filled anew; there is no coarse one."""
+    moved = form[4].outlines[1].moved(moves_of(form)[1])
+    if not isinstance(moved, FreeSurface):
+        pytest.skip("plates are made of outlines")
+
+    def lost(*_):
+        raise InputError("Gmsh finds no faces")
+
+    monkeypatch.setattr("dolfinopt.part.solid.mesh.tetrahedra_of", lost)
+    part = moved.made
+    meshes = mesh_parts({1: part})
+    assert not meshes.coarse
+    mesh = meshes.fine[1]
+    assert mesh.volumes.sum() == pytest.approx(part.volume, rel=1e-6)
+    assert mesh.quality.min() > 0.5 * moved.mesh.quality.min()
+    for name in ("boundary", "inboard", "outboard"):
+        before, after = (np.unique(one.points[getattr(one, name)].reshape(-1, 3), axis=0)
+                         for one in (moved.mesh, mesh))  # fmt: skip
+        assert before.shape == after.shape
+        assert np.abs(before - after).max() < 1e-4  # m: it has the part's volume, not the mesh's
 
 
 @pytest.mark.slow

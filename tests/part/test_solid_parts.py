@@ -320,20 +320,24 @@ def test_bores_are_interfaces_of_parts(tmp_path):
 
 
 @pytest.mark.slow
-def test_part_with_a_further_interface_is_a_link_again(tmp_path):
+@pytest.mark.parametrize("plate", [False, True])
+def test_part_with_a_further_interface_is_a_link_again(tmp_path, plate):
     """Its mesh holds the facets of all interfaces by name, a patch to a cell's side."""
     side = {"name": "side", "point": (0.25, 0.02, 0.0), "radius": 0.03}
     (tmp_path / "table.csv").write_text("t,swing\n0,0\n0.2,1\n")
     tree = fork() | {"payload": {"mass": 1.0}, "reduction": {"coordinates": 12}}
     link = tree["arms"][0] | {"cells": [20, 6, 4], "interfaces": [side], "passive": 0.03}
+    link |= {"extruded": True} if plate else {}
     tree |= {"arms": [link], "joints": tree["joints"][:1]}
     tree["forces"] = [{"arm": "link", "interface": "side", "force": [0.0, 500.0, 0.0]}]
     scene = scene_from_dict(tree, str(tmp_path / "link.toml"))
     mesh = arm_mesh(MPI.COMM_SELF, scene.arms[0])
     x, y, z = mesh.centroid.T
-    density = 1.0 * ((np.abs(y) > 0.007) | (np.abs(z) > 0.005) | (np.abs(x - 0.25) < 0.05))
+    walls = (np.abs(z) > 0.005) & (not plate)
+    density = 1.0 * ((np.abs(y) > 0.007) | walls | (np.abs(x - 0.25) < 0.05))
     density[mesh.passive] = 1.0
-    domain = solid_domain(mesh, density)
+    domain = domain_in_scene(scene, 0, mesh, density)
+    assert (domain.flat is not None) == plate
     assert list(domain.further) == ["side"] and len(domain.further["side"]) > 4
     part = make_solid_part(domain)
     found = solid_mesh(part, mesh_size(part))

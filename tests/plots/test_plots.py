@@ -13,13 +13,13 @@ from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.multibody.end_effector import end_effector
+from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.mechanism import Closure, Mechanism, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.views import ArmView
-from dolfinopt.plots import animation, curves, design, machine, shapes, style
+from dolfinopt.plots import animation, curves, design, machine, style
 from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -134,10 +134,10 @@ def test_log_scale_beyond_a_decade():
 
 def test_areas_and_volume_fraction_of_any_polygons():
     triangle = np.array([[[0, 0], [2, 0], [0, 3]]], dtype=float)
-    assert shapes.cell_areas(triangle) == pytest.approx([3.0])
+    assert design.cell_areas(triangle) == pytest.approx([3.0])
     corners = np.array([[[0, 0], [0, 1], [3, 1], [3, 0]], [[3, 0], [4, 0], [4, 1], [3, 1]]], float)
     view = ArmView("a", corners, corners.mean(axis=1), np.array([1.0, 0.2]), np.zeros((2, 4, 2, 0)))
-    assert shapes.volume_fraction(view) == pytest.approx(0.8)  # the first one is clockwise
+    assert design.volume_fraction(view) == pytest.approx(0.8)  # the first one is clockwise
 
 
 # -- designs ---------------------------------------------------------------------------------
@@ -295,7 +295,7 @@ def test_magnified_arms_join(magnification):
             cells = film.motion.cells(k, frame)
             for end, joint in ((0.0, k), (LENGTHS[k], k + 1)):
                 axis = np.all(np.abs(view.corners - [end, 0.0]) < 1e-12, axis=-1)
-                place = shapes.plane(film.motion.place[frame, joint])
+                place = machine.plane(film.motion.place[frame, joint])
                 assert axis.any()
                 np.testing.assert_allclose(cells[axis] - place, 0.0, atol=1e-13)
 
@@ -309,7 +309,7 @@ def test_film_runs_from_the_first_to_the_last_instant():
     np.testing.assert_allclose(film.trace, moving.end, atol=1e-14)
     np.testing.assert_allclose(film.desired, rigid, atol=1e-14)
     np.testing.assert_allclose(film.t, moving.t[film.at])
-    tips = shapes.plane(film.motion.place[:, -1])
+    tips = machine.plane(film.motion.place[:, -1])
     np.testing.assert_allclose(tips, moving.end[film.at], atol=1e-14)
     magnified = animation.make_film(views, moving, 3.0, 7).trace
     wanted = end_effector(mechanism, still(moving.q_r), 3.0 * moving.q_e)
@@ -349,7 +349,7 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
             picture = np.asarray(gif.convert("RGB")).astype(int)
             pictures.append(picture)
             assert (picture[0, 0] == 255).all()
-            x, y = axes.transData.transform(shapes.plane(film.motion.place[frame, -1]))
+            x, y = axes.transData.transform(machine.plane(film.motion.place[frame, -1]))
             pixel = picture[round(len(picture) - y), round(x)]
             assert np.abs(pixel - [217, 95, 2]).max() <= 16
     assert (pictures[3] != pictures[0]).any(axis=2).sum() > 1000
@@ -364,7 +364,7 @@ def test_machine_shows_every_arm_where_it_is(arms):
     moving = swinging(mechanism)
     figure = machine.machine_figure(views, moving, "title")
     axes = figure.axes[0]
-    place = shapes.chain(mechanism, moving.q_r, 0.0 * moving.q_e)[0]
+    place = machine.chain(mechanism, moving.q_r, 0.0 * moving.q_e)[0]
     at = machine.poses_along(place[:, -1], machine.POSES)
     assert [text.get_text() for text in axes.texts] == [f"{moving.t[n]:.2f} s" for n in at]
     cells = [one for one in axes.collections if isinstance(one, machine.Cells)]
@@ -373,7 +373,7 @@ def test_machine_shows_every_arm_where_it_is(arms):
     assert {int((one.get_facecolor()[:, 3] > 0.0).sum()) for one in cells} == {40 * 4}
     ends = [line.get_xydata()[0] for line in axes.lines if line.get_mfc() == style.ORANGE
             and len(line.get_xydata()) == 1]  # fmt: skip
-    np.testing.assert_allclose(ends, shapes.plane(place[at, -1]))
+    np.testing.assert_allclose(ends, machine.plane(place[at, -1]))
     solid = np.abs(shown(figure) - [8, 29, 88]).max(axis=2) < 12
     assert solid.sum() > 2000
 
@@ -392,7 +392,7 @@ def slider_crank(count: int = 61) -> tuple[list[ArmView], Any]:
     desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
     q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
     closure = Closure.slider(0.0, 1.0)
-    actual = shapes.close_loop(mechanism, closure, desired, q_e)
+    actual = machine.close_loop(mechanism, closure, desired, q_e)
     assert actual is not None
     return views, motion(mechanism, t, actual, q_e, desired, closure)
 
@@ -402,15 +402,15 @@ def test_a_drawn_loop_is_closed_by_its_last_joints(kind):
     mechanism = manipulator(3)[1]
     q_r = np.array([[0.2, 0.5, -0.9, 0.7], [0.2, 0.48, -0.9, 0.8]])
     q_e = 0.02 * np.sin(np.arange(12.0)).reshape(2, 6)
-    rigid_end = shapes.chain(mechanism, q_r[:1], 0.0 * q_e[:1])[0][0, -1]
+    rigid_end = machine.chain(mechanism, q_r[:1], 0.0 * q_e[:1])[0][0, -1]
     closure = Closure.pin(rigid_end) if kind == "pin" else Closure.slider(rigid_end, 1.0 + 0.5j)
-    closed = shapes.close_loop(mechanism, closure, q_r, q_e)
-    end = shapes.chain(mechanism, closed, q_e)[0][:, -1]
+    closed = machine.close_loop(mechanism, closure, q_r, q_e)
+    end = machine.chain(mechanism, closed, q_e)[0][:, -1]
     assert np.abs(closure.gap(end)).max() < 3e-6
     free = 4 - closure.count
     np.testing.assert_array_equal(closed[:, :free], q_r[:, :free])
-    assert shapes.close_loop(mechanism, Closure.pin(5.0), q_r, q_e) is None  # out of reach
-    assert shapes.close_loop(mechanism, None, q_r, q_e) is q_r
+    assert machine.close_loop(mechanism, Closure.pin(5.0), q_r, q_e) is None  # out of reach
+    assert machine.close_loop(mechanism, None, q_r, q_e) is q_r
 
 
 def test_magnified_loops_stay_closed():
@@ -426,8 +426,8 @@ def test_magnification_is_less_where_the_loop_does_not_reach_its_pin():
     views, mechanism = manipulator(3)
     t, desired = np.arange(2.0), np.array([[0.0, 0.5, -0.6, 0.8], [0.0, 0.52, -0.6, 0.8]])
     shortened = np.tile([-0.01, 0.0], (2, 3))
-    closure = Closure.pin(shapes.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
-    actual = shapes.close_loop(mechanism, closure, desired, shortened)
+    closure = Closure.pin(machine.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
+    actual = machine.close_loop(mechanism, closure, desired, shortened)
     moving = motion(mechanism, t, actual, shortened, desired, closure)
     film = animation.make_film(views, moving, 50.0, 2)
     assert 1.0 <= film.magnification < 50.0
@@ -460,7 +460,7 @@ def test_stage_of_a_loop_shows_slider_and_guide():
     words = [text.get_text() for text in stage.figure.legends[0].texts]
     assert len(words) == 2 and "0.5 kg" in words[1]
     heights = [np.ptp(view.corners[..., 1]) for view in film.motion.views]
-    np.testing.assert_allclose(heights, [shapes.BAR, 0.06])  # a rigid crank is a thin bar
+    np.testing.assert_allclose(heights, [machine.BAR, 0.06])  # a rigid crank is a thin bar
     shown(stage.figure)
 
 

@@ -10,12 +10,12 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.multibody.end_effector import end_effector
-from dolfinopt.multibody.spatial.end_effector import body_frames
+from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.output.views import AROUND, ArmView, designed
 from dolfinopt.part.solid.surface import surface_at
 from dolfinopt.plots import animation, solid_design, solid_machine
 from dolfinopt.plots.design import design_figure, stress_figure
+from dolfinopt.plots.solid_machine import body_frames
 
 pytestmark = pytest.mark.serial
 CELLS, SIZE = (20, 4, 2), np.array([0.5, 0.1, 0.05])

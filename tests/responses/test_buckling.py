@@ -12,7 +12,7 @@ from runs import scene
 
 import dolfinopt as do
 from dolfinopt.arms.arm import build_arms
-from dolfinopt.arms.buckling import buckling_modes
+from dolfinopt.arms.modes import buckling_modes
 from dolfinopt.errors import InputError
 from dolfinopt.fem.prestress import Prestress, StressedModulus
 from dolfinopt.parallel import partition_arms

@@ -18,7 +18,7 @@ from dolfinopt.optimization import certificate, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.responses.order_selection import OrderSelection, estimated_error
-from dolfinopt.study.simulate import simulate_scenarios
+from dolfinopt.study.cases import simulate_scenarios
 
 WORLD = MPI.COMM_WORLD
 AUTO = 'reduction.coordinates="auto"'

@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 from runs import TWO_ARM, refusal
+from scenes import put_at
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
@@ -66,17 +67,6 @@ def with_fork():
     data["joints"][2]["parent_interface"] = "side"
     data["payload"]["arm"] = "slide"
     return data
-
-
-def put(data, path, value):
-    """Set a value at a path; None takes the key away."""
-    node = data
-    for part in path[:-1]:
-        node = node[part] if isinstance(part, int) else node.setdefault(part, {})
-    if value is None:
-        del node[path[-1]]
-    else:
-        node[path[-1]] = value
 
 
 def machine_of(scene):
@@ -177,7 +167,7 @@ FORKS = [
 def test_refusals(source, make, path, value, shown, remedy):
     data = make()
     data.setdefault("reduction", {"coordinates": 12})["coordinates"] = 12
-    put(data, path, value)
+    put_at(data, path, value)
     if path[-1] == "cells":
         del data["arms"][1]["rigid"]
     refusal(lambda: scene_from_dict(data, source), shown, remedy)

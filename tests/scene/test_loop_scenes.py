@@ -8,6 +8,7 @@ import pytest
 from loops import BOOM_TABLE, boom, closed, four_bar
 from machines import loop, loop_tree, with_keys
 from runs import TWO_ARM, refused
+from scenes import put_at
 
 from dolfinopt.multibody.machine import loops_of
 from dolfinopt.scene.load import load_scene, scene_from_dict
@@ -19,13 +20,7 @@ TURN = "t,turn\n0,0.5\n1,1.0\n"
 def changed(tree: dict, path: tuple[Any, ...], value: Any) -> dict:
     """Return a scene with another value at a path; None takes it away."""
     new = copy.deepcopy(tree)
-    node: Any = new
-    for key in path[:-1]:
-        node = node.setdefault(key, {}) if isinstance(node, dict) else node[key]
-    if value is None:
-        del node[path[-1]]
-    else:
-        node[path[-1]] = value
+    put_at(new, path, value)
     return new
 
 

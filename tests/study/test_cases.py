@@ -9,14 +9,13 @@ from runs import TWO_ARM, refusal
 from studies import COARSE
 
 import dolfinopt as do
-from dolfinopt import locks
+from dolfinopt import disk
 from dolfinopt.optimization import iterate
 from dolfinopt.optimization import loop as optimization
 from dolfinopt.output import checkpoint
 from dolfinopt.responses import evaluation
 from dolfinopt.study import store
-from dolfinopt.study.cases import Case, scene_content
-from dolfinopt.study.simulate import simulate_scenarios
+from dolfinopt.study.cases import Case, scene_content, simulate_scenarios
 from dolfinopt.study.store import run_cases
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
@@ -411,7 +410,7 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
 
 @alone
 def test_another_run_is_refused(plan, tmp_path, monkeypatch):
-    monkeypatch.setattr(locks, "try_lock", lambda *arguments: False)
+    monkeypatch.setattr(disk, "try_lock", lambda *arguments: False)
     refusal(lambda: run_cases(plan, tmp_path, SELF, shown=False), str(tmp_path), "another run")
 
 

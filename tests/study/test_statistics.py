@@ -58,13 +58,6 @@ def test_moments(text, mean, variance):
     assert law.deviation**2 == pytest.approx(variance, rel=1e-8)
 
 
-@pytest.mark.parametrize("text", TEXTS)
-def test_quantiles_are_those_of_the_distribution(text):
-    law = parse_distribution(text)
-    shares = np.linspace(0.001, 0.999, 50)
-    np.testing.assert_allclose(law.law.cdf(law.at(shares)), shares, rtol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("text", "low", "high"),
     [("normal:1:0.1", -math.inf, 1.05), ("normal:1:2", 0.0, math.inf), ("normal:0:1", -1.0, 2.0)],
@@ -140,14 +133,6 @@ def test_latin_hypercube_has_a_point_in_every_interval():
     points = unit_points(40, 3, "latin-hypercube", 3)
     for column in points.T:
         np.testing.assert_array_equal(np.sort((40 * column).astype(int)), np.arange(40))
-
-
-def test_sobol_fills_every_box():
-    """64 points of a (0, 6, 2)-net: one in each box of 8 x 8, 16 x 4, 4 x 16."""
-    points = unit_points(64, 2, "sobol", 5)
-    for a, b in ((8, 8), (16, 4), (4, 16), (64, 1)):
-        boxes = {(int(a * x), int(b * y)) for x, y in points}
-        assert len(boxes) == 64
 
 
 def test_saltelli_points():

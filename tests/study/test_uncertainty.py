@@ -9,9 +9,10 @@ from studies import COARSE, cells_of, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.study import simulate, uncertainty
+from dolfinopt.study import cases as computing
+from dolfinopt.study import uncertainty
+from dolfinopt.study.cases import scales_bodies, with_sample
 from dolfinopt.study.figures import draw
-from dolfinopt.study.simulate import scales_bodies, with_sample
 from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import (
     Sampling,
@@ -195,7 +196,7 @@ def test_what_is_known_is_not_done_again(chunks, given, shared_tmp_path):
 def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
     """Ctrl-C in the third chunk: two are kept, and the end is the same."""
     count = 3 * CHUNK - 1
-    honest, calls = simulate.simulate_batch, []
+    honest, calls = computing.simulate_batch, []
 
     def interrupted(scenes, *others):
         calls.append(1)
@@ -203,7 +204,7 @@ def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return honest(scenes, *others)
 
-    monkeypatch.setattr(simulate, "simulate_batch", interrupted)
+    monkeypatch.setattr(computing, "simulate_batch", interrupted)
     with pytest.raises(KeyboardInterrupt):
         respond(payloads(count), tmp_path / "a", SELF)
     found, computed, _ = respond(payloads(count), tmp_path / "a", SELF)
@@ -228,7 +229,7 @@ def test_ranks_do_not_matter(chunks, given, tmp_path, shared_tmp_path):
 @alone
 def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch):
     """What was found is kept for this run; the command ends with status 1."""
-    honest = simulate.simulate_batch
+    honest = computing.simulate_batch
 
     def failing(scenes, *others):
         return [
@@ -240,7 +241,7 @@ def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch)
     heavy = np.flatnonzero(masses(CHUNK - 1) > 6.25) + 1
     assert 0 < len(heavy) < CHUNK - 1
     with monkeypatch.context() as patch:
-        patch.setattr(simulate, "simulate_batch", failing)
+        patch.setattr(computing, "simulate_batch", failing)
         found, _, failures = respond(cases, tmp_path, SELF)
         with pytest.raises(ConvergenceError, match=r"sample \d+ \(payload.*\): too heavy \(and"):
             run(TWO_ARM, "--random", MASS, "--samples", 10, "--design", given, *overrides(*SMALL),

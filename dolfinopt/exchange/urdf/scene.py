@@ -6,27 +6,37 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.urdf.closures import NO_LOOPS, RobotLoops
+from dolfinopt.exchange.urdf.file import implausible_inertias
 from dolfinopt.exchange.urdf.robot import (
     CELLS,
     FEWEST,
     GROUND,
+    NO_LOOPS,
     Robot,
     RobotJoint,
+    RobotLoops,
     SceneBody,
+    SolidMesh,
+    default_tool,
     number,
+    places_of,
+    read_loops,
     roll_pitch_yaw_of,
+    scene_bodies,
 )
 from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_table
+
+if TYPE_CHECKING:
+    from dolfinopt.exchange.urdf.geometry import LinkCells
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
@@ -515,3 +525,80 @@ def _too_fast(robot: Robot, file: str, rates: np.ndarray) -> list[str]:
 
 def _unit(joint: RobotJoint) -> str:
     return "m" if joint.kind == "prismatic" else "rad"
+
+
+# -- from a robot to a scene -----------------------------------------------------------------
+
+MeshWriter = Callable[["LinkCells"], bytes]  # the bytes of a mesh file
+Warn = Callable[[list[str]], None]
+
+
+def scene_of_robot(
+    robot: Robot,
+    links: tuple[str, ...],
+    tool: str | None,
+    trajectory: str,
+    closures: Path | None,
+    write_mesh: MeshWriter | None,
+    warn: Warn,
+) -> tuple[RobotScene, np.ndarray, np.ndarray]:
+    """Return the scene of a robot, instants (n,) and rows (n, joints and rods) of its table.
+
+    Args:
+        robot: as its file has it.
+        links: that become solids.
+        tool: end-effector's link; None: the end of the solids' chain.
+        trajectory: table of joint coordinates.
+        closures: table of closed loops, if there is one.
+        write_mesh: makes mesh files of solids in their links' shapes; None: all are boxes.
+        warn: takes what is doubtful, as it is found.
+
+    Raises:
+        InputError: a file cannot be used, or names what there is not.
+    """
+    bodies, loops = scene_bodies(robot, links, tool), NO_LOOPS
+    if closures is not None:
+        places = places_of(robot, links, tool or default_tool(robot, links))
+        loops = read_loops(robot, bodies, places, closures)
+    t, rows, said = read_trajectory(robot, trajectory, loops)
+    warn([*said, *implausible_inertias(robot)])
+    if write_mesh is not None:
+        bodies = tuple(
+            _meshed(robot, one, write_mesh, warn) if one.is_solid else one for one in bodies
+        )
+    start_joints = tuple(map(float, rows[0, : len(robot.movable)]))
+    return RobotScene(robot, bodies, float(t[-1]), loops, start_joints), t, rows
+
+
+def _meshed(robot: Robot, body: SceneBody, write_mesh: MeshWriter, warn: Warn) -> SceneBody:
+    """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
+    # The shape is that of the collision elements; of the visual ones where those are no solid.
+    from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints  # loads trimesh
+
+    link = robot.links[body.link]
+    done: tuple[str, ...] = ()
+    try:
+        try:
+            found = cells_between_joints(link.shapes, body)
+        except NoSolid as error:
+            if link.visual is None:
+                raise
+            try:
+                found = cells_between_joints(link.visual(), body)
+            except NoSolid:
+                raise error from None
+            done = ("visual geometry",)
+    except NoSolid as error:
+        warn([f"{robot.file}: link {body.link!r} becomes a box: {error}"])
+        return body
+    _, height, thickness = map(float, found.extents)
+    mesh = SolidMesh(
+        write_mesh(found),
+        len(found.cells),
+        found.side,
+        found.volume,
+        found.ends_within(found.side),
+        found.offset(body.length),
+        (*done, *found.done),
+    )
+    return replace(body, size=(height, thickness), mesh=mesh)

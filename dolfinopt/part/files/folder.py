@@ -10,8 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import write_bytes, write_text, writing
-from dolfinopt.locks import working_in
+from dolfinopt.disk import working_in, write_bytes, write_text, writing
 from dolfinopt.output.folders import PARTS_LIST, record_of_parts, remove_stale
 from dolfinopt.part.files.scene_file import scene_text
 from dolfinopt.scene.load import Scene

@@ -26,6 +26,7 @@ from dolfinopt.part.plane.trace import make_shape
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.stress import CornerStress
 
 
@@ -189,9 +190,9 @@ class PlanePart:
         """Return which places (n, 2) are away from where stress has no limit (n,)."""
         return is_regular(self.shape, self.domain.cell, places, margin)
 
-    def stress(self, state: DesignState) -> CornerStress:
+    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the triangles of its arm."""
-        return corner_stress(state)
+        return corner_stress(state, fields)
 
 
 def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:

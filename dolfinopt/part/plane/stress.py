@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from shapely import Geometry
 
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
 
 
 VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
@@ -66,7 +67,7 @@ def is_regular(shape: Shape, cell: float, places: np.ndarray, margin: float) -> 
     return far
 
 
-def corner_stress(state: DesignState) -> CornerStress:
+def corner_stress(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
     """Return the stress of a design in the plane.
 
     Of a node of the outline the triangles beside the outline count: others know less of it.
@@ -79,4 +80,6 @@ def corner_stress(state: DesignState) -> CornerStress:
     rim = (number == 1)[which.ravel()].reshape(-1, 3)
     outer = np.zeros(count, dtype=bool)
     outer[corners[rim]] = outer[np.roll(corners, -1, axis=1)[rim]] = True
-    return mean_at_corners(state, VERTICES, rim.any(axis=1)[:, None] | ~outer[corners], outer)
+    return mean_at_corners(
+        state, fields, VERTICES, rim.any(axis=1)[:, None] | ~outer[corners], outer
+    )

@@ -116,7 +116,8 @@ class FreeSurface:
             used, triangles = np.unique(self.mesh.boundary, return_inverse=True)
             surface = Surface(self.mesh.points[used], triangles.reshape(-1, 3))
         far = float(np.linalg.norm(moves, axis=1).max())
-        return replace(self.part, surface=surface, distance=self.part.distance + far)
+        far += self.part.distance
+        return replace(self.part, surface=surface, distance=far, moved=self.mesh)
 
     @property
     def size(self) -> float:
@@ -360,7 +361,9 @@ class FreePlate:
     def followed(self, mesh: PlateMesh) -> PlateMesh | None:
         """Return a mesh of a plate nearby, moved to this one; None where it folds."""
         face = self.outline.followed(mesh.face)
-        return None if face is None else extruded(face, mesh.thickness, mesh.layers)
+        if face is None:
+            return None
+        return replace(extruded(face, mesh.thickness, mesh.layers), further=mesh.further)
 
     def by_s(self, mesh: PlateMesh, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s from those by the places (n, 3) of all nodes."""

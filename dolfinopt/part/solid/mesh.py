@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import Tetrahedra, tetrahedra_of
+from dolfinopt.mesh.geometry import Tetrahedra, filled_anew, tetrahedra_of
 from dolfinopt.part.plane.mesh import BodyMesh
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
     from dolfinopt.part.plane.part import PlanePart
+    from dolfinopt.part.solid.domain import SolidDomain
     from dolfinopt.part.solid.part import SolidPart
 
 
@@ -49,11 +50,6 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
     Raises:
         InputError: Gmsh cannot mesh it.
     """
-    if part.domain.further and part.flat is not None:
-        raise InputError(
-            f"arm {part.name!r}: plates with several outboard interfaces (arms.interfaces) are not "
-            "meshed; leave out arms.extruded"
-        )
     if not part.closed:  # Gmsh would end the process
         raise InputError(f"arm {part.name!r}: its surface is not closed")
     for angle, share in TRIES:
@@ -62,6 +58,7 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
                 mesh: Tetrahedra = _freeform_mesh(part, share * size, np.radians(angle))
             else:
                 mesh = _plate_mesh(part.flat, share * size)
+            mesh = _with_further(part.domain, mesh, share * size)
         except InputError as error:
             reason = str(error)
             continue
@@ -76,6 +73,18 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
     raise InputError(f"arm {part.name!r}: {reason}")
 
 
+def filled(part: SolidPart, mesh: Tetrahedra, size: float) -> Tetrahedra:
+    """Mesh a part anew within the boundary of a mesh of it, whose triangles stay.
+
+    Raises:
+        InputError: Gmsh cannot mesh it.
+    """
+    found = _of_volume(part, filled_anew(mesh, size))
+    if found.quality.min() <= LEAST:
+        raise InputError(f"arm {part.name!r}: its cells are flat")
+    return found
+
+
 def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     domain, surface = part.domain, part.surface
     centres = surface.corners.mean(axis=1)
@@ -85,10 +94,13 @@ def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     )
     for faces in domain.further.values():
         outboard &= distance_to_faces(centres, faces) >= near
-    mesh = tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
+    return tetrahedra_of(surface.points, surface.triangles, size, (inboard, outboard), edge)
+
+
+def _with_further(domain: SolidDomain, mesh: Tetrahedra, size: float) -> Tetrahedra:
+    """Return a mesh with its facets that lie in further interfaces, as far as facets tell."""
     if not domain.further:
         return mesh
-    # They may be parts of faces: what of the new facets lies there, as far as facets tell.
     facets = mesh.boundary
     middles = mesh.points[facets].mean(axis=1)
     found = {}

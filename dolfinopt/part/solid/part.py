@@ -22,7 +22,7 @@ from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.domain import SolidDomain
-from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
+from dolfinopt.part.solid.mesh import filled, mesh_size, solid_mesh
 from dolfinopt.part.solid.stress import corner_stress, is_regular
 from dolfinopt.part.solid.surface import (
     WHOLE,
@@ -40,6 +40,7 @@ from dolfinopt.part.widths import Boundary, narrowest_place
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.stress import CornerStress
 
 
@@ -116,6 +117,7 @@ class SolidPart:
         pieces: number of pieces left out because they do not join both interfaces.
         pieces_volume: their volume, m3.
         flat: the part in the plane that it is extruded from; None of others.
+        moved: the mesh whose boundary has become its surface; None of others.
     """
 
     domain: SolidDomain
@@ -125,6 +127,7 @@ class SolidPart:
     pieces: int
     pieces_volume: float
     flat: PlanePart | None = None
+    moved: Tetrahedra | None = None
 
     COARSER: ClassVar[float] = 1.6  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 0  # of the mesh where stress is largest
@@ -275,15 +278,21 @@ class SolidPart:
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> Tetrahedra:
         """Return tetrahedra, all about as large, see `part.Part`."""
-        return solid_mesh(self, coarser * mesh_size(self))
+        size = coarser * mesh_size(self)
+        try:
+            return solid_mesh(self, size)
+        except InputError:  # Gmsh finds no faces in thin walls that have moved
+            if self.moved is None or coarser > 1.0:
+                raise
+        return filled(self, self.moved, size)
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 3) are away from where stress has no limit (n,)."""
         return is_regular(self.domain, places, margin)
 
-    def stress(self, state: DesignState) -> CornerStress:
+    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the tetrahedra of its arm."""
-        return corner_stress(state)
+        return corner_stress(state, fields)
 
 
 def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart:

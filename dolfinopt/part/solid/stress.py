@@ -18,6 +18,7 @@ from dolfinopt.part.stress import CornerStress, mean_at_corners
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
+    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.solid.domain import SolidDomain
 
 
@@ -73,7 +74,7 @@ def singular_edges(domain: SolidDomain) -> np.ndarray:
     return np.asarray(points[found])
 
 
-def corner_stress(state: DesignState) -> CornerStress:
+def corner_stress(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
     """Return the stress of a design in space, of the cells with a facet there."""
     mesh = state.mesh
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
@@ -87,4 +88,4 @@ def corner_stress(state: DesignState) -> CornerStress:
     for facet, side in enumerate(sides):
         touches[np.ix_(rim[:, facet], side)] = True
     outer[corners[touches]] = True
-    return mean_at_corners(state, VERTICES, touches | ~outer[corners], outer)
+    return mean_at_corners(state, fields, VERTICES, touches | ~outer[corners], outer)

@@ -1,4 +1,4 @@
-"""Where the bodies of a machine in space are, paths of its end-effector, joints that follow."""
+"""Paths of an end-effector in space, and the joint coordinates of rigid links that follow them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
+from dolfinopt.multibody.closures import ClosedLoops, Distance, Loops
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.multibody.end_effector import Posed
 from dolfinopt.multibody.machine import (
-    Mechanism,
     Pose,
     RigidChain,
     end_chain,
+    loops_of,
     roll_pitch_yaw,
+    skeleton,
 )
 from dolfinopt.multibody.measured import (
     DAMPED_ITERATIONS,
@@ -35,94 +35,59 @@ from dolfinopt.multibody.measured import (
     STALLED_GAIN,
     START_GUESSES,
 )
+from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
-from dolfinopt.multibody.spatial.loops import RigidLoops, rigid_loops
 from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
 from dolfinopt.scene.load import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
-    """Frames of all bodies against the world's; b bodies in the mechanism's order.
+class RigidLoops:
+    """Closures of links without mass, all of their k equations; R rigid coordinates."""
 
-    Attributes:
-        origin: (n, b, 3) of every body's frame, where its joint is, m.
-        rotation: (n, b, 3, 3) from every body's frame to the world's.
-        outboard: (n, b, 3) of every body's first outboard interface, m.
-        parents: of every body, or `GROUND`.
-        axes: (n, b, 3) unit vectors along the joints' axes.
-        held: (n, b, 3) of the interface that every body hangs on; the world's origin of those on
-            the ground, m.
-        end: (n, 3) of the end-effector, m.
-        tied: (n, k, 2, 3) of both frames of the k closures, m.
-        ties: the closures.
-    """
+    mechanism: Mechanism
+    loops: Loops
 
-    origin: np.ndarray
-    rotation: np.ndarray
-    outboard: np.ndarray
-    parents: tuple[int, ...]
-    axes: np.ndarray
-    held: np.ndarray
-    end: np.ndarray
-    tied: np.ndarray
-    ties: tuple[Tie, ...] = ()
+    def at(self, q: np.ndarray) -> ClosedLoops:
+        """Return them at poses q (n, R)."""
+        return self.loops.at(self.mechanism, q, np.zeros((len(q), 0)))
 
-    def __getitem__(self, part: slice | np.ndarray) -> Frames:
-        """Return those at some of the instants."""
-        return Frames(
-            self.origin[part],
-            self.rotation[part],
-            self.outboard[part],
-            self.parents,
-            self.axes[part],
-            self.held[part],
-            self.end[part],
-            self.tied[part],
-            self.ties,
-        )
+    def gap(self, q: np.ndarray) -> np.ndarray:
+        """Return the equations (n, k), m."""
+        return self.at(q).every_gap
+
+    def rows(self, q: np.ndarray) -> np.ndarray:
+        """Return their derivatives (n, k, R)."""
+        return self.at(q).every_row
+
+    def acceleration(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+        """Return what rates qd (n, R) add to their second derivatives (n, k), m/s2."""
+        return self.at(q).acceleration(qd)
+
+    def with_lengths(self, q: np.ndarray) -> np.ndarray:
+        """Return a pose (R,) with the rods as long as its joints have them."""
+        gaps, found, k = self.gap(q[None])[0], q.copy(), 0
+        for tie in self.loops.ties:
+            for one in tie.equations:
+                if isinstance(one, Distance) and one.coordinate is not None:
+                    found[one.coordinate] += gaps[k]
+                k += 1
+        return found
+
+    def widest(self, error: np.ndarray) -> tuple[str, float]:
+        """Return the closure that is farthest open and by how much, m, of equations (k,)."""
+        ends = np.cumsum([len(tie.equations) for tie in self.loops.ties])[:-1]
+        sizes = [float(np.linalg.norm(part)) for part in np.split(error, ends)]
+        worst = int(np.argmax(sizes))
+        return self.loops.ties[worst].name, sizes[worst]
 
 
-def body_frames(
-    mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray, loops: Loops | None = None
-) -> Frames:
-    """Return the frames of all bodies but bearings, which are points.
-
-    Args:
-        mechanism: b bodies besides bearings.
-        q_r: (n, joints) rigid coordinates; rad or m.
-        q_e: (n, N) elastic coordinates.
-        loops: closures, or None.
-    """
-    posed, joints = Posed(mechanism, q_r, q_e), mechanism.joints
-    tied, ties = np.zeros((len(q_r), 0, 2, 3)), () if loops is None else loops.ties
-    if loops is not None:
-        tied = ClosedLoops(loops, posed).places
-    origin, rotation, outboard, axes, held = [], [], [], [], []
-    parents = []
-    for i, joint in enumerate(joints[: mechanism.num_arms]):
-        # A bearing hangs where the joint it holds would without it.
-        below = joint if joint.parent < mechanism.num_arms else joints[joint.parent]
-        parents.append(below.parent)
-        _, place, R = posed.body(i)
-        R = np.broadcast_to(R if R.ndim == 3 else R[..., None], (3, 3, len(q_r)))
-        origin.append(place.T)
-        rotation.append(R.transpose(2, 0, 1))
-        outboard.append(posed.interface(i, 0)[0].T)
-        axes.append(rotation[-1] @ joint.axis)
-        held.append(posed.interface(below.parent, below.interface)[0].T)
-    return Frames(
-        origin=np.stack(origin, axis=1),
-        rotation=np.stack(rotation, axis=1),
-        outboard=np.stack(outboard, axis=1),
-        parents=tuple(parents),
-        axes=np.stack(axes, axis=1),
-        held=np.stack(held, axis=1),
-        end=posed.interface(*mechanism.way[-1])[0].T,
-        tied=tied,
-        ties=ties,
-    )
+def rigid_loops(scene: Scene) -> RigidLoops:
+    """Return the closed loops of a scene with [[closures]]."""
+    loops = loops_of(scene)
+    assert loops is not None
+    return RigidLoops(skeleton(scene), loops)
 
 
 # -- path of an end-effector in space: its points, orientation, and joints that a table
