@@ -39,13 +39,20 @@ INVENTED = {"responses/mean_acceleration.py", "dynamics/bdf.py", "reduction/hank
 INVENTED |= {"exchange/adams.py"}  # what the exercise adds
 
 
-def test_files_that_the_page_names_exist():
-    page = (ROOT / "docs/pages/develop/architecture.md").read_text(encoding="utf-8")
+def test_files_that_the_pages_name_exist():
+    pages = sorted((ROOT / "docs/pages").rglob("*.md"))
+    text = {path.name: path.read_text(encoding="utf-8") for path in pages}
+    every = "".join(text.values())
     for name in INVENTED:
-        assert page.count(name) == 1 and (ROOT / "dolfinopt" / name).parent.is_dir()
-        page = page.replace(name, "")
-    for name in set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py|tests/[\w/]+(?:\.py)?)`", page)):
-        path = ROOT / name if name.startswith(("tests/", "docs/")) else ROOT / "dolfinopt" / name
+        assert text["architecture.md"].count(name) == 1
+        assert (ROOT / "dolfinopt" / name).parent.is_dir()
+    named = re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py|tests/[\w/]+(?:\.py)?)`", every)
+    for name in {*named} - INVENTED:
+        path = (
+            ROOT / name
+            if name.startswith(("tests/", "docs/", "demos/"))
+            else ROOT / "dolfinopt" / name
+        )
         assert path.exists(), name
 
 

@@ -9,7 +9,6 @@ test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
 
 import ast
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import build, wave
-from runs import ROOT, TWO_ARM
+from runs import ROOT, TWO_ARM, environment
 from runs import overrides as set_keys
 
 from dolfinopt.cli import commands
@@ -251,8 +250,7 @@ SOLVE = {"dolfinx", "ufl", "slepc4py", "scipy", "gmsh"}
 def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
     """Return which modules a process of its own has imported at its end."""
     line = [sys.executable, "-c", LOADED.format(code), " ".join(names), *map(str, arguments)]
-    # os.environ is as it was before this process began MPI.
-    done = subprocess.run(line, capture_output=True, text=True, env=dict(os.environ), timeout=60)
+    done = subprocess.run(line, capture_output=True, text=True, env=environment(), timeout=60)
     assert done.returncode == 0, done.stderr
     return set(ast.literal_eval(done.stdout.splitlines()[-1]))
 
@@ -263,8 +261,8 @@ def test_the_package_imports_nothing() -> None:
 
 
 @pytest.mark.serial
-def test_model_imports_nothing_of_studies_and_pictures() -> None:
-    others = DRAW | {"gmsh", "pandas", "scipy.stats"}
+def test_model_imports_nothing_of_studies_pictures_and_space() -> None:
+    others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.multibody.inverse_kinematics"}
     assert loaded(others | {"dolfinx"}, "from dolfinopt import Model") == {"dolfinx"}
 
 

@@ -38,7 +38,6 @@ from dolfinopt.fem.interface import (
     static_modes,
 )
 from dolfinopt.fem.interior import ExtendedStiffness, ExtendedSystem, Guesses, InteriorSystem
-from dolfinopt.fem.measured import TETRAHEDRA_BANDWIDTH_RATIO
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.fem.stress import element_centres, stress_operator
 from dolfinopt.mesh import compat
@@ -96,11 +95,10 @@ class Substructure:
                 self._mass = AffineMatrix(cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
         quadratic = operators.cells.shape[1] == 10  # tetrahedra
-        wider = TETRAHEDRA_BANDWIDTH_RATIO if quadratic else 1.0
         self.interior = InteriorSystem(
-            self.T, self._stiffness, self._mass, profile, tolerance, wider
+            self.T, self._stiffness, self._mass, profile, tolerance, quadratic
         )
-        self._statics_alone, self._solution = statics_alone, (tolerance, wider)
+        self._statics_alone, self._solution = statics_alone, (tolerance, quadratic)
         self._last: ElasticArm | None = None
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> Substructure:
@@ -212,7 +210,8 @@ class Substructure:
     @cached_property
     def stress_tensor(self) -> StressTensor:
         """How stress stiffens cells (collective)."""
-        every = self.quadrature.derivatives, self.quadrature.stress
+        points = quadrature(self.mesh, self.operators)  # not kept: of tetrahedra 10 kB a cell
+        every = points.derivatives, points.stress
         # Turned by half a turn k_e and m_e are the same, but not these.
         derivatives, stress = (single(self.mesh.comm, operator) for operator in every)
         if len(self.cells.stiffness) != 1 or derivatives is None or stress is None:

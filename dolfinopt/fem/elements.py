@@ -408,13 +408,13 @@ class Quadrature:
 
 
 def quadrature(mesh: ArmMesh, operators: ElementOperators) -> Quadrature:
-    """Return the operators at Gauss points that integrate a product of three gradients.
+    """Return the operators at points that integrate a product of three gradients.
 
-    Exactly so on parallelograms and triangles, see `gauss_order`.
+    Exactly so on parallelograms and simplices.
     """
     corners, element, dim = quadrature_corners(mesh), operators.element, mesh.dim
     around = corners.shape[1]
-    points, weights = gauss_points(around, gauss_order(element.degree, around, dim), dim)
+    points, weights = _product_points(element.degree, around, dim)
     law = operators.thickness * elasticity(dim, operators.poisson_ratio)
 
     def stress(corners: np.ndarray, strain: np.ndarray) -> np.ndarray:
@@ -432,20 +432,22 @@ def quadrature(mesh: ArmMesh, operators: ElementOperators) -> Quadrature:
     )
 
 
-def gauss_order(degree: int, corners: int, dim: int = 2) -> int:
+def _product_points(degree: int, corners: int, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (p, d) and weights (p,) for a product of three gradients."""
+    if corners == 2**dim:
+        return gauss_points(corners, gauss_order(degree), dim)
+    # Quadratic tetrahedra have 5 or 6 points so, and 27 by collapsed coordinates.
+    points, weights = basix.make_quadrature(KINDS[dim, corners], 3 * (degree - 1))
+    return points, weights
+
+
+def gauss_order(degree: int) -> int:
     """Return the fewest Gauss points a direction that integrate a product of three gradients.
 
-    On quadrilaterals and hexahedra it has the degree 3 d in any direction; on triangles and
-    tetrahedra 3 (d - 1) in all, and one or two more by collapsed coordinates. n points are exact
-    up to degree 2 n - 1.
-
-    Args:
-        degree: d of the displacement.
-        corners: of the cell.
-        dim: of the mesh, 2 or 3.
+    On quadrilaterals and hexahedra, where it has the degree 3 d in any direction for displacements
+    of degree d; n points are exact up to degree 2 n - 1.
     """
-    highest = 3 * degree if corners == 2**dim else 3 * (degree - 1) + dim - 1
-    return highest // 2 + 1
+    return 3 * degree // 2 + 1
 
 
 # -- element matrices by Gauss quadrature in NumPy, in the plane and in space --------------------

@@ -32,6 +32,8 @@ from dolfinopt.fem.measured import (
     KRYLOV_TOLERANCE,
     MUMPS_ROWS,
     SOLID_BAND_WORK_LIMIT,
+    TETRAHEDRA_BAND_WORK_LIMIT,
+    TETRAHEDRA_ROWS,
     WIDEST,
 )
 from dolfinopt.mesh.budget import free_memory, ranks_here
@@ -87,7 +89,7 @@ class InteriorSystem:
         mass: AffineMatrix | CellMatrix,
         profile: Profile,
         tolerance: float | None = None,
-        wider: float = 1.0,
+        irregular: bool = False,
     ):
         """Set up for such matrices; nothing is selected before it is asked for.
 
@@ -97,9 +99,9 @@ class InteriorSystem:
             mass: over local nodes.
             profile: of this rank.
             tolerance: in place of `ENERGY_TOLERANCE`.
-            wider: factor of `WIDEST`.
+            irregular: whether the mesh is of quadratic tetrahedra.
         """
-        self._wider = wider
+        self._irregular = irregular
         self._T, self._profile = T, profile
         self.tolerance = tolerance or ENERGY_TOLERANCE
         self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
@@ -146,8 +148,12 @@ class InteriorSystem:
         """LAPACK's factor, where one rank owns a band that is narrow enough."""
         if self._T.comm.size > 1 or has_options(OPTIONS):
             return None
-        size, most = self._num_rows, BAND_WORK_LIMIT if self._T.dim == 2 else SOLID_BAND_WORK_LIMIT
+        size, most = self._num_rows, BAND_WORK_LIMIT
+        if self._T.dim == 3:
+            most = TETRAHEDRA_BAND_WORK_LIMIT if self._irregular else SOLID_BAND_WORK_LIMIT
         if size * float(self._bandwidth) ** 2 > most:
+            return None
+        if size > FACTOR_ROWS and self._is_too_much(8.0 * size * (self._bandwidth + 1)):
             return None
         return BandCholesky(self._entries.rows, self._entries.columns, size)
 
@@ -169,18 +175,23 @@ class InteriorSystem:
         T = self._T
         if T.dim == 2 or has_options(OPTIONS):
             return False
-        return T.bandwidth > self._wider * WIDEST or self._memory_is_short()
+        wide = T.num_dofs > TETRAHEDRA_ROWS if self._irregular else T.bandwidth > WIDEST
+        return wide or self._memory_is_short()
 
     def _memory_is_short(self) -> bool:
         """Return whether a factor would take too much of a machine's free memory (collective)."""
-        T = self._T
-        here = MPI.Get_processor_name()
+        T, rows, here = self._T, self._T.num_dofs, MPI.Get_processor_name()
         share = T.comm.allgather(here).count(here) / T.comm.size
-        factor = share * FACTOR_BYTES * T.num_dofs * (T.num_dofs / FACTOR_ROWS) ** FACTOR_EXPONENT
-        # Other arms' ranks on this machine take theirs at the same time.
-        free = free_memory() * T.comm.allgather(here).count(here) / ranks_here()
-        short = T.num_dofs > FACTOR_ROWS and factor > FREE_MEMORY_SHARE * free
+        factor = share * FACTOR_BYTES * rows * (rows / FACTOR_ROWS) ** FACTOR_EXPONENT
+        short = rows > FACTOR_ROWS and self._is_too_much(factor)
         return bool(T.comm.allreduce(short, op=MPI.LOR))
+
+    def _is_too_much(self, needed: float) -> bool:
+        """Return whether the arm's ranks on this machine had better not take so many bytes."""
+        here = MPI.Get_processor_name()
+        # Other arms' ranks on this machine take theirs at the same time.
+        free = free_memory() * self._T.comm.allgather(here).count(here) / ranks_here()
+        return needed > FREE_MEMORY_SHARE * free
 
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:
@@ -390,16 +401,16 @@ class ExtendedSystem(InteriorSystem):
         mass: AffineMatrix | CellMatrix,
         profile: Profile,
         tolerance: float | None,
-        wider: float,
+        irregular: bool,
         near: np.ndarray,
     ):
         """Set up as an `InteriorSystem`.
 
         Args:
-            T, stiffness, mass, profile, tolerance, wider: see there.
+            T, stiffness, mass, profile, tolerance, irregular: see there.
             near: interior dofs of this rank that an outboard interface's coordinates couple with.
         """
-        super().__init__(T, stiffness, mass, profile, tolerance, wider)
+        super().__init__(T, stiffness, mass, profile, tolerance, irregular)
         self.near = near
         self._is_last = T.comm.rank == T.comm.size - 1
 

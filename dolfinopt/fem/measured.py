@@ -39,10 +39,12 @@ HARMLESS_CONTRAST = 1e6
 # -- stress: directions of a motion's loads ----------------------------------------------------
 
 # Of the largest one, by the length of the accelerations, below which a direction in which the loads
-# vary along a motion is none.
-MOTION_RANK_SHARE = 1e-11
+# vary along a motion is none. Stress of spatial_arm.toml is then right to 4e-12 of the largest, by
+# 34 to 40 solves an arm in place of 54 or 66.
+MOTION_RANK_SHARE = 1e-9
+SUMS_RANK_SHARE = 1e-11  # the same of displacements whose adjoints are summed
 # Part of the loads up to which so many directions are solved for in their place.
-FEWER_DIRECTIONS = 0.75
+FEWER_DIRECTIONS = 0.9
 
 # -- interior: the choice of a solver --------------------------------------------------------
 
@@ -61,11 +63,17 @@ MUMPS_ROWS = 150_000
 # whatever the shape, factors the longer the larger the cross-sections. With this one a nearby
 # design takes equally long: slender arms of 250 000 and cubes of 22 000 rows.
 WIDEST = 1200
-# Times that of quadratic tetrahedra, whose meshes are irregular: with 90 801 rows, a bandwidth of
-# 1484, a body takes 11 s by factors and 38 s by conjugate gradients.
-TETRAHEDRA_BANDWIDTH_RATIO = 2.0
-# Conjugate gradients, too, where factors take more than this part of the memory that is free. Bytes
-# a row of MUMPS' factor with so many rows, and the power of the rows with which they grow.
+# Quadratic tetrahedra, whose meshes are irregular, tell nothing by their bandwidth. Rows beyond
+# which they are solved by conjugate gradients, and rows times bandwidth squared up to which a band
+# is factorised. CPU seconds of a body for a nearby design, by MUMPS, conjugate gradients and the
+# band: 9 678 rows of a slender link 0.06, 0.26, 0.08; 24 213 rows 0.19, 0.77, 0.35; 62 856 rows
+# 0.71, 3.15, 2.53; cubes of 21 141 rows with geometric stiffness 0.52, 2.84; 94 902 rows 7.6, 18.4.
+# Of cubes the first grow as rows to 1.55 and would meet at 500 000.
+TETRAHEDRA_ROWS = 500_000
+TETRAHEDRA_BAND_WORK_LIMIT = 1e9
+# Conjugate gradients, too, where factors take more than this part of the memory that is free; no
+# band where it takes more. Bytes a row of MUMPS' factor with so many rows, and the power of the
+# rows with which they grow.
 FREE_MEMORY_SHARE = 0.5
 FACTOR_BYTES = 14e3
 FACTOR_ROWS = 50_000

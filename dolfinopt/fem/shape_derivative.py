@@ -231,7 +231,7 @@ class ShapeDerivative:
 
     @cached_property
     def _K0_rule(self) -> Rule:
-        order = gauss_order(self._degree, self._around, self._dim)
+        order = gauss_order(self._degree)
         return self._gauss(order, 3 * (self._degree - 1))
 
     def _by_corners(

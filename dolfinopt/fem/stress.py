@@ -30,7 +30,7 @@ from dolfinopt.fem.geometric_stiffness import (
     interface_fields,
     static_response,
 )
-from dolfinopt.fem.measured import FEWER_DIRECTIONS, MOTION_RANK_SHARE
+from dolfinopt.fem.measured import FEWER_DIRECTIONS, MOTION_RANK_SHARE, SUMS_RANK_SHARE
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import on_root
@@ -332,8 +332,8 @@ def load_fields(
     others = np.setdiff1d(np.arange(size), rows)
     into = out_of = np.eye(len(solved))
     if moving is not None:
-        lengths = _lengths(arm, V, MV)[solved]
-        directions = on_root(arm.comm, _directions, moving[:, rows], lengths)
+        inertia = np.delete(moving, np.r_[:q, q + first : q + first + b], axis=1)
+        directions = on_root(arm.comm, _directions, inertia, _lengths(arm, V, MV), solved)
         if directions[0].shape[1] <= FEWER_DIRECTIONS * len(solved):
             into, out_of = directions
     right = moved(MV) if known is not None else np.concatenate([forces, moved(MV)], axis=2)
@@ -358,20 +358,32 @@ def _lengths(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(arm.comm.allreduce(np.concatenate(squares)), 0.0))
 
 
-def _directions(c: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return D (k, r) and E (k, r) with c = (c D) E' for coefficients (n, k) of a motion."""
+def _directions(
+    c: np.ndarray, lengths: np.ndarray, which: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return D (k, r) and E (k, r) with c = (c D) E' for those of the coefficients c of a motion.
+
+    What is left out is small beside all of them.
+
+    Args:
+        c: (n, m).
+        lengths: (m,) by which they are weighed.
+        which: (k,) of the m.
+    """
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     weighed = c * lengths
     if len(weighed) > weighed.shape[1]:
-        weighed = np.linalg.qr(weighed, mode="r")
-    _, sizes, directions = np.linalg.svd(weighed, full_matrices=False)
-    kept = directions[sizes > MOTION_RANK_SHARE * sizes[0]].T
-    return lengths[:, None] * kept, kept / lengths[:, None]
+        weighed = np.asarray(np.linalg.qr(weighed, mode="r"))
+    largest = np.linalg.norm(weighed, 2)
+    _, sizes, directions = np.linalg.svd(weighed[:, which], full_matrices=False)
+    kept = directions[sizes > MOTION_RANK_SHARE * largest].T
+    own = lengths[which][:, None]
+    return own * kept, kept / own
 
 
 def _factors(c: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return A (n, r) and B (r, k) with c = A B, columns weighed by lengths (k,)."""
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     left, sizes, right = np.linalg.svd(c * lengths, full_matrices=False)
-    kept = sizes > MOTION_RANK_SHARE * sizes[0]
+    kept = sizes > SUMS_RANK_SHARE * sizes[0]
     return left[:, kept] * sizes[kept], right[kept] / lengths

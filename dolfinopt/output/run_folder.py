@@ -181,15 +181,6 @@ def write_result(
     return write_simulation(folder, simulated, wall, paraview=paraview, pictures=pictures)
 
 
-# -- folders of results: one run each. What an earlier run left is never mixed with a new one ----
-
-
-# -- parts: files made of a design, which may change after them ----------------------------------
-
-
-# -- studies: many questions may be answered in one folder, each under a name of its own ----------
-
-
 # -- an optimisation in a folder -------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
-from solids import solid_arm, solid_scene
+from solids import elastic_link, link_mesh, solid_arm, solid_scene
 
 from dolfinopt.arms.arm import Arm, field_tolerance
 from dolfinopt.fem import interior, multigrid
@@ -173,10 +173,26 @@ def test_which_solver(monkeypatch):
         system.__dict__.pop("is_iterative", None)
         found.append(system.is_iterative)
     assert found == [False, True]
+    for bytes_, fits in ((1e12, True), (8.0 * rows * system._T.bandwidth, False)):
+        free[0] = bytes_
+        system.__dict__.pop("_band", None)
+        assert (system._band is not None) == fits
     assert system._T.bandwidth == 3 * (4 * 3 + 4 + 1 + 1) - 1
     monkeypatch.setattr(interior, "WIDEST", system._T.bandwidth - 1)
     system.__dict__.pop("is_iterative")
     free[0] = 1e12
+    assert system.is_iterative
+
+
+@pytest.mark.serial
+def test_which_solver_of_tetrahedra(monkeypatch):
+    """MUMPS, however wide their band is: conjugate gradients take four times as long."""
+    monkeypatch.setattr(interior, "WIDEST", 100)
+    system = elastic_link("quadratic", link_mesh("tetrahedron", (20, 4, 4))).substructure.interior
+    assert system._T.bandwidth > 100 and system._T.num_dofs > 3000
+    assert system.solver_name == "mumps"
+    monkeypatch.setattr(interior, "TETRAHEDRA_ROWS", 3000)
+    system.__dict__.pop("is_iterative")
     assert system.is_iterative
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from remainders import Built, build, uneven, wave
-from runs import TWO_ARM
+from remainders import Built, build, built_of, uneven, wave
+from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import load_coefficients
@@ -206,6 +206,45 @@ def test_cells_near_an_interface_may_be_left_out() -> None:
     length = built.scene.arms[0].length
     for one in report.values():
         assert 0.1 <= one.peak.place[0] <= length - 0.1
+
+
+def few_directions(*changes: str) -> Analysed:
+    """Return the spatial demo on few cells."""
+    coarse = "arms.1.cells=[12,3,2]", "arms.2.cells=[12,3,2]", "design.filter_radius=0"
+    built = built_of(do.load_scene(ROOT / "demos" / "spatial_arm.toml", [*coarse, *changes]))
+    return Analysed(
+        built, {k: 0.6 + 0.3 * arm.mesh.centroid[:, 0] for k, arm in built.arms.items()}
+    )
+
+
+@pytest.mark.parametrize("stiffening", ["true", "false"])
+def test_directions_of_the_motion(stiffening: str) -> None:
+    """In space they are less than the loads, and make the same stress and gradient of it.
+
+    Directions that are left out have a share of 1e-9 of the loads, and less in what these do.
+    """
+    one = few_directions(f"simulation.stiffening={stiffening}", "objective.gradient=exact")
+    for k, state in one.analysis.designs.items():
+        before = state.elastic.profile.counts.solves
+        [loads] = arm_loads(one.analysis.scene, motions_of(one.trajectory))[k]
+        few = state.load_fields_of(loads.coefficients)
+        solved = state.elastic.profile.counts.solves - before
+        assert solved == few.Z.shape[2] - (18 if stiffening == "true" else 6) < 50
+        every, a = state.load_fields, loads.coefficients[::40]
+        u, same = every.displacements(a), few.displacements(a)
+        assert np.abs(same - u).max() < 1e-10 * np.abs(u).max()
+        by_u = np.random.default_rng(1).normal(size=u.shape)
+        ways = [fields.gradient(a, by_u).by_a for fields in (every, few)]  # few know all columns
+        assert np.abs(ways[1] - ways[0]).max() < 1e-8 * np.abs(ways[0]).max()
+
+
+def test_solves_of_an_iteration() -> None:
+    """Value and gradient of a stress in space: half of the solves for every load, 144 an arm."""
+    one = few_directions("simulation.stiffening=false", "objective.gradient=exact")
+    counts, before = one.analysis.profile.counts, one.analysis.profile.counts.solves
+    one.measure()
+    one.gradient()
+    assert counts.solves - before < 2 * 80
 
 
 def test_void_has_no_stress() -> None:

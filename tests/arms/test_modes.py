@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy.linalg
+from bodies import changed, random_tree
 from mpi4py import MPI
 from remainders import Field, arm_of, build, dense_matrices, rates, uneven, wave
 from runs import TWO_ARM
@@ -18,12 +19,15 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.modes import (
     CarriedInertia,
     Chain,
+    FrozenTree,
     LoadedModes,
     RigidIntegrals,
     loaded_modes,
     rigid_integrals,
 )
 from dolfinopt.fem.interface import floats
+from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient
 
@@ -89,6 +93,33 @@ def test_carried(arms: int, kind: str) -> None:
         elif kind == "none":
             expected = np.zeros((3, 3))
         np.testing.assert_allclose(load.matrix(), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.serial
+def test_carried_inertia_of_a_frozen_tree():
+    """What body 1 carries is what its rows feel of the others, which are held."""
+    rng = np.random.default_rng(7)
+    mechanism = random_tree(rng, interfaces=2).mechanism()
+    pose = RigidMotion(*rng.normal(size=(3, 1, 4)))
+    rest = np.zeros((1, 8))
+    mass = linearise(mechanism, pose, rest, rest, rest).dense()[0, :3, 16:19]
+    rigid = mechanism.rigid
+    frozen = FrozenTree(rigid, pose, "rigid-body")
+    carried, B = frozen.carried()[1].matrix(), mechanism.bodies[1].outboard
+    expected = mechanism.bodies[1].M + B.T @ carried @ B
+    assert np.abs(mass - expected).max() < 1e-12 * np.abs(mass).max()
+    # The derivative by body 4, two joints further out, whose inertia is not stretched linearly.
+    weights = rng.normal(size=(12, 12))
+    zero = [np.zeros((len(b.outboard), len(b.outboard))) for b in mechanism.bodies]
+    by = frozen.cotangents([zero[0], weights, *zero[2:]])[4]
+    for name in ("mass", "w", "W"):
+        change = 0.1 * np.asarray(getattr(rigid.bodies[4], name)) + 0.01
+        if name == "W":
+            change = 0.5 * (change + change[np.arange(9).reshape(3, 3).T.ravel()])
+        other = changed(rigid, 4, name, change)
+        after = FrozenTree(other, pose, "rigid-body").carried()[1].matrix()
+        found = np.sum(getattr(by, name) * change)
+        assert found == pytest.approx(np.sum(weights * (after - carried)), rel=1e-10)
 
 
 def test_rigid_integrals_of_a_bar() -> None:

@@ -1,20 +1,14 @@
-"""Rotations in space, frozen trees, and that plane scenes do not import them."""
+"""Rotations in space."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
-from bodies import changed, complex_derivative, random_tree
+from bodies import complex_derivative
 from scipy.linalg import expm
 
-from dolfinopt.arms.modes import FrozenTree
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.machine import exponential, roll_pitch_yaw, skew
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.tangent import linearise
 
 pytestmark = pytest.mark.serial
 ROUNDING = 1e-12
@@ -66,36 +60,3 @@ def test_frames_of_urdf():
     """Roll about x, then pitch about y, then yaw about z, all of them fixed axes."""
     roll, pitch, yaw = (expm(skew(x)) for x in np.diag([0.3, -0.4, 0.5]))
     assert np.abs(roll_pitch_yaw((0.3, -0.4, 0.5)) - yaw @ pitch @ roll).max() < ROUNDING
-
-
-def test_carried_inertia_of_a_frozen_tree():
-    """What body 1 carries is what its rows feel of the others, which are held."""
-    rng = np.random.default_rng(7)
-    mechanism = random_tree(rng, interfaces=2).mechanism()
-    pose = RigidMotion(*rng.normal(size=(3, 1, 4)))
-    rest = np.zeros((1, 8))
-    mass = linearise(mechanism, pose, rest, rest, rest).dense()[0, :3, 16:19]
-    rigid = mechanism.rigid
-    frozen = FrozenTree(rigid, pose, "rigid-body")
-    carried, B = frozen.carried()[1].matrix(), mechanism.bodies[1].outboard
-    expected = mechanism.bodies[1].M + B.T @ carried @ B
-    assert np.abs(mass - expected).max() < ROUNDING * np.abs(mass).max()
-    # The derivative by body 4, two joints further out, whose inertia is not stretched linearly.
-    weights = rng.normal(size=(12, 12))
-    zero = [np.zeros((len(b.outboard), len(b.outboard))) for b in mechanism.bodies]
-    by = frozen.cotangents([zero[0], weights, *zero[2:]])[4]
-    for name in ("mass", "w", "W"):
-        change = 0.1 * np.asarray(getattr(rigid.bodies[4], name)) + 0.01
-        if name == "W":
-            change = 0.5 * (change + change[np.arange(9).reshape(3, 3).T.ravel()])
-        other = changed(rigid, 4, name, change)
-        after = FrozenTree(other, pose, "rigid-body").carried()[1].matrix()
-        found = np.sum(getattr(by, name) * change)
-        assert found == pytest.approx(np.sum(weights * (after - carried)), rel=1e-10)
-
-
-def test_plane_scenes_import_nothing_of_space():
-    space = "dolfinopt.multibody.inverse_kinematics"
-    code = f"import sys, dolfinopt.model; print('{space}' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "False"
