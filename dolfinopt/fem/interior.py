@@ -72,6 +72,14 @@ class Guesses:
     progress: tuple[float, float]
 
 
+def _is_too_much(comm: MPI.Comm, needed: float) -> bool:
+    """Return whether the arm's ranks on this machine had better not take so many bytes."""
+    here = MPI.Get_processor_name()
+    # Other arms' ranks on this machine take theirs at the same time.
+    free = free_memory() * comm.allgather(here).count(here) / ranks_here()
+    return needed > FREE_MEMORY_SHARE * free
+
+
 class InteriorSystem:
     """K_II with one factorisation, and M_II, of whichever design asked last.
 
@@ -153,7 +161,8 @@ class InteriorSystem:
             most = TETRAHEDRA_BAND_WORK_LIMIT if self._irregular else SOLID_BAND_WORK_LIMIT
         if size * float(self._bandwidth) ** 2 > most:
             return None
-        if size > FACTOR_ROWS and self._is_too_much(8.0 * size * (self._bandwidth + 1)):
+        needed = 8.0 * size * (self._bandwidth + 1)
+        if size > FACTOR_ROWS and _is_too_much(self._T.comm, needed):
             return None
         return BandCholesky(self._entries.rows, self._entries.columns, size)
 
@@ -183,15 +192,8 @@ class InteriorSystem:
         T, rows, here = self._T, self._T.num_dofs, MPI.Get_processor_name()
         share = T.comm.allgather(here).count(here) / T.comm.size
         factor = share * FACTOR_BYTES * rows * (rows / FACTOR_ROWS) ** FACTOR_EXPONENT
-        short = rows > FACTOR_ROWS and self._is_too_much(factor)
+        short = rows > FACTOR_ROWS and _is_too_much(T.comm, factor)
         return bool(T.comm.allreduce(short, op=MPI.LOR))
-
-    def _is_too_much(self, needed: float) -> bool:
-        """Return whether the arm's ranks on this machine had better not take so many bytes."""
-        here = MPI.Get_processor_name()
-        # Other arms' ranks on this machine take theirs at the same time.
-        free = free_memory() * self._T.comm.allgather(here).count(here) / ranks_here()
-        return needed > FREE_MEMORY_SHARE * free
 
     @cached_property
     def _iterative(self) -> BlockConjugateGradients:

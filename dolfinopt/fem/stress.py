@@ -232,7 +232,9 @@ class LoadFields:
         loads[:, :q] = 0.0
         summed = self.is_complete and len(a) > self.Z.shape[2]
         if summed:
-            sums, directions = _factors((a @ self.to_columns)[:, q:], np.abs(self.Z).max((0, 1)))
+            lengths = arm.comm.allreduce(np.square(self.Z).sum(axis=(0, 1))) ** 0.5
+            columns = (a @ self.to_columns)[:, q:]
+            sums, directions = on_root(arm.comm, _factors, columns, lengths)
             by_w, loads = combine(by_u, sums), directions @ self.loads
         mu = static_response(arm, *arm.restrict(by_w))
         weighted = arm.mass_times(mu)

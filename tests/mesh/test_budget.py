@@ -62,7 +62,7 @@ def test_estimate_is_what_was_measured(monkeypatch, make, low, high, words):
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("stiffening", "element", "gigabytes"),  # of 16 755 cells; the estimate of their number: 19 200
-    [("auto", "quadratic", 3.25), (False, "quadratic", 1.04), (True, "linear", 0.46)],
+    [("auto", "quadratic", 1.74), (False, "quadratic", 1.26), (True, "linear", 0.46)],
 )
 def test_cells_of_files_count_as_measured(monkeypatch, tmp_path, stiffening, element, gigabytes):
     """All different: tetrahedra of a bar with sides of 5 mm; the estimate is on the safe side.
