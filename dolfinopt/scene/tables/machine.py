@@ -406,8 +406,8 @@ class Closure(Table):
         for index, arm in enumerate(scene.arms):
             if arm.bearing_stiffness is not None:
                 raise Refusal(
-                    "expected none with [closure]: bearings that give way are simulated in open "
-                    "chains; leave it out",
+                    "expected none with [closure]: close the loop by [[closures]], with [[joints]] "
+                    "about the plane's normal, or leave it out",
                     ("arms", index, "bearing_stiffness"),
                     (*at, "kind"),
                 )
