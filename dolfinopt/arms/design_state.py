@@ -1,6 +1,6 @@
 """One design of one arm: what x_phys is, densities or wall thickness, and what follows from it.
 
-`Kind` tells the kinds apart, `kind_of` chooses; `responses.by_design` leads a gradient back to
+`Kind` tells the kinds apart, `kind_of` chooses; `responses.products` leads a gradient back to
 x_phys.
 """
 

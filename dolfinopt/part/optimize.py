@@ -2,7 +2,7 @@
 
 Variables are the normal moves of the free outlines' control points (`free_outline`), the machine is
 that of the parts on meshes along their curves, and gradients are those by the places of the nodes
-(`responses.shape_sensitivity`). A step minimises the method of moving asymptotes' approximation of
+(`responses.products`). A step minimises the method of moving asymptotes' approximation of
 the merit f0 + c sum_i max(0, f_i) within a trust region, and is taken if the merit falls as
 promised, see `optimization.acceptance`. What was found is judged on a finer mesh; limits that are
 not kept there are tightened by what is missing, and the iterations go on.
@@ -36,8 +36,8 @@ from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
+from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import Analysis, objective_of
-from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Scene
 
 ITERATIONS = 80  # default, at most, from every start

@@ -186,7 +186,7 @@ class OutlineStress(Stress):
     """p-mean over the outline's nodes and instants of the von Mises stress of parts, Pa.
 
     Nodes count alike; those near singular points do not. The true value is the largest. By
-    densities there is no gradient, parts being solid; by nodes see `shape_sensitivity.by_nodes`.
+    densities there is no gradient, parts being solid; by nodes see `products.by_nodes`.
     """
 
     name = "outline_stress"

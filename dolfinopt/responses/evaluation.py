@@ -26,7 +26,6 @@ from dolfinopt.multibody.shape_integrals import (
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
-from dolfinopt.responses.by_design import by_design
 from dolfinopt.responses.measured import (
     NEGLECTED_DEVIATION_SHARE,
     STIFFENING_INSTANTS,
@@ -35,7 +34,7 @@ from dolfinopt.responses.measured import (
     STIFFENING_UNKNOWN_CHANGE,
 )
 from dolfinopt.responses.motion import motion_objective, worst_instants
-from dolfinopt.responses.products import By
+from dolfinopt.responses.products import By, by_design
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -281,7 +280,7 @@ def gradient(
         partition, arms: as for `evaluate`, with the design reduced.
         trajectory: what `evaluate` returned.
         profile: of this rank.
-        by: `shape_sensitivity.by_nodes` for the gradient by the places of the arms' nodes.
+        by: `products.by_nodes` for the gradient by the places of the arms' nodes.
     """
     analysis = analysis_of(scene, partition, arms, trajectory, profile, by)
     rows = objective_of(scene).gradients(analysis)

@@ -27,8 +27,7 @@ from dolfinopt.arms.arm import fixed_body
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, scaled
 from dolfinopt.parallel import Partition
-from dolfinopt.responses.by_design import by_design
-from dolfinopt.responses.products import By
+from dolfinopt.responses.products import By, by_design
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:

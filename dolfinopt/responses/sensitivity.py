@@ -26,9 +26,8 @@ from dolfinopt.multibody.shape_integrals import (
     rigid_body,
 )
 from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
-from dolfinopt.responses.by_design import by_design
 from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
-from dolfinopt.responses.products import By, Pair, Products
+from dolfinopt.responses.products import By, Pair, Products, by_design
 from dolfinopt.responses.response import p_norm_of_lengths
 
 

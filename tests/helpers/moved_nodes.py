@@ -19,8 +19,8 @@ from dolfinopt.optimization.gradient_check import _at, _with
 from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.evaluation import analysis_of, evaluate
 from dolfinopt.responses.motion import MotionResponse
+from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import Response, needs, objective_of
-from dolfinopt.responses.shape_sensitivity import by_nodes
 from dolfinopt.scene.load import Arm, Scene
 
 # From an arm's name and the places of its nodes (n, d), m, to their moves (n, d), m.

@@ -21,9 +21,8 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.responses.evaluation import gradient
-from dolfinopt.responses.products import Products
+from dolfinopt.responses.products import Products, by_nodes
 from dolfinopt.responses.sensitivity import esl_gradient
-from dolfinopt.responses.shape_sensitivity import by_nodes
 
 WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
