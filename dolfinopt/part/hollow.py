@@ -21,11 +21,11 @@ from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.mesh.geometry import TENSOR, msh_bytes
 from dolfinopt.mesh.hollow import Hull
 from dolfinopt.mesh.sections import Member
-from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.solid.stress import APART, SHARP
 from dolfinopt.part.solid.surface import Surface, check_surface
 from dolfinopt.part.stress import CornerStress, mean_at_corners
+from dolfinopt.part.workshop_files import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.scene.tables.arms import WALL_KEYS
 
 if TYPE_CHECKING:

@@ -21,9 +21,7 @@ import dolfinopt.part.solid.part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.part.files.scene_file import scene_text
-from dolfinopt.part.files.step import solid_text
-from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.part.folder import scene_text
 from dolfinopt.part.plane.curves import Arc, Piece, Shape
 from dolfinopt.part.plane.part import shape_facets
 from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
@@ -40,6 +38,7 @@ from dolfinopt.part.solid.surface import (
     nodal_densities,
     outside,
 )
+from dolfinopt.part.workshop_files import MM, solid_text, three_mf_bytes, triangle_bytes
 from dolfinopt.scene.load import scene_from_dict
 
 trimesh = pytest.importorskip("trimesh")

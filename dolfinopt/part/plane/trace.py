@@ -23,13 +23,14 @@ from dolfinopt.part.plane.curves import (
     Piece,
     Shape,
     Spline,
+    Target,
     angle_between,
     direction,
+    fit,
     sampled,
     with_arcs,
 )
 from dolfinopt.part.plane.domain import Edge
-from dolfinopt.part.plane.fit import Target, fit
 from dolfinopt.part.plane.outline import Outline
 
 CORNER = np.radians(60.0)  # turn within `REACH` to either side that makes a corner of a free run

@@ -15,9 +15,6 @@ import numpy as np
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.geometry import Tetrahedra
-from dolfinopt.part.files.drawings import dxf_text
-from dolfinopt.part.files.step import solid_text
-from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
@@ -37,6 +34,7 @@ from dolfinopt.part.solid.surface import (
     with_volume,
 )
 from dolfinopt.part.widths import Boundary, narrowest_place
+from dolfinopt.part.workshop_files import MM, dxf_text, solid_text, three_mf_bytes, triangle_bytes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
