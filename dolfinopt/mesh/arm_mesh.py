@@ -25,7 +25,7 @@ from dolfinopt.mesh.gmsh_session import (
     gmsh_on_root,
     mesh_geo,
 )
-from dolfinopt.mesh.hollow import Hull, Wall, box_hull, rib_stations, tube_hull, wall_of
+from dolfinopt.mesh.hollow import Hull, Wall, box_hull, read_hull, rib_stations, tube_hull, wall_of
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
@@ -490,8 +490,6 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
 def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:
     """Return the outer surface of a hollow arm (on the root)."""
     if arm.hull is not None:
-        from dolfinopt.mesh.hull_file import read_hull
-
         return read_hull(gmsh, arm)
     assert arm.cells is not None and len(arm.cells) == 3
     size = arm.length, arm.height, arm.thickness

@@ -19,7 +19,7 @@ GRID_ROUNDING_SHARE = 1e-9  # of a cell: a node is so near to its line of the gr
 # Of an interface's radius, up to which sides belong to it: those as far from its point do, too.
 INTERFACE_REACH_RATIO = 1.0 + 1e-9
 
-# -- hull_file -------------------------------------------------------------------------------
+# -- hollow ----------------------------------------------------------------------------------
 
 # Of a hollow link's length: how far beside a station the surface is cut, so that no node lies in
 # the plane; and of its height, up to which two crossings of a ray are one edge's.
