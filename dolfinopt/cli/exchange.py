@@ -332,7 +332,7 @@ def import_robot(
         if world.rank == 0:
             with ending_at_once():
                 from dolfinopt.exchange.urdf.scene import scene_of_robot
-                from dolfinopt.mesh.geometry import msh_bytes
+                from dolfinopt.mesh.solid_cells import msh_bytes
 
                 model = _robot(robot, package_path)
                 chosen = tuple(name for word in links.split(",") if (name := word.strip()))

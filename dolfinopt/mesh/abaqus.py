@@ -16,7 +16,9 @@ import numpy as np
 
 from dolfinopt.disk import open_input
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.bores import (
+from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE, VOID, group_named
+from dolfinopt.mesh.measured import INP_BYTES_LIMIT
+from dolfinopt.mesh.solid_cells import (
     ENDS,
     REGIONS,
     Entities,
@@ -27,8 +29,6 @@ from dolfinopt.mesh.bores import (
     interface_names,
     into_model,
 )
-from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE, VOID, group_named
-from dolfinopt.mesh.measured import INP_BYTES_LIMIT
 from dolfinopt.scene.load import Arm
 
 # Corners of the cells that are read, by meshio's names; of shells, which only mark faces.

@@ -22,7 +22,6 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.bores import ENDS, TENSOR, elements_of
 from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.mesh.geometry import check_place, read_groups, telling_where, where_of
 from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
@@ -34,6 +33,7 @@ from dolfinopt.mesh.measured import (
     SHORT_CELL_SHARE,
 )
 from dolfinopt.mesh.sections import Member
+from dolfinopt.mesh.solid_cells import ENDS, TENSOR, elements_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.load import Arm

@@ -18,9 +18,9 @@ from scipy.spatial import cKDTree
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.mesh.geometry import TENSOR, msh_bytes
 from dolfinopt.mesh.hollow import Hull
 from dolfinopt.mesh.sections import Member
+from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.solid.surface import Surface, check_surface
 from dolfinopt.part.stress import EDGE_DISTANCE, REENTRANT_SINE, CornerStress, mean_at_corners

@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import Tetrahedra, filled_anew, msh_bytes, tetrahedra_of
 from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, TRIANGLE, gmsh_on_root
+from dolfinopt.mesh.solid_cells import Tetrahedra, filled_anew, msh_bytes, tetrahedra_of
 from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 

@@ -28,7 +28,6 @@ from scipy.optimize import brentq, minimize
 
 from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import msh_bytes
 from dolfinopt.mesh.sections import (
     FLAT_BAR,
     I_SECTION,
@@ -38,6 +37,7 @@ from dolfinopt.mesh.sections import (
     Section,
     member,
 )
+from dolfinopt.mesh.solid_cells import msh_bytes
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.responses.response import objective_of

@@ -24,7 +24,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import Tetrahedra
+from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.mesh import NEAR, PlateMesh, extruded, facing
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.solid.domain import SolidDomain

@@ -14,7 +14,7 @@ import numpy as np
 
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import Tetrahedra
+from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.mesh import filled, mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
