@@ -15,9 +15,16 @@ from mpi4py import MPI
 from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
 from dolfinopt.arms.modes import Carried, LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
-from dolfinopt.density.filter import AxisSymmetry, Extrusion, HelmholtzFilter
+from dolfinopt.density.filter import (
+    AxisSymmetry,
+    Extrusion,
+    HelmholtzFilter,
+    Projected,
+    preserving_threshold,
+    project,
+    robust_thresholds,
+)
 from dolfinopt.density.interpolation import Interpolated
-from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of

@@ -67,6 +67,7 @@ FILE_CELL_BYTES = {
 
 # -- geometry --------------------------------------------------------------------------------
 
+INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
 END_FACE_COSINE_GAP = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
 SIDE_FACE_COSINE = 1e-6  # to z, of a side face's normal: rounding of splines
@@ -93,9 +94,8 @@ WORD_CHARACTERS_LIMIT = 250  # of a name, number or text; Gmsh's parser has buff
 LINE_CHARACTERS_LIMIT = 1000  # of a line that Gmsh sees; it reads blocks of 8192
 UNREAD_STATEMENTS_LIMIT = 1000  # of a .geo file that Gmsh gave up: no file of an arm has more
 
-# -- abaqus, solid_cells ---------------------------------------------------------------------
+# -- solid_cells -----------------------------------------------------------------------------
 
-INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 # By how much nodes may be off a bore's radius: CAD programs place them to 1e-6, converters in
 # single precision to 1e-4, facets of stl files with 12 sides by 3 %.
 BORE_RADIUS_SHARE = 0.02

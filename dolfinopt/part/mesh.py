@@ -27,8 +27,8 @@ from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvatu
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
+    from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.plane.part import PlanePart
-    from dolfinopt.part.solid.domain import SolidDomain
     from dolfinopt.part.solid.part import SolidPart
 
 CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.fem.stress import LoadFields
+    from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.part import Part
-    from dolfinopt.part.solid.domain import SolidDomain
     from dolfinopt.scene.tables.objective import Objective
 
 HOT = 0.8  # of the largest stress, from which on a place is worth a finer mesh

@@ -15,9 +15,10 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
-from dolfinopt.reduction.basis import Basis, Options
-from dolfinopt.reduction.free_arm import (
+from dolfinopt.reduction.basis import (
+    Basis,
     FreeArm,
+    Options,
     Rows,
     frame_fields,
     frame_loads,

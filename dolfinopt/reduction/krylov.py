@@ -14,9 +14,11 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import AdjointFields, Basis, Options
-from dolfinopt.reduction.free_arm import (
+from dolfinopt.reduction.basis import (
+    AdjointFields,
+    Basis,
     FreeArm,
+    Options,
     Rows,
     frame_fields,
     frame_loads,

@@ -11,8 +11,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
-from dolfinopt.reduction.basis import Basis, orient
-from dolfinopt.reduction.free_arm import FreeArm, Rows
+from dolfinopt.reduction.basis import Basis, FreeArm, Rows, orient
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     INDEPENDENT_ENERGY_RATIO,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
+from dolfinopt.part.domain import loops, recognise
 from dolfinopt.part.plane.curves import (
     Arc,
     Line,
@@ -14,7 +15,6 @@ from dolfinopt.part.plane.curves import (
     fit,
     sampled,
 )
-from dolfinopt.part.plane.domain import loops, recognise
 
 pytestmark = pytest.mark.serial
 

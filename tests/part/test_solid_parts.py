@@ -21,11 +21,11 @@ import dolfinopt.part.solid.part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.part.domain import domain_in_scene, solid_domain
 from dolfinopt.part.folder import scene_text
 from dolfinopt.part.mesh import mesh_size, solid_mesh
 from dolfinopt.part.plane.curves import Arc, Piece, Shape
 from dolfinopt.part.plane.part import shape_facets
-from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
 from dolfinopt.part.solid.part import make_solid_part, measured_widths
 from dolfinopt.part.solid.surface import (
     Surface,

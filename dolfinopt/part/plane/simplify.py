@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dolfinopt.part.domain import Edge
 from dolfinopt.part.plane.curves import KINK, Arc, Line, Piece, Shape, direction
-from dolfinopt.part.plane.domain import Edge
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.trace import (
     AXIS,

@@ -25,9 +25,9 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
+from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import NEAR, PlateMesh, extruded, facing
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
-from dolfinopt.part.solid.domain import SolidDomain
 from dolfinopt.part.solid.part import SolidPart, plate_part
 from dolfinopt.part.solid.surface import (
     Surface,

@@ -15,11 +15,11 @@ import numpy as np
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
+from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import filled, mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
-from dolfinopt.part.solid.domain import SolidDomain
 from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
