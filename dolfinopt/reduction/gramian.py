@@ -18,11 +18,14 @@ from dolfinopt.parallel import on_root
 from dolfinopt.reduction.basis import (
     Basis,
     FreeArm,
+    InverseSpace,
     Options,
     Rows,
+    dot,
     frame_fields,
     frame_loads,
     interface_loads,
+    ritz,
 )
 from dolfinopt.reduction.measured import (
     KRYLOV_BLOCKS_LIMIT,
@@ -30,7 +33,6 @@ from dolfinopt.reduction.measured import (
     RESPONSE_RANK_SHARE,
     RESPONSE_TOLERANCE,
 )
-from dolfinopt.reduction.subspace import InverseSpace, dot, ritz
 
 
 def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:

@@ -17,15 +17,19 @@ from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.reduction.basis import (
     AdjointFields,
     Basis,
+    Expansion,
     FreeArm,
     Options,
     Rows,
+    dot,
     frame_fields,
     frame_loads,
     interface_loads,
+    orthonormalise,
+    ritz,
+    solve_at,
 )
 from dolfinopt.reduction.measured import KRYLOV_BLOCKS_LIMIT, SHIFT_TOLERANCE
-from dolfinopt.reduction.subspace import Expansion, dot, orthonormalise, ritz, solve_at
 
 
 def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:
