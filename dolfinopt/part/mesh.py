@@ -21,13 +21,13 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.gmsh_session import INBOARD, NAMES, OUTBOARD, TRIANGLE, gmsh_on_root
+from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, filled_anew, msh_bytes, tetrahedra_of
+from dolfinopt.part.domain import INBOARD, OUTBOARD, SolidDomain
 from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
-    from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.plane.part import PlanePart
     from dolfinopt.part.solid.part import SolidPart
 
@@ -72,12 +72,12 @@ class BodyMesh:
     @property
     def inboard(self) -> np.ndarray:
         """Sides (k, 2) of the inboard interface."""
-        return self.sides[self.labelled(NAMES[INBOARD])]
+        return self.sides[self.labelled(INBOARD)]
 
     @property
     def outboard(self) -> np.ndarray:
         """Sides (k, 2) of the outboard interface."""
-        return self.sides[self.labelled(NAMES[OUTBOARD])]
+        return self.sides[self.labelled(OUTBOARD)]
 
     @property
     def quality(self) -> np.ndarray:
