@@ -478,7 +478,7 @@ def checked(tmp_path_factory):
                "constraints.deviation=0.001")  # fmt: skip
     folder = finished(tmp_path_factory.mktemp("solids") / "run", (windows,), *changes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dolfinopt.part.solid.mesh.ACROSS", 1.0)  # large cells take little time
+        patch.setattr("dolfinopt.part.mesh.ACROSS", 1.0)  # large cells take little time
         run("part", folder)
     return folder, json.loads((folder / "part" / "part.json").read_text())
 
