@@ -28,6 +28,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
 from dolfinopt.mesh.checks import facet_areas, facet_corners
+from dolfinopt.scene.load import Arm
 from dolfinopt.solver import conjugate_gradients, direct_solver
 
 
@@ -430,6 +431,18 @@ class Extrusion:
         return np.asarray((total / self._count)[self._column])
 
     backward = forward
+
+
+def averages_of(mesh: ArmMesh, arm: Arm) -> list[AxisSymmetry | Extrusion]:
+    """Return the averages that an arm's keys ask for (collective on the arm)."""
+    found: list[AxisSymmetry | Extrusion] = []
+    if arm.symmetric:
+        found.append(AxisSymmetry(mesh))
+    if arm.symmetric_z:
+        found.append(AxisSymmetry(mesh, axis=2))
+    if arm.extruded:
+        found.append(Extrusion(mesh))
+    return found
 
 
 # -- Heaviside projection of filtered designs: crisp at a threshold, with its exact derivative -
