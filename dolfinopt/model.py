@@ -466,7 +466,7 @@ class Model:
             InputError: no part can be made of the design, or the folder holds files already.
         """
         from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
-        from dolfinopt.part.files.folder import file_names, write_parts
+        from dolfinopt.part.folder import file_names, write_parts
         from dolfinopt.part.part import Curves, make_parts, mesh_parts
 
         out = None if folder is None else Path(folder)

@@ -15,15 +15,21 @@ from mpi4py import MPI
 from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
 from dolfinopt.arms.modes import Carried, LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
-from dolfinopt.density.filter import AxisSymmetry, Extrusion, HelmholtzFilter
+from dolfinopt.density.filter import (
+    HelmholtzFilter,
+    Projected,
+    averages_of,
+    preserving_threshold,
+    project,
+    robust_thresholds,
+)
 from dolfinopt.density.interpolation import Interpolated
-from dolfinopt.density.projection import Projected, preserving_threshold, project, robust_thresholds
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.machine import RIGID_ARMS
@@ -100,7 +106,7 @@ class Arm:
         self.solid = scene.material_of(index)
         with profile.phase("mesh"):
             self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
-            self.averages = _averages(self.mesh, arm)
+            self.averages = averages_of(self.mesh, arm)
         self._check_widths(arm)
         with profile.phase("element operators"):
             try:
@@ -449,18 +455,6 @@ class Arm:
         whole: Contacts = on_root(mesh.comm, found)
         first = sum(mesh.comm.allgather(mesh.num_cells)[: mesh.comm.rank])
         return replace(whole, kept=whole.kept[first : first + mesh.num_cells])
-
-
-def _averages(mesh: ArmMesh, arm: scenes.Arm) -> list[AxisSymmetry | Extrusion]:
-    """Return the averages that an arm's keys ask for (collective on the arm)."""
-    found: list[AxisSymmetry | Extrusion] = []
-    if arm.symmetric:
-        found.append(AxisSymmetry(mesh))
-    if arm.symmetric_z:
-        found.append(AxisSymmetry(mesh, axis=2))
-    if arm.extruded:
-        found.append(Extrusion(mesh))
-    return found
 
 
 def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> dict[int, Arm]:

@@ -34,8 +34,8 @@ from dolfinopt.multibody.machine import (
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.reduction.basis import FreeArm, FreeOperators
 from dolfinopt.reduction.eigenproblem import largest_eigenpairs, lowest_eigenpairs
-from dolfinopt.reduction.free_arm import FreeArm, FreeOperators
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm

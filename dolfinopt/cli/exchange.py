@@ -332,7 +332,7 @@ def import_robot(
         if world.rank == 0:
             with ending_at_once():
                 from dolfinopt.exchange.urdf.scene import scene_of_robot
-                from dolfinopt.mesh.geometry import msh_bytes
+                from dolfinopt.mesh.solid_cells import msh_bytes
 
                 model = _robot(robot, package_path)
                 chosen = tuple(name for word in links.split(",") if (name := word.strip()))
@@ -538,7 +538,7 @@ def _robot_files(
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return the files by name, the robot last, and what has become of the links (root only)."""
     from dolfinopt.exchange.urdf.file import NewLink, read_robot, robot_text
-    from dolfinopt.part.files.triangles import triangle_bytes
+    from dolfinopt.part.workshop_files import triangle_bytes
 
     before = read_robot(origin.file).links
     links, index = [], {arm.name: k for k, arm in enumerate(scene.arms)}

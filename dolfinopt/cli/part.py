@@ -113,7 +113,7 @@ def part(
     """
     world = start()
     from dolfinopt.parallel import on_root, together
-    from dolfinopt.part.files.folder import file_names
+    from dolfinopt.part.folder import file_names
     from dolfinopt.part.part import Curves, PartsError, make_parts
 
     scene: Scene = on_root(world, scene_of, folder)
@@ -263,7 +263,7 @@ class Made:
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""
         from dolfinopt.output.folders import prepare_folder
-        from dolfinopt.part.files.folder import write_parts
+        from dolfinopt.part.folder import write_parts
 
         prepare_folder(target)
         meshes = None if self.meshes is None else self.meshes.fine

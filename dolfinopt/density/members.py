@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -32,6 +32,30 @@ class Width:
 
 
 Widths = tuple[Width | None, Width | None]
+
+
+def widths_of(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: float) -> Widths:
+    """Return the widths of the thinnest member and of the thinnest gap of one arm.
+
+    Args:
+        corners: (n_cells, c, d) of every cell, m; in the plane, in order around it. Cells without
+            corners (nan) are left out.
+        solid: (n_cells,) True where the cell is solid.
+        fixed: (n_cells,) True where the scene says what the cell is.
+        asked: of `thinnest_solid`, m.
+    """
+    known = np.isfinite(corners).all(axis=(1, 2))
+    corners, solid, fixed = corners[known], solid[known], fixed[known]
+    plane, middle = corners.shape[2] == 2, corners.mean(axis=1)
+    found = thinnest(corners, solid) if plane else thinnest_solid(corners, solid, asked)
+
+    def placed(width: Width | None) -> Width | None:
+        if width is None:
+            return None
+        away = np.linalg.norm(middle - width.place, axis=1)
+        return replace(width, fixed=bool(fixed[np.argmin(away)]))
+
+    return placed(found[0]), placed(found[1])
 
 
 def thinnest(corners: np.ndarray, solid: np.ndarray) -> Widths:

@@ -15,7 +15,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
-from dolfinopt.mesh.geometry import add_cells, build_model
+from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import (
     FURTHER,
     INBOARD,
@@ -25,8 +25,9 @@ from dolfinopt.mesh.gmsh_session import (
     gmsh_on_root,
     mesh_geo,
 )
-from dolfinopt.mesh.hollow import Hull, Wall, box_hull, rib_stations, tube_hull, wall_of
+from dolfinopt.mesh.hollow import Hull, Wall, box_hull, read_hull, rib_stations, tube_hull, wall_of
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
+from dolfinopt.mesh.solid_cells import add_cells
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
 
@@ -490,8 +491,6 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
 def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:
     """Return the outer surface of a hollow arm (on the root)."""
     if arm.hull is not None:
-        from dolfinopt.mesh.hull_file import read_hull
-
         return read_hull(gmsh, arm)
     assert arm.cells is not None and len(arm.cells) == 3
     size = arm.length, arm.height, arm.thickness

@@ -1,55 +1,35 @@
 """Geometry files -> a Gmsh model of one arm with the groups this program knows, on the root.
 
-Reads .geo (parametric or not), .msh and .step. The model leaves here with the physical groups, made
-of first-order cells of one kind that have passed `checks.py`.
+Reads .geo (parametric or not), .msh, .step and .inp. The model leaves here with the physical
+groups, made of first-order cells of one kind that have passed `checks.py`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
-from dolfinopt.disk import write_bytes
+from dolfinopt.disk import open_input
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.abaqus import read_inp
-from dolfinopt.mesh.bores import (
-    ENDS,
-    HEXAHEDRON,
-    TENSOR,
-    TETRAHEDRON,
-    Entities,
-    bores_of,
-    elements_of,
-    further_of,
-    interface_names,
-    placed,
-)
 from dolfinopt.mesh.checks import check_cells, check_mesh, facet_keys, flatten, keys_of, remedy
 from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import (
     DESIGN,
     FURTHER,
     INBOARD,
-    LINE,
     NAMES,
     OUTBOARD,
     PASSIVE,
-    QUADRILATERAL,
-    TRIANGLE,
     VOID,
     find_groups,
-    gmsh_on_root,
     group_named,
-    in_child,
     mesh_surfaces,
     rename_groups,
     silent_terminal,
@@ -57,13 +37,27 @@ from dolfinopt.mesh.gmsh_session import (
 )
 from dolfinopt.mesh.measured import (
     END_FACE_COSINE_GAP,
-    FACES_EDGE_ANGLE,
     FILE_ROUNDING_SHARE,
     FRAME_TOLERANCE,
-    INTERFACE_AREA_SHARE,
-    LOST_VOLUME_SHARE,
+    INP_BYTES_LIMIT,
     SIDE_FACE_COSINE,
     THICKNESS_TOLERANCE,
+)
+from dolfinopt.mesh.solid_cells import (
+    ENDS,
+    HEXAHEDRON,
+    REGIONS,
+    TENSOR,
+    TETRAHEDRON,
+    Entities,
+    SolidCells,
+    bores_of,
+    boundary,
+    elements_of,
+    further_of,
+    interface_names,
+    into_model,
+    placed,
 )
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.arms import SIZE_PARAMETER
@@ -646,283 +640,200 @@ def check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
         )
 
 
-# -- A closed surface of triangles, meshed with tetrahedra; cells as a solid arm's .msh file -----
+# -- meshes of Abaqus and CalculiX (.inp), by meshio, as a model with the groups of an arm -----
+# Cells are tetrahedra (C3D4, C3D10) or hexahedra (C3D8, C3D20); nodes between corners are left out,
+# sides become straight. Interfaces are node sets, surfaces made of element sets' faces, or sets of
+# shell elements; element sets are regions.
 
 
-@dataclass(frozen=True, eq=False)
-class Tetrahedra:
-    """A solid arm's mesh.
-
-    Attributes:
-        points: (n, 3) in the arm's frame, m.
-        cells: (m, 4) of positive volume.
-        inboard, outboard: (k, 3) nodes of the interfaces' facets.
-        further: those of further interfaces by their names.
-    """
-
-    points: np.ndarray
-    cells: np.ndarray
-    inboard: np.ndarray
-    outboard: np.ndarray
-    further: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
-
-    kind: ClassVar[str] = "tetrahedra"
-
-    @property
-    def volumes(self) -> np.ndarray:
-        """Volumes (m,) of the cells, m3; negative of those turned over."""
-        a, *rest = self.points[self.cells].swapaxes(0, 1)
-        b, c, d = (one - a for one in rest)
-        return np.asarray(np.einsum("na,na->n", b, np.cross(c, d)) / 6.0)
-
-    @property
-    def quality(self) -> np.ndarray:
-        """Shape (m,) of the cells: 12 (3 V)^(2/3) / (sum of squared edges), 1 of a regular one.
-
-        Source: Liu & Joe (1994), doi:10.1007/BF01955874.
-        """
-        corners = self.points[self.cells]
-        pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-        edges = corners[:, pairs[:, 0]] - corners[:, pairs[:, 1]]
-        volume = np.maximum(self.volumes, 0.0)
-        return np.asarray(12.0 * (3.0 * volume) ** (2.0 / 3.0) / np.square(edges).sum(axis=(1, 2)))
-
-    @property
-    def boundary(self) -> np.ndarray:
-        """Facets (k, 3) that only one cell has, counterclockwise from outside."""
-        sides = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
-        facets = np.concatenate([self.cells[:, side] for side in sides])
-        order = np.sort(facets, axis=1)
-        _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
-        return np.asarray(facets[count[which.ravel()] == 1])
-
-    def figures(self) -> dict[str, Any]:
-        """Return its entry of part.json."""
-        return {
-            self.kind: len(self.cells),
-            "volume": float(self.volumes.sum()),
-            "least_quality": float((quality := self.quality).min()),
-            "mean_quality": float(quality.mean()),
-        }
-
-    def write(self, path: Path) -> None:
-        """Write it as `arms.mesh` reads it back (.msh)."""
-        write_bytes(path, msh_bytes(self))
+# Corners of the cells that are read, by meshio's names; of shells, which only mark faces.
+CELLS = {"tetra": 4, "tetra10": 4, "hexahedron": 8, "hexahedron20": 8}
+FACES = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4}
+KEYWORDS = ("*NODE", "*ELEMENT", "*NSET", "*ELSET")
+# Faces S1, S2, ... of cells by their corners, in Abaqus's order.
+SURFACES = {
+    4: [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]],
+    8: [[0, 1, 2, 3], [4, 7, 6, 5], [0, 4, 5, 1], [1, 5, 6, 2], [2, 6, 7, 3], [3, 7, 4, 0]],
+}
+# Elements of faces that meshio does not know, and others of as many nodes that it does.
+FACE_TYPES = {
+    "CPS6": "STRI65", "CPE6": "STRI65", "CAX6": "STRI65", "M3D6": "STRI65", "SFM3D6": "STRI65",
+    "S6": "STRI65", "SFM3D3": "S3", "SFM3D4": "S4", "CPE8": "S8R", "CAX8": "S8R", "M3D8": "S8R",
+    "SFM3D8": "S8R", "S8": "S8R",
+}  # fmt: skip
 
 
-def tetrahedra_of(
-    points: np.ndarray,
-    triangles: np.ndarray,
-    size: float,
-    interfaces: tuple[np.ndarray, np.ndarray],
-    edge: float = FACES_EDGE_ANGLE,
-) -> Tetrahedra:
-    """Mesh the solid within a closed surface, on this process alone.
-
-    Faces are found by their edges and meshed anew.
-
-    Args:
-        points: (n, 3) corners of the surface in the arm's frame, m.
-        triangles: (m, 3) their indices, counterclockwise from outside.
-        size: of the cells, m.
-        interfaces: (m,) True of the triangles of the inboard and the outboard interface.
-        edge: between triangles, from which on there is an edge between faces, rad.
+def read_inp(gmsh: Any, arm: Arm) -> Entities:
+    """Make the Gmsh model of a file's cells, its sets the arm's groups.
 
     Raises:
-        InputError: Gmsh cannot mesh it; says why.
+        InputError: it holds no such cells, or an interface is neither a set nor a bore.
     """
-    return in_child(_tetrahedra_of, points, triangles, size, interfaces, edge)
-
-
-def _tetrahedra_of(
-    points: np.ndarray,
-    triangles: np.ndarray,
-    size: float,
-    interfaces: tuple[np.ndarray, np.ndarray],
-    edge: float,
-) -> Tetrahedra:
-    with _meshing() as gmsh:
-        return _meshed(gmsh, points, triangles, size, interfaces, edge)
-
-
-def filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
-    """Return tetrahedra within the boundary of a mesh, whose triangles stay.
-
-    Args:
-        mesh: whose cells may be bad; its boundary does not cross itself.
-        size: of the cells inside, m.
-
-    Raises:
-        InputError: Gmsh cannot mesh it; says why.
-    """
-    return in_child(_filled_anew, mesh, size)
-
-
-def _filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
-    facets = mesh.boundary
-    rim = np.unique(facets)
+    mesh, surfaces = _read(Path(str(arm.mesh)))
+    blocks = [(block, CELLS[block.type]) for block in mesh.cells if block.type in CELLS]
+    others = sorted({block.type for block in mesh.cells} - set(CELLS) - set(FACES))
+    if not blocks or others:
+        held = ", ".join(others) or "none in space"
+        raise InputError(
+            f"its elements are {held}; expected tetrahedra (C3D4, C3D10) or hexahedra (C3D8, "
+            "C3D20) alone"
+        )
+    if len({corners for _, corners in blocks}) > 1:
+        raise InputError("it has both tetrahedra and hexahedra; expected cells of one kind")
+    regions = _regions(mesh)
+    corners = [np.asarray(block.data)[:, :count] for block, count in blocks]
+    every = np.concatenate(corners)
+    which = np.concatenate([regions[block.type, id(block)] for block, _ in blocks])
+    cells = {group: every[which == group] for group in REGIONS}
+    facets = {}
+    for group, name in interface_names(arm).items():
+        if group not in bores_of(arm):
+            facets[group] = _interface(mesh, surfaces, every, group, name, arm)
+    used = np.unique(every)
     number = np.full(len(mesh.points), -1)
-    number[rim] = np.arange(len(rim))
-    with _meshing() as gmsh:
-        model = gmsh.model
-        model.add("surface")
-        model.addDiscreteEntity(2, 1)
-        model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
-        model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
-        solid = _generated(gmsh, [1], size)
-        found = _cells(model, solid, {group: [] for group in ENDS})
-    if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
-        raise InputError("its cells do not fill it")
-    return replace(
-        found,
-        inboard=number[mesh.inboard],
-        outboard=number[mesh.outboard],
-        further={name: number[own] for name, own in mesh.further.items()},
+    number[used] = np.arange(len(used))
+    points = np.asarray(mesh.points, dtype=float)[used]
+    return into_model(
+        gmsh,
+        SolidCells(
+            points,
+            {group: number[rows] for group, rows in cells.items()},
+            {group: number[rows] for group, rows in facets.items()},
+        ),
     )
 
 
-@contextmanager
-def _meshing() -> Iterator[Any]:
-    """Yield Gmsh on this process alone, whose errors are InputErrors then."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        try:
-            with silent_terminal():
-                yield gmsh
-        except InputError:
-            raise
-        except Exception as error:
-            if type(error) is not Exception:  # Gmsh raises no other
-                raise
-            text = " ".join(str(error).split()) or "Gmsh failed"
-            raise InputError(f"its surface cannot be meshed ({text})") from None
+Surfaces = dict[str, list[tuple[str, int]]]  # element sets and numbers of their cells' faces
 
 
-def _generated(gmsh: Any, faces: list[int], size: float) -> int:
-    """Mesh the solid within faces; return its number."""
-    geo = gmsh.model.geo
-    solid = geo.addVolume([geo.addSurfaceLoop(faces)])
-    geo.synchronize()
-    for key in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
-        gmsh.option.setNumber(key, size)
-    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
-    gmsh.model.mesh.generate(3)
-    return int(solid)
+def _read(path: Path) -> tuple[Any, Surfaces]:
+    """Return meshio's mesh of a file that reads no others, and its surfaces."""
+    try:
+        import meshio
+    except ImportError:
+        raise InputError("meshio is needed to read .inp files: pip install meshio") from None
+    with open_input(path) as stream:
+        data = stream.read(INP_BYTES_LIMIT + 1)
+    if len(data) > INP_BYTES_LIMIT:
+        raise InputError(f"it has more than {INP_BYTES_LIMIT // 10**6} MB; mesh it coarser")
+    text = data.decode("latin-1")
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    if not first.lstrip().startswith("*"):
+        raise InputError(
+            "it is no input file of Abaqus or CalculiX, whose first line begins with *"
+        )
+    if "*INCLUDE" in text.upper().replace(" ", ""):
+        raise InputError("it includes other files (*INCLUDE); save the mesh in one file")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            kept = Path(folder) / "mesh.inp"
+            kept.write_text(_mesh_alone(text), encoding="latin-1")
+            return meshio.read(kept, file_format="abaqus"), _surfaces(text)
+    except (Exception, SystemExit) as error:  # meshio raises whatever a line makes of it
+        told = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"it cannot be read ({told}); expected *NODE and *ELEMENT") from None
 
 
-def _meshed(
-    gmsh: Any,
-    points: np.ndarray,
-    triangles: np.ndarray,
-    size: float,
-    interfaces: tuple[np.ndarray, np.ndarray],
-    edge: float,
-) -> Tetrahedra:
-    model = gmsh.model
-    model.add("surface")
-    model.addDiscreteEntity(2, 1)
-    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
-    model.mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
-    model.mesh.classifySurfaces(edge, True, True, math.pi)
-    model.mesh.createGeometry()
-    faces = [tag for _, tag in model.getEntities(2)]
-    chosen = {}
-    for group, mark in zip(ENDS, interfaces, strict=True):
-        chosen[group] = _faces_of(model, faces, points, triangles, mark)
-    solid = _generated(gmsh, faces, size)
-    for group, own in chosen.items():
-        if not own:
-            raise InputError(f"the {NAMES[group]} interface is lost in its faces")
-    found = _cells(model, solid, chosen)
-    volumes = found.volumes
-    a, b, c = points[triangles].swapaxes(0, 1)  # each with the origin a tetrahedron
-    expected = np.einsum("na,na->", a, np.cross(b, c)) / 6.0
-    if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST_VOLUME_SHARE * expected:
-        raise InputError("its cells do not fill it")
+def _mesh_alone(text: str) -> str:
+    """Return the nodes, elements and sets of a file, faces by names that meshio knows."""
+    kept: list[str] = []
+    wanted = False
+    for line in text.splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.startswith("*"):
+            word = line.partition(",")[0].strip().upper()
+            wanted = word in KEYWORDS
+            if word == "*ELEMENT":
+                line = re.sub(r"(?i)(TYPE\s*=\s*)(\w+)", _known_type, line)
+        if wanted:
+            kept.append(line)
+    return "\n".join(kept) + "\n"
+
+
+def _surfaces(text: str) -> Surfaces:
+    """Return the surfaces of a file that are faces of element sets, by their names."""
+    found: Surfaces = {}
+    rows: list[tuple[str, int]] | None = None
+    for line in text.splitlines():
+        if line.startswith("**") or not line.strip():
+            continue
+        if line.startswith("*"):
+            name = re.search(r"(?i)NAME\s*=\s*\"?([^,\"]+)", line)
+            by_node = re.search(r"(?i)TYPE\s*=\s*NODE", line)
+            rows = None
+            if line.upper().startswith("*SURFACE,") and name and not by_node:
+                rows = found.setdefault(name[1].strip(), [])
+        elif rows is not None:
+            one, _, face = (part.strip() for part in line.partition(","))
+            if face[:1].upper() == "S" and face[1:].isdigit():
+                rows.append((one, int(face[1:])))
     return found
 
 
-def _faces_of(
-    model: Any, faces: list[int], points: np.ndarray, triangles: np.ndarray, mark: np.ndarray
-) -> list[int]:
-    """Return the faces made of an interface's triangles (m,)."""
-    own = {tuple(row) for row in np.sort(triangles[mark], axis=1) + 1}
+def _known_type(found: re.Match[str]) -> str:
+    return found[1] + FACE_TYPES.get(found[2].upper(), found[2].upper())
+
+
+def _regions(mesh: Any) -> dict[tuple[str, int], np.ndarray]:
+    """Return the group of every cell of every block: of its element sets, or design."""
+    found = {
+        (block.type, id(block)): np.full(len(block.data), DESIGN, dtype=int) for block in mesh.cells
+    }
+    for name, members in mesh.cell_sets.items():
+        group = group_named(name, PASSIVE, VOID)
+        for block, own in zip(mesh.cells, members, strict=True):
+            if group is not None and own is not None and len(own):
+                found[block.type, id(block)][np.asarray(own, dtype=int)] = group
+    return found
+
+
+def _interface(
+    mesh: Any, surfaces: Surfaces, cells: np.ndarray, group: int, name: str, arm: Arm
+) -> np.ndarray:
+    """Return the facets of an interface: a surface or shells of its name, or within its nodes."""
+
+    def belongs(one: str) -> bool:
+        known = further_of(arm).get(one.strip().casefold())
+        return (known or group_named(one, *ENDS)) == group
+
+    outer = boundary(cells)
+    faces = [rows for one in surfaces if belongs(one) for rows in _of_surface(mesh, surfaces[one])]
+    for one, members in mesh.cell_sets.items():
+        for block, own in zip(mesh.cells, members, strict=True):
+            if belongs(one) and block.type in FACES and own is not None and len(own):
+                rows = np.asarray(block.data)[np.asarray(own, dtype=int), : FACES[block.type]]
+                faces.append(rows)
+    if faces:
+        return np.concatenate(faces)
+    marked = np.zeros(len(mesh.points), dtype=bool)
+    for one, members in mesh.point_sets.items():
+        if belongs(one):
+            marked[np.asarray(members, dtype=int)] = True
+    found = outer[marked[outer].all(axis=1)]
+    if not len(found):
+        names = sorted({*mesh.point_sets, *mesh.cell_sets, *surfaces})
+        held = ", ".join(map(repr, names[:8])) or "none"
+        why = "holds the corners of no cell's side on the surface" if marked.any() else "is missing"
+        key = "inboard_bore, outboard_bore" if group in ENDS else "axis and radius"
+        raise InputError(
+            f'the node set "{name}" {why}; its sets are {held}: name that of the interface\'s '
+            f"nodes so (*NSET, NSET={name}), or state the bore (arms.{key})"
+        )
+    return np.asarray(found)
+
+
+def _of_surface(mesh: Any, rows: list[tuple[str, int]]) -> list[np.ndarray]:
+    """Return the facets of a surface, those of every element set and block."""
+    known = {name.casefold(): members for name, members in mesh.cell_sets.items()}
     found = []
-    for face in faces:
-        nodes = model.mesh.getElementsByType(TRIANGLE, face)[1].reshape(-1, 3).astype(int)
-        inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
-        a, b, c = points[nodes - 1].swapaxes(0, 1)
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        if area[inside].sum() > INTERFACE_AREA_SHARE * area.sum():
-            found.append(face)
+    for name, face in rows:
+        for block, own in zip(mesh.cells, known.get(name.casefold(), []), strict=False):
+            corners = CELLS.get(block.type)
+            if corners is None or own is None or not len(own):
+                continue
+            if face > len(SURFACES[corners]):
+                raise InputError(f"its cells of set {name!r} have no face S{face}")
+            side = SURFACES[corners][face - 1]
+            found.append(np.asarray(block.data)[np.asarray(own, dtype=int)][:, side])
     return found
-
-
-def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
-    """Return the cells of a meshed solid with the facets of its interfaces' faces."""
-    tags, places, _ = model.mesh.getNodes()
-    nodes = model.mesh.getElementsByType(TETRAHEDRON, solid)[1].reshape(-1, 4).astype(int)
-    if not len(nodes):
-        raise InputError("its volume has no cells")
-    used, cells = np.unique(nodes, return_inverse=True)
-    number = np.full(int(tags.max()) + 1, -1)
-    number[used] = np.arange(len(used))
-    points = np.empty((len(number), 3))
-    points[tags.astype(int)] = places.reshape(-1, 3)
-    nodes_of = model.mesh.getElementsByType
-    facets = [
-        number[np.concatenate([[], *(nodes_of(TRIANGLE, face)[1] for face in own)]).astype(int)]
-        for own in (interfaces[group] for group in ENDS)
-    ]
-    inboard, outboard = (one.reshape(-1, 3) for one in facets)
-    return Tetrahedra(points[used], cells.reshape(-1, 4), inboard, outboard)
-
-
-class InterfaceMesh(Protocol):
-    """Cells of an arm in the plane or in space, with the facets of its interfaces."""
-
-    @property
-    def points(self) -> np.ndarray:
-        """(n, d) in the arm's frame, m."""
-
-    @property
-    def cells(self) -> np.ndarray:
-        """(m, c) nodes of triangles, tetrahedra or hexahedra."""
-
-    @property
-    def inboard(self) -> np.ndarray: ...  # (k, f) nodes of the interfaces' facets
-
-    @property
-    def outboard(self) -> np.ndarray: ...
-
-
-def msh_bytes(mesh: InterfaceMesh) -> bytes:
-    """Return the .msh file that `arms.mesh` reads back, on this process alone."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
-        add_cells(gmsh.model, mesh)
-        gmsh.option.setNumber("Mesh.Binary", 1)
-        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
-        path = Path(folder) / "solid.msh"
-        gmsh.write(str(path))
-        return path.read_bytes()
-
-
-def add_cells(model: Any, mesh: InterfaceMesh) -> None:
-    """Make a mesh and its interfaces a model of Gmsh."""
-    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
-    cell, side = kinds[mesh.cells.shape[1]]
-    dim = mesh.points.shape[1]
-    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
-    model.add("solid")
-    solid = model.addDiscreteEntity(dim)
-    model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
-    model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
-    model.addPhysicalGroup(dim, [solid], DESIGN)
-    model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
-    named = [(INBOARD, NAMES[INBOARD], mesh.inboard), (OUTBOARD, NAMES[OUTBOARD], mesh.outboard)]
-    if isinstance(mesh, Tetrahedra):
-        named += [(FURTHER + k, name, own) for k, (name, own) in enumerate(mesh.further.items())]
-    for group, name, facets in named:
-        face = model.addDiscreteEntity(dim - 1)
-        model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
-        model.addPhysicalGroup(dim - 1, [face], group)
-        model.setPhysicalName(dim - 1, group, name)

@@ -19,7 +19,7 @@ GRID_ROUNDING_SHARE = 1e-9  # of a cell: a node is so near to its line of the gr
 # Of an interface's radius, up to which sides belong to it: those as far from its point do, too.
 INTERFACE_REACH_RATIO = 1.0 + 1e-9
 
-# -- hull_file -------------------------------------------------------------------------------
+# -- hollow ----------------------------------------------------------------------------------
 
 # Of a hollow link's length: how far beside a station the surface is cut, so that no node lies in
 # the plane; and of its height, up to which two crossings of a ray are one edge's.
@@ -67,12 +67,10 @@ FILE_CELL_BYTES = {
 
 # -- geometry --------------------------------------------------------------------------------
 
+INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
 END_FACE_COSINE_GAP = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
 SIDE_FACE_COSINE = 1e-6  # to z, of a side face's normal: rounding of splines
-FACES_EDGE_ANGLE = math.radians(40.0)  # between triangles, from which on it parts two faces
-LOST_VOLUME_SHARE = 0.1  # largest one that flat cells may miss at curved faces
-INTERFACE_AREA_SHARE = 0.5  # of a face, from which on it is the interface's
 
 # -- sections: incompatible hexahedra, against beam theory (test_uniform_members.py) -------------
 
@@ -96,9 +94,11 @@ WORD_CHARACTERS_LIMIT = 250  # of a name, number or text; Gmsh's parser has buff
 LINE_CHARACTERS_LIMIT = 1000  # of a line that Gmsh sees; it reads blocks of 8192
 UNREAD_STATEMENTS_LIMIT = 1000  # of a .geo file that Gmsh gave up: no file of an arm has more
 
-# -- abaqus, bores ---------------------------------------------------------------------------
+# -- solid_cells -----------------------------------------------------------------------------
 
-INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 # By how much nodes may be off a bore's radius: CAD programs place them to 1e-6, converters in
 # single precision to 1e-4, facets of stl files with 12 sides by 3 %.
 BORE_RADIUS_SHARE = 0.02
+FACES_EDGE_ANGLE = math.radians(40.0)  # between triangles, from which on it parts two faces
+LOST_VOLUME_SHARE = 0.1  # largest one that flat cells may miss at curved faces
+INTERFACE_AREA_SHARE = 0.5  # of a face, from which on it is the interface's

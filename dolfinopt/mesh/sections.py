@@ -198,3 +198,12 @@ I_SECTION = Section(
     _beam_wall,
     _beam,
 )
+KINDS = {  # by the machine's dimension
+    2: {"solid bar": FLAT_BAR},
+    3: {
+        "solid bar": SOLID_BAR,
+        "rectangular tube": RECTANGULAR_TUBE,
+        "round tube": ROUND_TUBE,
+        "I section": I_SECTION,
+    },
+}

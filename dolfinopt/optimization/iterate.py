@@ -11,7 +11,6 @@ from mpi4py import MPI
 
 from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.optimization.acceptance import Search, judge_step, leaps, learnt, promise
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
     DEARER_ITERATIONS,
@@ -31,7 +30,16 @@ from dolfinopt.optimization.measured import (
     STRICT_ATTEMPTS,
     STRICT_STEPS,
 )
-from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
+from dolfinopt.optimization.mma import (
+    MMAState,
+    Search,
+    initial_state,
+    judge_step,
+    leaps,
+    learnt,
+    mma_step,
+    promise,
+)
 from dolfinopt.optimization.problem import (
     EvaluatedDesign,
     Evaluator,
@@ -52,7 +60,7 @@ class Iterate:
 
     Attributes:
         x, state: this rank's design variables (n,), and what MMA remembers.
-        convexity: (1 + m,) of objective and constraints, see `acceptance`; empty at first.
+        convexity: (1 + m,) of objective and constraints, see `mma`; empty at first.
         stage: what is held while steps are compared.
         search: how the next step is sought.
         anchor: (n,) the best design since the projection became steeper.

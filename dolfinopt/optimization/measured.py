@@ -4,7 +4,7 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 """
 
 
-# -- Which steps are taken (acceptance, iterate) --
+# -- Which steps are taken (mma, iterate) --
 
 # Of the promised fall of the merit: what a step must bring; with frozen loads any fall does.
 ACCEPTED_FALL_SHARE = 0.05

@@ -11,8 +11,8 @@ import numpy as np
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
-from dolfinopt.optimization.acceptance import Search
 from dolfinopt.optimization.measured import IMPROVED_SHARE
+from dolfinopt.optimization.mma import Search
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.responses.order_selection import OrderSelection
 

@@ -16,7 +16,7 @@ from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
-from dolfinopt.optimization.acceptance import Search
+from dolfinopt.optimization.mma import Search
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.optimization.state import Best, FurtherMemory, HistoryRow, IterateMemory, Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.contacts import Contacts
-from dolfinopt.density.members import Width, Widths, thinnest, thinnest_solid
+from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
@@ -473,23 +473,7 @@ def _widths(
     whole, cut, stays = (gather_cells(partition, one) for one in (corners, solid, fixed))
     asked = gather_arms(partition, asked)
     with together(partition.world):
-        return {k: _thinnest(whole[k], cut[k], stays[k], asked[k]) for k in whole}
-
-
-def _thinnest(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: float) -> Widths:
-    """Return the widths of one arm; cells without corners in the plane are left out."""
-    known = np.isfinite(corners).all(axis=(1, 2))
-    corners, solid, fixed = corners[known], solid[known], fixed[known]
-    plane, middle = corners.shape[2] == 2, corners.mean(axis=1)
-    found = thinnest(corners, solid) if plane else thinnest_solid(corners, solid, asked)
-
-    def placed(width: Width | None) -> Width | None:
-        if width is None:
-            return None
-        away = np.linalg.norm(middle - width.place, axis=1)
-        return replace(width, fixed=bool(fixed[np.argmin(away)]))
-
-    return placed(found[0]), placed(found[1])
+        return {k: widths_of(whole[k], cut[k], stays[k], asked[k]) for k in whole}
 
 
 def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.output.views import ArmView, gather_views
-from dolfinopt.part.files.scene_file import scene_data, toml_text
+from dolfinopt.part.folder import scene_data, toml_text
 from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile

@@ -18,14 +18,13 @@ from scipy.spatial import cKDTree
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.mesh.geometry import TENSOR, msh_bytes
 from dolfinopt.mesh.hollow import Hull
 from dolfinopt.mesh.sections import Member
-from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.solid.stress import APART, SHARP
 from dolfinopt.part.solid.surface import Surface, check_surface
-from dolfinopt.part.stress import CornerStress, mean_at_corners
+from dolfinopt.part.stress import EDGE_DISTANCE, REENTRANT_SINE, CornerStress, mean_at_corners
+from dolfinopt.part.workshop_files import MM, three_mf_bytes, triangle_bytes
 from dolfinopt.scene.tables.arms import WALL_KEYS
 
 if TYPE_CHECKING:
@@ -170,15 +169,15 @@ class HollowPart:
         That is where the wall meets the rigid interfaces, and along inner edges.
         """
         x = self.hull.outer[:, 0, 0]
-        far = max(margin, APART * float(np.median(np.diff(x))))
+        far = max(margin, EDGE_DISTANCE * float(np.median(np.diff(x))))
         found = (places[:, 0] >= x[0] + far) & (places[:, 0] <= x[-1] - far)
         # The mitre of a section that turns by 2 a is 1 / cos a.
         turn = 2.0 * np.arccos(1.0 / np.linalg.norm(self.hull.inward, axis=2).clip(1.0))
-        edges = np.sin(turn) > SHARP
+        edges = np.sin(turn) > REENTRANT_SINE
         if edges.any():
             inner = (self.hull.outer + self.thickness[:, :, None] * self.hull.inward)[edges]
             across = cKDTree(inner[:, 1:]).query(places[:, 1:])[0]
-            found &= across > APART * self.thickness.min()
+            found &= across > EDGE_DISTANCE * self.thickness.min()
         return np.asarray(found)
 
     def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:

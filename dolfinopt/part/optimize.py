@@ -4,7 +4,7 @@ Variables are the normal moves of the free outlines' control points (`free_outli
 that of the parts on meshes along their curves, and gradients are those by the places of the nodes
 (`responses.products`). A step minimises the method of moving asymptotes' approximation of
 the merit f0 + c sum_i max(0, f_i) within a trust region, and is taken if the merit falls as
-promised, see `optimization.acceptance`. What was found is judged on a finer mesh; limits that are
+promised, see `optimization.mma`. What was found is judged on a finer mesh; limits that are
 not kept there are tightened by what is missing, and the iterations go on.
 Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 """
@@ -21,9 +21,8 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.optimization.acceptance import Promise, judge_step
 from dolfinopt.optimization.measured import LIMIT_PRICE
-from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
+from dolfinopt.optimization.mma import MMAState, Promise, initial_state, judge_step, mma_step
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts

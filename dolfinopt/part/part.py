@@ -255,11 +255,11 @@ def _made(
 
         return make_hollow_part(mesh, design[0], curves)
     if scene.arms[index].is_solid:
-        from dolfinopt.part.solid.domain import domain_in_scene
+        from dolfinopt.part.domain import domain_in_scene
         from dolfinopt.part.solid.part import make_solid_part
 
         return make_solid_part(domain_in_scene(scene, index, mesh, *design), curves)
-    from dolfinopt.part.plane.domain import domain_of
+    from dolfinopt.part.domain import domain_of
     from dolfinopt.part.plane.part import make_part
 
     return make_part(domain_of(scene, index, mesh, *design), curves)

@@ -3,7 +3,8 @@
 In these cells stress is linear. At a node of the outline it is the mean of the cells beside the
 outline that share the node, weighted by their areas or volumes: of second order, where the stress
 at centres is of first order. Where a rigid interface ends at a free edge, and at re-entrant
-corners, stress has no limit: it grows with every refinement, and what is found there says nothing.
+corners and edges, stress has no limit: it grows with every refinement, and what is found there says
+nothing.
 Source: Williams (1952), doi:10.1115/1.4010553.
 """
 
@@ -16,9 +17,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
+from scipy.spatial import cKDTree
 
 from dolfinopt.fem.stress import LoadFields, stress_operator
 from dolfinopt.mesh import compat
+from dolfinopt.mesh.checks import facet_corners
+from dolfinopt.part.mesh import CORNER
+from dolfinopt.part.plane.curves import Shape, direction
+from dolfinopt.part.solid.surface import distance_to_faces
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
     PointStress,
@@ -33,12 +39,15 @@ from dolfinopt.responses.stress import (
 from dolfinopt.responses.stress_report import ArmStress, Peak
 
 if TYPE_CHECKING:
+    from shapely import Geometry
+
     from dolfinopt.arms.arm import Arm
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.fem.stress import LoadFields
+    from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.part import Part
     from dolfinopt.scene.tables.objective import Objective
-
 
 HOT = 0.8  # of the largest stress, from which on a place is worth a finer mesh
 SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
@@ -201,3 +210,145 @@ class OutlineStress(Stress):
         part = self._parts[index]
         found = part.stress(state, fields)
         return found.counted(part.regular(found.places, self.options.stress_margin))
+
+
+# -- in the plane: on the outline, away from singular points -----------------------------------
+
+
+TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
+# From a singular point, in cells of the design: the centre of the design's cell in such a corner,
+# where its stress is known, is as far away.
+CORNER_DISTANCE = np.sqrt(0.5)
+
+
+def singular_points(shape: Shape) -> np.ndarray:
+    """Return re-entrant corners, and where interfaces end (n, 2), m."""
+    found = []
+    for loop in shape.loops:
+        for before, after in zip([loop[-1], *loop[:-1]], loop):
+            a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
+            turn = np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)
+            if turn < -CORNER or before.label != after.label:
+                found.append(after.curve.start)
+    return np.array(found).reshape(-1, 2)
+
+
+def interface_lines(shape: Shape) -> Geometry:
+    """Return the curves of both interfaces as polylines (shapely)."""
+    import shapely
+
+    t = np.linspace(0.0, 1.0, 65)
+    return shapely.union_all(
+        [shapely.LineString(piece.curve.at(t)) for piece in shape.pieces if piece.label]
+    )
+
+
+def is_regular_in_plane(shape: Shape, cell: float, places: np.ndarray, margin: float) -> np.ndarray:
+    """Return which places (n, 2) are away from singular points and interfaces (n,).
+
+    Args:
+        shape: of the part, m.
+        cell: size of the design's cells, m.
+        places: m.
+        margin: from the interfaces, m.
+    """
+    import shapely
+
+    far = np.ones(len(places), dtype=bool)
+    if len(singular := singular_points(shape)):
+        gaps = np.linalg.norm(places[:, None] - singular, axis=2)
+        far = gaps.min(axis=1) >= CORNER_DISTANCE * cell
+    if margin > 0.0:
+        at = shapely.points(places)
+        far &= shapely.distance(at, interface_lines(shape)) >= margin
+    return far
+
+
+def corner_stress_in_plane(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+    """Return the stress of a design in the plane.
+
+    Of a node of the outline the triangles beside the outline count: others know less of it.
+    """
+    mesh = state.mesh
+    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
+    count = len(mesh.mesh.geometry.x)
+    ends = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
+    _, which, number = np.unique(ends, return_inverse=True, return_counts=True)
+    rim = (number == 1)[which.ravel()].reshape(-1, 3)
+    outer = np.zeros(count, dtype=bool)
+    outer[corners[rim]] = outer[np.roll(corners, -1, axis=1)[rim]] = True
+    return mean_at_corners(
+        state, fields, TRIANGLE, rim.any(axis=1)[:, None] | ~outer[corners], outer
+    )
+
+
+# -- in space: on the surface, away from singular edges ----------------------------------------
+
+
+TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)])  # of the reference tetrahedron
+# From a singular edge, in cells of the design: the centre of the design's cell in such a corner,
+# where its stress is known, is as far away.
+EDGE_DISTANCE = np.sqrt(0.75)
+REENTRANT_SINE = np.sin(np.radians(40.0))  # of the turn at a re-entrant edge
+SAMPLES = 4  # of an edge, for distances
+
+
+def is_regular_in_space(domain: SolidDomain, places: np.ndarray, margin: float) -> np.ndarray:
+    """Return which places (n, 3) are away from singular edges and interfaces (n,).
+
+    Args:
+        domain: the arm.
+        places: m.
+        margin: from the interfaces, m.
+    """
+    far = np.ones(len(places), dtype=bool)
+    if len(edges := singular_edges(domain)):
+        share = np.linspace(0.0, 1.0, SAMPLES + 1)[:, None, None]
+        samples = ((1.0 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
+        far = cKDTree(samples).query(places)[0] >= EDGE_DISTANCE * domain.cell
+    if margin > 0.0:
+        for faces in (domain.inboard, domain.outboard):
+            far &= distance_to_faces(places, faces) >= margin
+    return far
+
+
+def singular_edges(domain: SolidDomain) -> np.ndarray:
+    """Return the edges (n, 2, 3), m, around interfaces and re-entrant ones of the arm's faces."""
+    faces = domain.own
+    count = faces.shape[1]
+    points, nodes = np.unique(faces.reshape(-1, 3), axis=0, return_inverse=True)
+    nodes = nodes.reshape(-1, count)
+    centre, normal = faces.mean(axis=1), domain.outward
+    kind = np.zeros(len(faces), dtype=int)
+    for value, some in ((1, domain.inboard), (2, domain.outboard)):
+        kind[cKDTree(some.mean(axis=1)).query(centre)[0] < 1e-9 * domain.cell] = value
+    ends = np.stack([nodes, np.roll(nodes, -1, axis=1)], axis=2).reshape(-1, 2)
+    face = np.repeat(np.arange(len(faces)), count)
+    key = np.sort(ends, axis=1) @ [len(points), 1]
+    order = np.argsort(key, kind="stable")
+    pair = np.flatnonzero(key[order][1:] == key[order][:-1])
+    one, other = face[order[pair]], face[order[pair + 1]]
+    # Re-entrant: the neighbour rises above the plane of the face.
+    rise = (normal[one] * (centre[other] - centre[one])).sum(axis=1)
+    turn = np.linalg.norm(np.cross(normal[one], normal[other]), axis=1)
+    size = np.linalg.norm(centre[other] - centre[one], axis=1)
+    sharp = (turn > REENTRANT_SINE) & (rise > 0.1 * size)
+    found = ends[order[pair]][sharp | (kind[one] != kind[other])]
+    return np.asarray(points[found])
+
+
+def corner_stress_in_space(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+    """Return the stress of a design in space, of the cells with a facet there."""
+    mesh = state.mesh
+    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
+    count = len(mesh.mesh.geometry.x)
+    sides = np.array(facet_corners(3, 4))
+    facets = np.sort(corners[:, sides], axis=2) @ np.array([count * count, count, 1])
+    _, which, number = np.unique(facets, return_inverse=True, return_counts=True)
+    rim = (number == 1)[which.ravel()].reshape(facets.shape)
+    outer = np.zeros(count, dtype=bool)
+    touches = np.zeros(corners.shape, dtype=bool)  # a corner of one of its own outer facets
+    for facet, side in enumerate(sides):
+        touches[np.ix_(rim[:, facet], side)] = True
+    outer[corners[touches]] = True
+    return mean_at_corners(state, fields, TETRAHEDRON, touches | ~outer[corners], outer)

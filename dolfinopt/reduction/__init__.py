@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import AdjointFields, Basis, Options
-from dolfinopt.reduction.free_arm import by_frame_fields, frame_fields
+from dolfinopt.reduction.basis import AdjointFields, Basis, Options, by_frame_fields, frame_fields
 from dolfinopt.reduction.gramian import balanced
 from dolfinopt.reduction.krylov import krylov, krylov_adjoint
 from dolfinopt.reduction.modal import craig_bampton, craig_bampton_adjoint, modal, modal_adjoint

@@ -1,12 +1,26 @@
-"""The reduced basis of one arm, and what its methods share."""
+"""The reduced basis of one arm, and what its methods share: the clamped-free arm, subspaces."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
+from dolfinopt.parallel import on_root
+from dolfinopt.reduction.eigenproblem import Operators, Pencil, by_column, interior_operators
+from dolfinopt.reduction.measured import (
+    DEFLATION_SHARE,
+    INDEPENDENT_ENERGY_RATIO,
+    ORTHONORMAL_ROUNDS_LIMIT,
+    ORTHONORMALITY_ERROR,
+    ROUNDING_LENGTH_SHARE,
+)
 
 
 @dataclass(frozen=True)
@@ -75,3 +89,391 @@ def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
         weight += np.stack([0.3 * z, -7.0 * z, 1.3 + 7.0 * y], axis=1)
     mean = arm.comm.allreduce(np.einsum("ni,nik->k", weight, MV))
     return np.where(mean < 0.0, -1.0, 1.0)
+
+
+# -- the clamped-free arm, outboard interface rigid: its operators, inverse and inputs ---------
+
+
+# Of `frame_fields` among the rigid motions, by the number of directions.
+FRAME_ORDER = {2: [1, 2, 0], 3: [1, 2, 5, 4, 3, 0]}
+
+Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
+
+
+class FreeArm:
+    """Inverse of T'KT by block elimination with the factorisation of the interior.
+
+    With constraint modes Psi and Schur complement S, (T'KT) z = f is solved by
+    z_b = S^-1 (f_b + Psi' f_I),  z_I = K_II^-1 f_I + Psi z_b.
+
+    Attributes:
+        arm: with its design set.
+        psi: (num_interior, b) interior rows of the constraint modes.
+        schur_inverse: (b, b) compliance of the outboard interface.
+    """
+
+    def __init__(self, arm: ElasticArm):
+        self.arm = arm
+        modes = arm.constraint_modes()
+        self.coupling, self.corner, self.psi = modes.coupling, modes.corner, modes.interior
+        self.schur_inverse = np.linalg.inv(modes.stiffness)
+
+    def solve(self, right: Rows) -> np.ndarray:
+        """Return (T'KT)^-1 right as a nodal field (n_nodes, d, k); no solve for zero rows."""
+        interior, outboard = right
+        if self.arm.comm.allreduce(int(interior.any())):
+            lift = self.arm.comm.allreduce(self.psi.T @ interior)
+            z = self.schur_inverse @ (outboard + lift)
+            return self.arm.expand(self.arm.solve(interior) + self.psi @ z, z)
+        z = self.schur_inverse @ outboard
+        return self.arm.expand(self.psi @ z, z)
+
+
+def interface_loads(free: FreeArm) -> Rows:
+    """Return unit forces and moments (N, N m) at the outboard interface."""
+    b = len(free.corner)
+    return np.zeros((free.arm.num_interior, b)), np.eye(b)
+
+
+def frame_loads(free: FreeArm) -> Rows:
+    """Return M times `frame_fields`: inertia loads of unit accelerations of the frame."""
+    return free.arm.restrict(free.arm.mass_times(frame_fields(free.arm)))
+
+
+def frame_fields(arm: ElasticArm) -> np.ndarray:
+    """Return the rigid motions [1_y, S X, 1_x] of the frame (n_nodes, d, b).
+
+    Transverse ones first: they bend the arm. In space 1_y, 1_z, e_z x X, e_y x X, e_x x X, 1_x.
+    """
+    order = FRAME_ORDER[arm.mesh.dim]
+    return np.ascontiguousarray(rigid_motions(arm.points)[:, :, order])
+
+
+def by_frame_fields(by: np.ndarray) -> np.ndarray:
+    """Return the derivatives (n_nodes, d) by the nodes, given those by `frame_fields`."""
+    return by_rigid_motions(by[:, :, np.argsort(FRAME_ORDER[by.shape[1]])])
+
+
+class FreeOperators:
+    """T'KT, T'MT and the inverse of the former as operators that are never assembled.
+
+    Vectors are the owned interior dofs; the b outboard coordinates follow those of the last
+    rank.
+    """
+
+    def __init__(self, arm: ElasticArm, carried: np.ndarray | None = None):
+        """Set up; `carried` (b, b) is the inertia of what is fixed to the outboard interface."""
+        self.arm = arm
+        self.last = arm.comm.rank == arm.comm.size - 1
+        self.free = FreeArm(arm)
+        self._m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
+        self._m_corner = m_corner if carried is None else m_corner + carried
+        self.rows = arm.num_interior + (len(self.free.corner) if self.last else 0)
+        iterative = arm.substructure.interior.is_iterative
+        operators = self._operators(interior_operators(arm)) if iterative else None
+        self.pencil = Pencil(
+            arm, self.solve, self.mass_times, self.stiffness_times, self.rows, operators
+        )
+
+    def _operators(self, inner: Operators) -> Operators:
+        """Return those for columns, with what the interior's approximate inverse gives."""
+
+        def stiffness(V: np.ndarray) -> np.ndarray:
+            product = inner.stiffness(self.split(V)[0])
+            return self._bordered(product, V, self.free.coupling, self.free.corner)
+
+        def precondition(R: np.ndarray) -> np.ndarray:
+            return self._eliminated(inner.precondition, R)
+
+        return Operators(
+            self.rows,
+            stiffness,
+            lambda V: by_column(self.mass_times, V),
+            precondition,
+            inner.total,
+            inner.comm,
+        )
+
+    def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the interior rows and the outboard coordinates (b, ...), the latter everywhere."""
+        outboard = rows[self.arm.num_interior :] if self.last else None
+        if self.arm.comm.size > 1:
+            outboard = self.arm.comm.bcast(outboard, root=self.arm.comm.size - 1)
+        assert outboard is not None
+        return rows[: self.arm.num_interior], outboard
+
+    def joined(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+        """Return the vector of interior rows and outboard coordinates."""
+        return np.concatenate([interior, outboard]) if self.last else interior
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """Return (T'KT)^-1 right."""
+        return self._eliminated(self.arm.interior_inverse, right)
+
+    def _eliminated(
+        self, inverse: Callable[[np.ndarray], np.ndarray], right: np.ndarray
+    ) -> np.ndarray:
+        """Return (T'KT)^-1 right, given what stands for the inverse of the interior."""
+        interior, outboard = self.split(right)
+        lift = self.arm.comm.allreduce(self.free.psi.T @ interior)
+        tip = self.free.schur_inverse @ (outboard + lift)
+        return self.joined(inverse(interior) + self.free.psi @ tip, tip)
+
+    def stiffness_times(self, rows: np.ndarray) -> np.ndarray:
+        """Return T'KT times a vector."""
+        inner = self.arm.interior_stiffness_times(self.split(rows)[0])
+        return self._bordered(inner, rows, self.free.coupling, self.free.corner)
+
+    def mass_times(self, rows: np.ndarray) -> np.ndarray:
+        """Return T'MT times a vector."""
+        inner = self.arm.interior_mass_times(self.split(rows)[0])
+        return self._bordered(inner, rows, self._m_coupling, self._m_corner)
+
+    def _bordered(
+        self, inner: np.ndarray, rows: np.ndarray, coupling: np.ndarray, corner: np.ndarray
+    ) -> np.ndarray:
+        """Return [A_II, A_Ib; A_Ib', A_bb] times a vector, given A_II times its interior."""
+        interior, outboard = self.split(rows)
+        lower = self.arm.comm.allreduce(coupling.T @ interior)
+        return self.joined(inner + coupling @ outboard, lower + corner @ outboard)
+
+
+# -- subspaces orthonormal in the mass matrix: block Gram-Schmidt, block Arnoldi, Ritz vectors -
+
+
+def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return left . right (k, l), summed over the ranks, one of them a product with K or M."""
+    rows = left.shape[0] * left.shape[1]
+    return total(arm, left.reshape(rows, left.shape[2]).T @ right.reshape(rows, right.shape[2]))
+
+
+def total(arm: ElasticArm, part: Any) -> Any:
+    """Return the sum over the arm's ranks; without the detour through MPI on a single one."""
+    return part if arm.comm.size == 1 else arm.comm.allreduce(part)
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """W[kept] = [V, Q] coefficients; what is not kept lies in the span of V and Q.
+
+    Attributes:
+        Q, MQ: (n_nodes, d, k) new columns, M-orthonormal and M-orthogonal to V; M times them.
+        coefficients: (columns of V + k, columns of W).
+        kept: (k,) the columns of W that were independent.
+    """
+
+    Q: np.ndarray
+    MQ: np.ndarray
+    coefficients: np.ndarray
+    kept: np.ndarray
+
+
+def orthonormalise(
+    arm: ElasticArm,
+    W: np.ndarray,
+    V: np.ndarray,
+    MV: np.ndarray,
+    deflation: float = DEFLATION_SHARE,
+) -> Expansion:
+    """Orthonormalise the columns of W against V and one another in the inner product of M.
+
+    Block Gram-Schmidt in two rounds, and more where the check at its end asks for them.
+    Source: Giraud et al., Numer. Math. 101 (2005) 87-100, doi:10.1007/s00211-005-0615-4.
+
+    Args:
+        arm: with its design set.
+        W: (n_nodes, d, k).
+        V, MV: (n_nodes, d, r) M-orthonormal, and M V.
+        deflation: share of a column's length below which its remainder is dropped.
+
+    Raises:
+        ConvergenceError: the columns do not become orthonormal.
+    """
+    size = np.sqrt(np.maximum(np.diag(dot(arm, W, arm.mass_times(W))), 0.0))
+    by_V = dot(arm, MV, W)
+    Q, R, kept = _qr(arm, W - combine(V, by_V), deflation * size)
+    if len(kept) == 0:
+        return Expansion(Q, Q, by_V, kept)
+    for _ in range(ORTHONORMAL_ROUNDS_LIMIT):
+        # Differences of nearly equal fields have lost the rigid motion of the interface.
+        Q = arm.expand(_interior(arm, Q), interface_coordinates(arm, Q))
+        h = dot(arm, MV, Q)
+        Q, again, still = _qr(arm, Q - combine(V, h), np.full(len(kept), ROUNDING_LENGTH_SHARE))
+        by_V, R, kept = by_V + h @ R, again @ R, kept[still]
+        MQ = arm.mass_times(Q)
+        overlap = dot(arm, MQ, np.concatenate([V, Q], axis=2))
+        goal = np.eye(V.shape[2] + len(kept))[V.shape[2] :]
+        if np.abs(overlap - goal).max(initial=0.0) <= ORTHONORMALITY_ERROR:
+            return Expansion(Q, MQ, np.vstack([by_V, R]), kept)
+    raise ConvergenceError(
+        f"arm {arm.mesh.name!r}: the vectors of the reduction do not become orthonormal; ask for "
+        "fewer reduction.coordinates or raise interpolation.floor"
+    )
+
+
+def _qr(
+    arm: ElasticArm, W: np.ndarray, least: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Q, R, kept with W[kept] = Q R[kept]; remainders up to `least` are dropped."""
+    n_nodes, dim, k = W.shape
+    columns = np.ascontiguousarray(W.reshape(dim * n_nodes, k).T)
+    Q, MQ = np.empty_like(columns), np.empty_like(columns)
+    R, kept = np.zeros((k, k)), list[int]()
+    for j, w in enumerate(columns):
+        n = len(kept)
+        for _ in range(2):
+            h = total(arm, MQ[:n] @ w)
+            w -= h @ Q[:n]
+            R[:n, j] += h
+        Mw = arm.mass_times(w.reshape(n_nodes, dim, 1)).ravel()
+        length = np.sqrt(max(total(arm, w @ Mw), 0.0))
+        if length <= least[j]:
+            continue
+        Q[n], MQ[n], R[n, j] = w / length, Mw / length, length
+        kept.append(j)
+    n = len(kept)
+    fields = np.ascontiguousarray(Q[:n].T).reshape(n_nodes, dim, n)
+    return fields, R[:n], np.array(kept, dtype=int)
+
+
+class InverseSpace:
+    """Block Krylov space of K^-1 M from given fields, grown by block Arnoldi.
+
+    K^-1 M V_j = V H_j, V' M V = I: with it (K - w^2 M) z = b is a small problem for any w.
+
+    Attributes:
+        V, MV: (n_nodes, d, r) with the newest block last.
+        H: (r, columns that K^-1 M was applied to).
+        start: (r_0, k) coefficients of the first fields in the first r_0 columns.
+    """
+
+    def __init__(self, free: FreeArm, first: np.ndarray, deflation: float):
+        """Begin with the fields `first` (n_nodes, d, k)."""
+        self.free, self.deflation = free, deflation
+        none = np.empty((*first.shape[:2], 0))
+        expansion = orthonormalise(free.arm, first, none, none, deflation)
+        self.V, self.MV, self.start = expansion.Q, expansion.MQ, expansion.coefficients
+        self.H = np.empty((self.V.shape[2], 0))
+
+    def extend(self) -> None:
+        """Apply K^-1 M to the newest block; nothing happens once the space is invariant."""
+        done = self.H.shape[1]
+        if done == self.V.shape[2]:
+            return
+        W = self.free.solve(self.free.arm.restrict(self.MV[:, :, done:]))
+        new = orthonormalise(self.free.arm, W, self.V, self.MV, self.deflation)
+        self.V = np.concatenate([self.V, new.Q], axis=2)
+        self.MV = np.concatenate([self.MV, new.MQ], axis=2)
+        H = np.zeros((self.V.shape[2], done + W.shape[2]))
+        H[: len(self.H), :done] = self.H
+        H[:, done:] = new.coefficients
+        self.H = H
+
+
+def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
+    """Return the basis of Ritz vectors of span V: K_r y = lambda M_r y, ascending.
+
+    M-orthonormal, with diagonal stiffness; they depend on the span alone, and are made to point
+    the same way on any mesh.
+
+    Args:
+        arm: with its design set.
+        V: (n_nodes, d, q) within the range of T.
+
+    Raises:
+        ConvergenceError: the columns of V are dependent.
+    """
+    energy, mass = arm.energy_matrix(V), dot(arm, V, arm.mass_times(V))
+    dependent = ConvergenceError(
+        f"arm {arm.mesh.name!r}: the vectors of the reduction are dependent; ask for fewer "
+        "reduction.coordinates or raise interpolation.floor"
+    )
+
+    def solved() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        length = np.sqrt(np.diag(energy))
+        try:
+            shares = np.linalg.eigvalsh(energy / np.outer(length, length))
+            if not shares[0] > INDEPENDENT_ENERGY_RATIO * shares[-1]:  # not a number included
+                raise dependent
+            inverse = np.linalg.inv(np.linalg.cholesky(energy))
+        except np.linalg.LinAlgError:
+            raise dependent from None
+        # The lowest frequencies are the largest of these, which keep all their digits.
+        mu, y = np.linalg.eigh(inverse @ (0.5 * (mass + mass.T)) @ inverse.T)
+        if not mu[0] > 0.0:  # not a number included
+            raise dependent
+        return inverse, mu, y
+
+    inverse, mu, y = on_root(arm.comm, solved)
+    y = (inverse.T @ y[:, ::-1]) / np.sqrt(mu[::-1])
+    # Stiffnesses differ by up to ten powers of ten, and y are as far from orthonormal as that.
+    none = np.empty((*V.shape[:2], 0))
+    V = orthonormalise(arm, combine(V, y), none, none).Q
+    outboard = interface_coordinates(arm, V)
+    V = arm.expand(_interior(arm, V), outboard)
+    MV = arm.mass_times(V)
+    sign = orient(arm, V, MV)
+    stiffness = np.diag(np.diag(arm.energy_matrix(V)))
+    start = np.empty((arm.num_interior, 0))
+    return Basis(V * sign, MV * sign, stiffness, outboard * sign, start)
+
+
+def _interior(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
+    """Return the owned interior rows (num_interior, k) of nodal fields."""
+    return field[arm.interior_nodes].reshape(arm.num_interior, field.shape[2])
+
+
+def interface_coordinates(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
+    """Return the coordinates (b, k) of the outboard interface in nodal fields that keep it rigid.
+
+    Args:
+        arm: the field's.
+        field: (n_nodes, d, k).
+    """
+    rigid = arm.rigid[arm.outboard].reshape(-1, arm.rigid.shape[2])
+    moved = field[arm.outboard].reshape(len(rigid), field.shape[2])
+    # A node that several ranks know counts several times: the fit is exact all the same.
+    normal, right = arm.comm.allreduce(rigid.T @ rigid), arm.comm.allreduce(rigid.T @ moved)
+    return np.linalg.solve(normal, right)
+
+
+def solve_at(free: FreeArm, omega: float, right: Rows, tolerance: float, most: int) -> np.ndarray:
+    """Solve (T'KT - omega^2 T'MT) z = right for all columns at once; a field (n_nodes, d, k).
+
+    Block GMRES preconditioned with the factor of K at hand, in the inner product of M. Above the
+    first natural frequency K - omega^2 M is indefinite, but the preconditioned eigenvalues
+    1 - omega^2 / lambda cluster at 1: at 1.1, 4, 13 and 43 times the first frequency each column
+    takes 5, 6, 8 and 10 solves. A factor LDL' of the interior of K - omega^2 M would be dearer, and
+    its constraint modes are infinite at the natural frequencies of the arm held at both ends.
+
+    Args:
+        free: the arm with its factor.
+        omega: rad/s; 0 needs one solve.
+        right: see `FreeArm.solve`.
+        tolerance: of the residual, relative, after multiplication by K^-1, norm of M.
+        most: steps.
+
+    Raises:
+        ConvergenceError: omega is too close to a natural frequency.
+    """
+    first = free.solve(right)
+    if omega == 0.0:
+        return first
+    space = InverseSpace(free, first, 1e-13)
+    for _ in range(most):
+        space.extend()
+        rows, columns = space.H.shape
+        operator = np.eye(rows, columns) - omega**2 * space.H
+        goal = np.zeros((rows, first.shape[2]))
+        goal[: len(space.start)] = space.start
+        y = np.linalg.lstsq(operator, goal, rcond=None)[0]
+        residual = np.linalg.norm(operator @ y - goal, axis=0)
+        if (residual <= tolerance * np.linalg.norm(goal, axis=0)).all():
+            return combine(space.V[:, :, :columns], y)
+        if rows == columns:
+            break
+    raise ConvergenceError(
+        f"arm {free.arm.mesh.name!r}: the response at {omega / (2.0 * np.pi):g} Hz does not "
+        "converge: too close to a natural frequency, or too far above the first ones; move or "
+        "lower reduction.shifts"
+    )

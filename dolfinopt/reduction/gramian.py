@@ -15,13 +15,17 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.parallel import on_root
-from dolfinopt.reduction.basis import Basis, Options
-from dolfinopt.reduction.free_arm import (
+from dolfinopt.reduction.basis import (
+    Basis,
     FreeArm,
+    InverseSpace,
+    Options,
     Rows,
+    dot,
     frame_fields,
     frame_loads,
     interface_loads,
+    ritz,
 )
 from dolfinopt.reduction.measured import (
     KRYLOV_BLOCKS_LIMIT,
@@ -29,7 +33,6 @@ from dolfinopt.reduction.measured import (
     RESPONSE_RANK_SHARE,
     RESPONSE_TOLERANCE,
 )
-from dolfinopt.reduction.subspace import InverseSpace, dot, ritz
 
 
 def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:

@@ -14,16 +14,22 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import AdjointFields, Basis, Options
-from dolfinopt.reduction.free_arm import (
+from dolfinopt.reduction.basis import (
+    AdjointFields,
+    Basis,
+    Expansion,
     FreeArm,
+    Options,
     Rows,
+    dot,
     frame_fields,
     frame_loads,
     interface_loads,
+    orthonormalise,
+    ritz,
+    solve_at,
 )
 from dolfinopt.reduction.measured import KRYLOV_BLOCKS_LIMIT, SHIFT_TOLERANCE
-from dolfinopt.reduction.subspace import Expansion, dot, orthonormalise, ritz, solve_at
 
 
 def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:

@@ -53,7 +53,7 @@ RESPONSE_RANK_SHARE = 1e-10
 # Part of the length of a vector of their Krylov space, below which its remainder is rounding.
 RESPONSE_DEFLATION_SHARE = 1e-12
 
-# -- subspace --------------------------------------------------------------------------------
+# -- basis -----------------------------------------------------------------------------------
 
 DEFLATION_SHARE = 1e-10  # of a column's length: a remainder below adds nothing but rounding
 # A second round leaves columns their length; what shrinks below this was rounding in the first.

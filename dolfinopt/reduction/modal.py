@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.reduction.basis import AdjointFields, Basis, Options, orient
+from dolfinopt.reduction.basis import AdjointFields, Basis, FreeOperators, Options, orient
 from dolfinopt.reduction.eigenproblem import complement_solve, interior_pencil, lowest_eigenpairs
-from dolfinopt.reduction.free_arm import FreeOperators
 
 
 def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -> Basis:

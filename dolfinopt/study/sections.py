@@ -28,16 +28,8 @@ from scipy.optimize import brentq, minimize
 
 from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import msh_bytes
-from dolfinopt.mesh.sections import (
-    FLAT_BAR,
-    I_SECTION,
-    RECTANGULAR_TUBE,
-    ROUND_TUBE,
-    SOLID_BAR,
-    Section,
-    member,
-)
+from dolfinopt.mesh.sections import KINDS, Section, member
+from dolfinopt.mesh.solid_cells import msh_bytes
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.responses.response import objective_of
@@ -57,15 +49,6 @@ from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "sections"  # of the study's files, and of the folder of the members' meshes
 DESIGN, SAME = "design", "same mass"
-KINDS = {  # by the machine's dimension
-    2: {"solid bar": FLAT_BAR},
-    3: {
-        "solid bar": SOLID_BAR,
-        "rectangular tube": RECTANGULAR_TUBE,
-        "round tube": ROUND_TUBE,
-        "I section": I_SECTION,
-    },
-}
 BAR_CELLS = (4, 8)  # of a bar in place of an arm from a file: over its smaller side, at most
 LEAST, MOST = 0.01, 0.95  # shares: thinner walls are foil, thicker ones leave a slit
 VARIED = {

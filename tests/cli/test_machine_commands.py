@@ -9,7 +9,7 @@ from mpi4py import MPI
 from runs import refusal, run
 from scipy.io import loadmat
 
-from dolfinopt.part.files.scene_file import toml_text
+from dolfinopt.part.folder import toml_text
 
 WORLD = MPI.COMM_WORLD
 QUICK = ["--set", "simulation.tolerance=1e-3"]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
 
-from dolfinopt.density.projection import preserving_threshold, project, robust_thresholds
+from dolfinopt.density.filter import preserving_threshold, project, robust_thresholds
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 X = np.concatenate([np.linspace(0.0, 1.0, 201), [1e-12, 1e-3, np.nextafter(1.0, 0.0)]])

@@ -22,7 +22,7 @@ from dolfinopt.exchange.urdf.robot import (
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
-from dolfinopt.mesh.geometry import TENSOR
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.machine import exponential, roll_pitch_yaw

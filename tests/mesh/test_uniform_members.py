@@ -9,7 +9,6 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes, check_cells
-from dolfinopt.mesh.geometry import TENSOR
 from dolfinopt.mesh.sections import (
     FLAT_BAR,
     I_SECTION,
@@ -18,6 +17,7 @@ from dolfinopt.mesh.sections import (
     SOLID_BAR,
     member,
 )
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.profiling import Profile
 from dolfinopt.study.sections import Members

@@ -7,9 +7,16 @@ from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.optimization.acceptance import Promise, judge_step, leaps, learnt, promise
 from dolfinopt.optimization.measured import ERODED_LIMIT_FACTOR
-from dolfinopt.optimization.mma import initial_state, mma_step
+from dolfinopt.optimization.mma import (
+    Promise,
+    initial_state,
+    judge_step,
+    leaps,
+    learnt,
+    mma_step,
+    promise,
+)
 from dolfinopt.optimization.problem import Evaluator, Problem, Stage, limits_at, problem_of
 from dolfinopt.responses.constraints import EXCESS, limits_by_column, tightest
 from dolfinopt.responses.response import constraints_of

@@ -13,8 +13,8 @@ from runs import TWO_ARM, assert_same_bits, command, environment, overrides, run
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.optimization.acceptance import Search
 from dolfinopt.optimization.iterate import Iterate
+from dolfinopt.optimization.mma import Search
 from dolfinopt.output import checkpoint
 from dolfinopt.parallel import on_root
 

@@ -10,7 +10,7 @@ from runs import scene
 
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.parallel import partition_arms
-from dolfinopt.part.plane.domain import Domain, domain_of
+from dolfinopt.part.domain import Domain, domain_of
 from dolfinopt.profiling import Profile
 
 ONE = ("arms.1.rigid=true", "design.projection=robust", "arms.0.passive=0.015")

@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 import shapely
 
-from dolfinopt.part.plane.curves import Arc, Line, Spline, curvature, direction, sampled
-from dolfinopt.part.plane.domain import loops, recognise
-from dolfinopt.part.plane.fit import Target, fit
+from dolfinopt.part.domain import loops, recognise
+from dolfinopt.part.plane.curves import (
+    Arc,
+    Line,
+    Spline,
+    Target,
+    curvature,
+    direction,
+    fit,
+    sampled,
+)
 
 pytestmark = pytest.mark.serial
 

@@ -7,8 +7,8 @@ from cutter import deepest_left
 
 from dolfinopt.part.part import Curves
 from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, direction
-from dolfinopt.part.plane.gauge import SPACINGS, thinnest_member, tight_places
 from dolfinopt.part.plane.part import make_part
+from dolfinopt.part.widths import SPACINGS, thinnest_member, tight_places
 
 pytestmark = pytest.mark.serial
 SIZE = 1e-4  # m, of rasters

@@ -274,7 +274,7 @@ def test_damaged_design_is_refused(tmp_path):
 
 def test_files_are_there_all_or_none(tmp_path, monkeypatch):
     """What a killed command has left goes; a disk that is full leaves no part.json."""
-    from dolfinopt.part.files import folder as files
+    from dolfinopt.part import folder as files
 
     made, folder = tmp_path / "made", tmp_path / "part"
     names = ["part.json", "part.toml", "arm1.svg"]

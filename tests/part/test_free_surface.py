@@ -38,7 +38,7 @@ def form(request, tmp_path_factory):
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", (cells, *COARSE))
     folder = write_run(tmp_path_factory.mktemp("solid") / "run", scene, request.param)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dolfinopt.part.solid.mesh.ACROSS", 1.0)  # large cells take little time
+        patch.setattr("dolfinopt.part.mesh.ACROSS", 1.0)  # large cells take little time
         (part,) = make_parts(scene, folder).values()
         problem = Problem(scene, {1: part}, {})
         yield folder, scene, part, problem, problem.evaluated({1: free_form(part, 1.0)}, {})
@@ -115,7 +115,7 @@ def test_a_surface_that_gmsh_cannot_mesh_keeps_its_triangles(form, monkeypatch):
     def lost(*_):
         raise InputError("Gmsh finds no faces")
 
-    monkeypatch.setattr("dolfinopt.part.solid.mesh.tetrahedra_of", lost)
+    monkeypatch.setattr("dolfinopt.part.mesh.tetrahedra_of", lost)
     part = moved.made
     meshes = mesh_parts({1: part})
     assert not meshes.coarse

@@ -12,7 +12,7 @@ from solids import solid_arm
 import dolfinopt as do
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_volumes, check_cells
-from dolfinopt.mesh.geometry import TENSOR
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.part.hollow import make_hollow_part
 from dolfinopt.part.part import Curves
 

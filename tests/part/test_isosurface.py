@@ -9,8 +9,8 @@ from solids import sixths
 
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.part.files.triangles import triangle_bytes
 from dolfinopt.part.solid.surface import surface_at
+from dolfinopt.part.workshop_files import triangle_bytes
 
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial

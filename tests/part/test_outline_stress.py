@@ -15,9 +15,12 @@ import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.part.check import simulate_parts
 from dolfinopt.part.part import make_parts, mesh_parts
-from dolfinopt.part.plane import stress as plane_stress
-from dolfinopt.part.solid import stress as solid_stress
-from dolfinopt.part.stress import OutlineStress, stress_of_parts
+from dolfinopt.part.stress import (
+    OutlineStress,
+    corner_stress_in_plane,
+    corner_stress_in_space,
+    stress_of_parts,
+)
 from dolfinopt.responses.response import Analysis
 
 pytestmark = pytest.mark.serial
@@ -44,7 +47,7 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     plane, kind = base != "spatial_arm", "objective.kind=stress"
     told = (f"arms.mesh='{tmp_path}/bar.geo'", *PLANE) if plane else SPACE
     scene = do.load_scene(ROOT / "demos" / f"{base}.toml", (*ROUGHLY, *told, kind))
-    stress = plane_stress.corner_stress if plane else solid_stress.corner_stress
+    stress = corner_stress_in_plane if plane else corner_stress_in_space
 
     def middle(length: float, places: np.ndarray, margin: float) -> np.ndarray:
         return (places[:, 0] > 0.15 * length) & (places[:, 0] < 0.85 * length)

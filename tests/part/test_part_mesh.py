@@ -6,9 +6,9 @@ from mpi4py import MPI
 from runs import scene
 
 from dolfinopt.arms.arm import Arm
+from dolfinopt.part.mesh import body_mesh, triangle_areas
 from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, Spline
-from dolfinopt.part.plane.mesh import body_mesh, triangle_areas
-from dolfinopt.part.plane.stress import corner_stress, singular_points
+from dolfinopt.part.stress import corner_stress_in_plane, singular_points
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial
@@ -103,7 +103,7 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
         arm = Arm(one, 0, MPI.COMM_SELF, Profile())
         assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=1e-6)
         arm.set_design(np.ones(arm.mesh.num_cells))
-        found_stress = corner_stress(arm.current)
+        found_stress = corner_stress_in_plane(arm.current)
         A, places = found_stress.A, found_stress.places
         q = arm.current.load_fields.V.shape[2]
         at_hole = np.linalg.norm(places - [0.5 * LENGTH, 0.0], axis=1) < 1.1 * RADIUS

@@ -16,18 +16,16 @@ from scipy.ndimage import gaussian_filter
 from solids import HEIGHT, LENGTH, THICKNESS, rasterised, solid_scene
 
 import dolfinopt as do
-import dolfinopt.part.solid.mesh as solid_mesh_module
+import dolfinopt.part.mesh as solid_mesh_module
 import dolfinopt.part.solid.part as solid_part_module
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.part.files.scene_file import scene_text
-from dolfinopt.part.files.step import solid_text
-from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.part.domain import domain_in_scene, solid_domain
+from dolfinopt.part.folder import scene_text
+from dolfinopt.part.mesh import mesh_size, solid_mesh
 from dolfinopt.part.plane.curves import Arc, Piece, Shape
 from dolfinopt.part.plane.part import shape_facets
-from dolfinopt.part.solid.domain import domain_in_scene, solid_domain
-from dolfinopt.part.solid.mesh import mesh_size, solid_mesh
 from dolfinopt.part.solid.part import make_solid_part, measured_widths
 from dolfinopt.part.solid.surface import (
     Surface,
@@ -40,6 +38,7 @@ from dolfinopt.part.solid.surface import (
     nodal_densities,
     outside,
 )
+from dolfinopt.part.workshop_files import MM, solid_text, three_mf_bytes, triangle_bytes
 from dolfinopt.scene.load import scene_from_dict
 
 trimesh = pytest.importorskip("trimesh")
@@ -479,7 +478,7 @@ def checked(tmp_path_factory):
                "constraints.deviation=0.001")  # fmt: skip
     folder = finished(tmp_path_factory.mktemp("solids") / "run", (windows,), *changes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("dolfinopt.part.solid.mesh.ACROSS", 1.0)  # large cells take little time
+        patch.setattr("dolfinopt.part.mesh.ACROSS", 1.0)  # large cells take little time
         run("part", folder)
     return folder, json.loads((folder / "part" / "part.json").read_text())
 

@@ -19,6 +19,7 @@ from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.reduction import Options, balanced, craig_bampton, krylov, modal
+from dolfinopt.reduction.basis import ritz
 from dolfinopt.reduction.eigenproblem import (
     Operators,
     Pencil,
@@ -28,7 +29,6 @@ from dolfinopt.reduction.eigenproblem import (
     lowest_eigenpairs,
 )
 from dolfinopt.reduction.gramian import quadrature
-from dolfinopt.reduction.subspace import ritz
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 LENGTH, HEIGHT, THICKNESS = 1.0, 0.06, 0.01  # m

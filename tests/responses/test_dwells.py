@@ -10,7 +10,7 @@ from runs import TWO_ARM, overrides, refused, run, scene, tomllib
 
 import dolfinopt as do
 from dolfinopt.dynamics.build import rests_of
-from dolfinopt.part.files.scene_file import toml_text
+from dolfinopt.part.folder import toml_text
 from dolfinopt.responses.constraints import deviation_limits, limits_of
 from dolfinopt.responses.response import find
 from dolfinopt.scene.load import scene_from_dict

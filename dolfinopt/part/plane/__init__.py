@@ -1,1 +1,1 @@
-"""Parts of plates: outline, curves, mesh, stress, and the free outline as variables."""
+"""Parts of plates: outline and curves, truss layouts, and the free outline as variables."""

@@ -23,6 +23,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
+from dolfinopt.part.mesh import BodyMesh, facing, normals
 from dolfinopt.part.plane.curves import (
     DEGREE,
     KINK,
@@ -34,7 +35,6 @@ from dolfinopt.part.plane.curves import (
     Spline,
     direction,
 )
-from dolfinopt.part.plane.mesh import BodyMesh, facing, normals
 from dolfinopt.part.plane.part import PlanePart
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
 from dolfinopt.part.plane.curves import sampled
-from dolfinopt.part.plane.domain import INBOARD, OUTBOARD, Domain
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon

@@ -11,18 +11,25 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.files.drawings import dxf_text, r12_text, svg_text
-from dolfinopt.part.files.step import face_text, solid_text
-from dolfinopt.part.files.triangles import MM, extruded_facets, triangle_bytes
+from dolfinopt.part.domain import Domain
+from dolfinopt.part.mesh import BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.domain import Domain
-from dolfinopt.part.plane.gauge import TightPlace, thinnest_member, tight_places
-from dolfinopt.part.plane.mesh import BodyMesh, body_mesh
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.simplify import simple_shape
-from dolfinopt.part.plane.stress import corner_stress, is_regular
 from dolfinopt.part.plane.trace import make_shape
+from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
+from dolfinopt.part.widths import TightPlace, thinnest_member, tight_places
+from dolfinopt.part.workshop_files import (
+    MM,
+    dxf_text,
+    extruded_facets,
+    face_text,
+    r12_text,
+    solid_text,
+    svg_text,
+    triangle_bytes,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
@@ -188,11 +195,11 @@ class PlanePart:
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 2) are away from where stress has no limit (n,)."""
-        return is_regular(self.shape, self.domain.cell, places, margin)
+        return is_regular_in_plane(self.shape, self.domain.cell, places, margin)
 
     def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the triangles of its arm."""
-        return corner_stress(state, fields)
+        return corner_stress_in_plane(state, fields)
 
 
 def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:

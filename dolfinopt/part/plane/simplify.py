@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dolfinopt.part.domain import Edge
 from dolfinopt.part.plane.curves import KINK, Arc, Line, Piece, Shape, direction
-from dolfinopt.part.plane.domain import Edge
-from dolfinopt.part.plane.gauge import polygon_of
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.trace import (
     AXIS,
@@ -32,6 +31,7 @@ from dolfinopt.part.plane.trace import (
     trace,
     whole,
 )
+from dolfinopt.part.widths import polygon_of
 
 SPACING = 0.2  # of points along the outline, cells
 SHARES = (0.9, 0.6, 0.4, 0.25, 0.15, 0.08)  # of the distance, one attempt after the other

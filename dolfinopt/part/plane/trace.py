@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
+from dolfinopt.part.domain import Edge
 from dolfinopt.part.plane.curves import (
     MIRROR,
     Arc,
@@ -23,13 +24,13 @@ from dolfinopt.part.plane.curves import (
     Piece,
     Shape,
     Spline,
+    Target,
     angle_between,
     direction,
+    fit,
     sampled,
     with_arcs,
 )
-from dolfinopt.part.plane.domain import Edge
-from dolfinopt.part.plane.fit import Target, fit
 from dolfinopt.part.plane.outline import Outline
 
 CORNER = np.radians(60.0)  # turn within `REACH` to either side that makes a corner of a free run

@@ -1,1 +1,1 @@
-"""Parts of solid arms: surface, mesh, stress."""
+"""Parts of solid arms: surface, and the free surface as variables."""

@@ -24,11 +24,10 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import Tetrahedra
+from dolfinopt.mesh.solid_cells import Tetrahedra
+from dolfinopt.part.domain import SolidDomain
+from dolfinopt.part.mesh import NEAR, PlateMesh, extruded, facing
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
-from dolfinopt.part.plane.mesh import facing
-from dolfinopt.part.solid.domain import SolidDomain
-from dolfinopt.part.solid.mesh import NEAR, PlateMesh, extruded
 from dolfinopt.part.solid.part import SolidPart, plate_part
 from dolfinopt.part.solid.surface import (
     Surface,

@@ -14,16 +14,12 @@ import numpy as np
 
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.geometry import Tetrahedra
-from dolfinopt.part.files.drawings import dxf_text
-from dolfinopt.part.files.step import solid_text
-from dolfinopt.part.files.triangles import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.mesh.solid_cells import Tetrahedra
+from dolfinopt.part.domain import SolidDomain
+from dolfinopt.part.mesh import filled, mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
-from dolfinopt.part.solid.domain import SolidDomain
-from dolfinopt.part.solid.mesh import filled, mesh_size, solid_mesh
-from dolfinopt.part.solid.stress import corner_stress, is_regular
 from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
@@ -36,7 +32,9 @@ from dolfinopt.part.solid.surface import (
     smooth_surface,
     with_volume,
 )
+from dolfinopt.part.stress import corner_stress_in_space, is_regular_in_space
 from dolfinopt.part.widths import Boundary, narrowest_place
+from dolfinopt.part.workshop_files import MM, dxf_text, solid_text, three_mf_bytes, triangle_bytes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
@@ -288,11 +286,11 @@ class SolidPart:
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 3) are away from where stress has no limit (n,)."""
-        return is_regular(self.domain, places, margin)
+        return is_regular_in_space(self.domain, places, margin)
 
     def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the tetrahedra of its arm."""
-        return corner_stress(state, fields)
+        return corner_stress_in_space(state, fields)
 
 
 def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart:

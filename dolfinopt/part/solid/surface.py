@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.part.solid.domain import SolidDomain
+from dolfinopt.part.domain import SolidDomain
 
 BELOW = 0.98  # the highest level, over the highest density
 APART = 0.005  # least difference of a node's density from the level

@@ -1,16 +1,23 @@
-"""STEP files (ISO 10303-21, AP214) of a shape: its face in z = 0, and the solid; in millimetres.
+"""Files for the workshop: STEP, DXF and SVG of a shape's curves, STL and 3MF of surfaces.
 
-A plate needs few kinds of entities, and only its own file can name edges and have the same bytes
-for the same shape.
+STEP (ISO 10303-21, AP214), of a shape its face in z = 0, and the solid: a plate needs few kinds of
+entities, and only its own file can name edges and have the same bytes for the same shape. 3MF is
+the 3D Manufacturing Format, core specification 1.3. All but STL are in millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import io
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Piece, Shape, Spline
+from dolfinopt.part.solid.surface import Surface
 
 MM = 1e3  # of a metre
 HALF = 0.9 * np.pi  # sweep of an arc from which on it is divided
@@ -55,7 +62,7 @@ def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -
     return file.text(name, f"{name}.step", "ADVANCED_BREP_SHAPE_REPRESENTATION", solid)
 
 
-# -- curves ------------------------------------------------------------------------------------
+# -- STEP: curves ------------------------------------------------------------------------------
 
 
 def _whole(loop: Iterable[Piece]) -> list[tuple[Curve, str]]:
@@ -85,7 +92,7 @@ def _cut(loop: Iterable[Piece]) -> list[tuple[Curve, str]]:
     ]
 
 
-# -- topology ----------------------------------------------------------------------------------
+# -- STEP: topology ----------------------------------------------------------------------------
 
 
 class _Loop:
@@ -146,7 +153,7 @@ def _flat_face(file: _File, loops: Sequence[Sequence[str]], z: float, upwards: b
     return file.add(f"ADVANCED_FACE('',({','.join(bounds)}),{plane},{sense})")
 
 
-# -- entities ----------------------------------------------------------------------------------
+# -- STEP: entities ----------------------------------------------------------------------------
 
 
 class _File:
@@ -268,3 +275,259 @@ def _string(text: str) -> str:
         for one in text.replace("\\", "\\\\").replace("'", "''")
     )
     return f"'{coded}'"
+
+
+# -- drawings for cutters and browsers: DXF and SVG --------------------------------------------
+
+
+OUTLINE, HOLES = "outline", "holes"  # layers
+MARGIN = 5.0  # mm around a picture
+
+
+def dxf_text(shape: Shape) -> str:
+    """Return a DXF of version R2010: lines, arcs, circles and splines on two layers."""
+    with _undated():
+        document = _document("R2010")
+        model = document.modelspace()
+        for k, loop in enumerate(shape.loops):
+            for piece in loop:
+                _draw(model, piece.curve, {"layer": HOLES if k else OUTLINE})
+        return _text(document)
+
+
+def r12_text(shape: Shape, tolerance: float) -> str:
+    """Return a DXF of version R12: closed polylines and circles.
+
+    Args:
+        shape: m.
+        tolerance: of chords in place of splines, m; arcs stay arcs, as bulges.
+    """
+    with _undated():
+        document = _document("R12")
+        model = document.modelspace()
+        for k, loop in enumerate(shape.loops):
+            look = {"layer": HOLES if k else OUTLINE}
+            if _is_circle(loop):
+                _draw(model, loop[0].curve, look)
+                continue
+            corners = [one for piece in loop for one in _corners(piece.curve, tolerance)]
+            model.add_polyline2d(corners, format="xyb", close=True, dxfattribs=look)
+        return _text(document)
+
+
+@contextmanager
+def _undated() -> Iterator[None]:
+    """Have documents made and written without dates and random numbers: a shape gives its bytes."""
+    from ezdxf import options
+
+    before = options.write_fixed_meta_data_for_testing
+    options.write_fixed_meta_data_for_testing = True
+    try:
+        yield
+    finally:
+        options.write_fixed_meta_data_for_testing = before
+
+
+def _document(version: str) -> Any:
+    import ezdxf
+    from ezdxf import units
+
+    # R12 knows no units.
+    document = ezdxf.new(version, units=0 if version == "R12" else units.MM)
+    document.header["$MEASUREMENT"] = 1
+    document.layers.add(OUTLINE, color=7)
+    document.layers.add(HOLES, color=1)
+    return document
+
+
+def _text(document: Any) -> str:
+    classes = document.classes
+    classes.add_required_classes(document.dxfversion)  # from a set
+    classes.classes = dict(sorted(classes.classes.items()))
+    stream = io.StringIO()
+    document.write(stream)
+    return stream.getvalue()
+
+
+def _is_circle(loop: tuple[Piece, ...]) -> bool:
+    return len(loop) == 1 and isinstance(loop[0].curve, Arc) and loop[0].curve.is_circle
+
+
+def _draw(model: Any, curve: Curve, look: dict[str, Any]) -> None:
+    if isinstance(curve, Line):
+        model.add_line(_mm(curve.start), _mm(curve.end), dxfattribs=look)
+    elif isinstance(curve, Arc):
+        if curve.is_circle:
+            model.add_circle(_mm(curve.centre), MM * curve.radius, dxfattribs=look)
+            return
+        # Counterclockwise, as the format has them.
+        first, last = sorted((curve.begin, curve.begin + curve.sweep))
+        angles = np.degrees([first, last])
+        model.add_arc(_mm(curve.centre), MM * curve.radius, *angles, dxfattribs=look)
+    else:
+        spline = model.add_spline(degree=DEGREE, dxfattribs=look)
+        spline.control_points = [(*_mm(p), 0.0) for p in curve.points]
+        spline.knots = curve.knots.tolist()
+
+
+def _mm(point: np.ndarray) -> tuple[float, float]:
+    return float(MM * point[0]), float(MM * point[1])
+
+
+def _corners(curve: Curve, tolerance: float) -> list[tuple[float, float, float]]:
+    """Return corners of a polyline along a curve, without the last: x, y in mm, and bulge."""
+    if isinstance(curve, Arc):
+        pieces = int(np.ceil(abs(curve.sweep) / np.pi))
+        places = curve.at(np.arange(pieces) / pieces)
+        return [(*_mm(p), float(np.tan(curve.sweep / pieces / 4.0))) for p in places]
+    return [(*_mm(p), 0.0) for p in curve.at(curve.parameters(tolerance)[:-1])]
+
+
+def svg_text(shape: Shape, title: str) -> str:
+    """Return an SVG picture to scale: the filled part, its size in millimetres; y points up."""
+    points = MM * np.vstack(shape.polygons(1e-5))
+    low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
+    width, height = high - low
+    path = " ".join(_path(loop) for loop in shape.loops)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.6g}mm" height="{height:.6g}mm" '
+        f'viewBox="{low[0]:.9g} {-high[1]:.9g} {width:.9g} {height:.9g}">\n'
+        f"<title>{_escaped(title)}</title>\n"
+        f'<path d="{path}" fill="#b0bec5" fill-rule="evenodd" stroke="#000" stroke-width="0.25"/>\n'
+        "</svg>\n"
+    )
+
+
+def _escaped(text: str) -> str:
+    from html import escape
+
+    return escape(text, quote=False)
+
+
+def _path(loop: tuple[Piece, ...]) -> str:
+    """Return the commands of a closed path, y downwards."""
+    words = [f"M {_xy(loop[0].curve.start)}"]
+    for piece in loop:
+        curve = piece.curve
+        if isinstance(curve, Line):
+            words.append(f"L {_xy(curve.end)}")
+        elif isinstance(curve, Arc):
+            words += _svg_arcs(curve)
+        else:
+            for _, b, c, d in curve.bezier():
+                words.append(f"C {_xy(b)} {_xy(c)} {_xy(d)}")
+    return " ".join([*words, "Z"])
+
+
+def _svg_arcs(arc: Arc) -> list[str]:
+    """Return an arc in pieces of half a turn at most, which the format cannot mistake."""
+    pieces = int(np.ceil(abs(arc.sweep) / np.pi - 1e-9))
+    radius, side = f"{MM * arc.radius:.12g}", int(arc.sweep < 0.0)
+    places = arc.at(np.arange(1, pieces + 1) / pieces)
+    return [f"A {radius} {radius} 0 0 {side} {_xy(p)}" for p in places]
+
+
+def _xy(point: np.ndarray) -> str:
+    return f"{MM * point[0]:.12g} {-MM * point[1]:.12g}"
+
+
+# -- surfaces in triangles, watertight: STL and 3MF --------------------------------------------
+
+
+def triangle_bytes(corners: np.ndarray, title: str) -> bytes:
+    """Return a binary STL of triangles, in single precision.
+
+    Args:
+        corners: (n, 3, 3) of every triangle, counterclockwise from outside.
+        title: for the header, which is the place to name the unit.
+    """
+    data = np.zeros(len(corners), dtype=[("n", "<f4", 3), ("p", "<f4", (3, 3)), ("a", "<u2")])
+    data["p"] = corners
+    a, b, c = (data["p"][:, k].astype(float) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    data["n"] = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    head = title.encode("ascii", "replace")[:80].ljust(80)
+    return head + np.uint32(len(corners)).tobytes() + data.tobytes()
+
+
+def extruded_facets(loops: list[np.ndarray], thickness: float) -> np.ndarray:
+    """Return the corners (n, 3, 3) of the facets, m, counterclockwise from outside."""
+    import shapely
+
+    # As the file will have them: corners that fall together there must not be two here.
+    loops = [_rounded(loop) for loop in loops]
+    polygon = shapely.Polygon(loops[0], loops[1:])
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    flat = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    twice = (flat[:, 1, 0] - flat[:, 0, 0]) * (flat[:, 2, 1] - flat[:, 0, 1])
+    twice -= (flat[:, 2, 0] - flat[:, 0, 0]) * (flat[:, 1, 1] - flat[:, 0, 1])
+    flat[twice < 0.0] = flat[twice < 0.0][:, ::-1]
+    top, bottom = _lifted(flat, thickness), _lifted(flat[:, ::-1], 0.0)
+    walls = []
+    for loop in loops:
+        after = np.roll(loop, -1, axis=0)
+        a, b = _lifted(loop, 0.0), _lifted(after, 0.0)
+        c, d = _lifted(after, thickness), _lifted(loop, thickness)
+        walls += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    return np.concatenate([bottom, top, *walls])
+
+
+def _rounded(loop: np.ndarray) -> np.ndarray:
+    """Return a loop's corners as single precision in mm has them, none twice in a row."""
+    points = (MM * loop).astype(np.float32).astype(float) / MM
+    return points[(points != np.roll(points, 1, axis=0)).any(axis=1)]
+
+
+def _lifted(points: np.ndarray, z: float) -> np.ndarray:
+    return np.concatenate([points, np.full((*points.shape[:-1], 1), z)], axis=-1)
+
+
+CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+PACKAGE = "http://schemas.openxmlformats.org/package/2006"
+HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
+TYPES = (
+    f'{HEAD}<Types xmlns="{PACKAGE}/content-types">'
+    '<Default Extension="rels" '
+    'ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
+    '<Default Extension="model" '
+    'ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>'
+)
+RELATIONS = (
+    f'{HEAD}<Relationships xmlns="{PACKAGE}/relationships">'
+    '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
+    'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
+)
+FIRST_DAY = (1980, 1, 1, 0, 0, 0)  # of ZIP: the same part gives the same bytes
+
+
+def three_mf_bytes(surface: Surface, name: str) -> bytes:
+    """Return a 3MF file of one object, its corners to 1e-9 mm.
+
+    Args:
+        surface: closed, m.
+        name: of the object.
+    """
+    vertices = "".join(
+        f'<vertex x="{x:.9f}" y="{y:.9f}" z="{z:.9f}"/>\n'
+        for x, y, z in np.asarray(MM * surface.points + 0.0)
+    )
+    triangles = "".join(
+        '<triangle v1="{}" v2="{}" v3="{}"/>\n'.format(*corners)
+        for corners in np.asarray(surface.triangles).tolist()
+    )
+    model = (
+        f'{HEAD}<model unit="millimeter" xml:lang="en" xmlns="{CORE}">\n<resources>\n'
+        f'<object id="1" type="model" name={quoteattr(name)}><mesh>\n'
+        f"<vertices>\n{vertices}</vertices>\n<triangles>\n{triangles}</triangles>\n"
+        '</mesh></object>\n</resources>\n<build><item objectid="1"/></build>\n</model>\n'
+    )
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as file:
+        for path, text in (
+            ("[Content_Types].xml", TYPES),
+            ("_rels/.rels", RELATIONS),
+            ("3D/3dmodel.model", model),
+        ):
+            entry = zipfile.ZipInfo(path, FIRST_DAY)
+            file.writestr(entry, text, compress_type=zipfile.ZIP_DEFLATED)
+    return stream.getvalue()

@@ -1,0 +1,476 @@
+"""Cells of solids in models of Gmsh: interfaces by their bores, surfaces filled, .msh files.
+
+The cells of a Gmsh model, with the names of groups that a file may have, become a model of plain
+entities, one a group, in m and in the arm's frame.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.disk import write_bytes
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.gmsh_session import (
+    DESIGN,
+    FURTHER,
+    INBOARD,
+    LINE,
+    NAMES,
+    OUTBOARD,
+    PASSIVE,
+    QUADRILATERAL,
+    TRIANGLE,
+    VOID,
+    gmsh_on_root,
+    in_child,
+    silent_terminal,
+)
+from dolfinopt.mesh.measured import (
+    BORE_RADIUS_SHARE,
+    FACES_EDGE_ANGLE,
+    INTERFACE_AREA_SHARE,
+    LOST_VOLUME_SHARE,
+)
+from dolfinopt.scene.load import Arm
+from dolfinopt.scene.tables.interfaces import Bore, frame_of
+
+TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
+# From Gmsh's order of a hexahedron's corners to that of a tensor product.
+TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+# Sides of cells in Gmsh's order of corners, around them, by the number of corners.
+SIDES = {
+    4: [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
+    8: [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]],
+}
+REGIONS = (DESIGN, PASSIVE, VOID)
+ENDS = (INBOARD, OUTBOARD)
+Entities = dict[int, list[int]]  # of every group
+
+
+def further_of(arm: Arm) -> dict[str, int]:
+    """Return the groups of the arm's further interfaces by their names, small letters."""
+    return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
+
+
+def interface_names(arm: Arm) -> dict[int, str]:
+    """Return the names of all interfaces by their groups."""
+    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.interfaces)}
+    return {INBOARD: NAMES[INBOARD], OUTBOARD: NAMES[OUTBOARD], **more}
+
+
+def bores_of(arm: Arm) -> dict[int, Bore]:
+    """Return the bores that are interfaces by their groups; points in the file's frame, m."""
+    found = {
+        FURTHER + k: Bore(point=one.point, axis=one.axis, radius=one.radius)
+        for k, one in enumerate(arm.interfaces)
+        if one.axis is not None and one.radius is not None
+    }
+    for group, bore in ((INBOARD, arm.inboard_bore), (OUTBOARD, arm.outboard_bore)):
+        if bore is not None:
+            found[group] = bore
+    return found
+
+
+def elements_of(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
+    """Return the nodes (n, corners) of the elements of entities, in Gmsh's order."""
+    rows = []
+    for entity in entities:
+        for ids, nodes in zip(*gmsh.model.mesh.getElements(dim, entity)[1:], strict=True):
+            rows.append(nodes.reshape(len(ids), -1).astype(int))
+    if not rows or len({row.shape[1] for row in rows}) > 1:
+        kind = "faces" if dim == 2 else "volumes"
+        raise InputError(f"its {kind} carry no elements of one kind; save the mesh of all of them")
+    return np.concatenate(rows)
+
+
+@dataclass(frozen=True, eq=False)
+class SolidCells:
+    """The cells of a solid mesh and the facets of its interfaces.
+
+    Attributes:
+        points: (n, 3) m.
+        cells: (m, 4 or 8) of every region by its group, in Gmsh's order.
+        facets: (k, 3 or 4) of every interface that is known by its group.
+    """
+
+    points: np.ndarray
+    cells: Mapping[int, np.ndarray]
+    facets: Mapping[int, np.ndarray]
+
+
+def boundary(cells: np.ndarray) -> np.ndarray:
+    """Return the facets (k, 3 or 4) that only one of the cells (m, 4 or 8) has."""
+    facets = np.concatenate([cells[:, side] for side in SIDES[cells.shape[1]]])
+    _, first, count = np.unique(
+        np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    return np.asarray(facets[first[count == 1]])
+
+
+def into_model(gmsh: Any, mesh: SolidCells) -> Entities:
+    """Make cells and facets a model of Gmsh, in place of what it has; return its entities."""
+    gmsh.clear()
+    model = gmsh.model
+    found: Entities = {group: [] for group in NAMES}
+    model.add("solid")
+    numbered = False
+    kinds = {
+        3: {4: TETRAHEDRON, 8: HEXAHEDRON},
+        2: {3: TRIANGLE, 4: QUADRILATERAL},
+    }
+    for dim, groups in ((3, mesh.cells), (2, mesh.facets)):
+        for group, rows in groups.items():
+            found[group] = []
+            if not len(rows):
+                continue
+            entity = model.addDiscreteEntity(dim)
+            if not numbered:
+                model.mesh.addNodes(
+                    dim, entity, np.arange(1, len(mesh.points) + 1), mesh.points.ravel()
+                )
+                numbered = True
+            kind = kinds[dim][rows.shape[1]]
+            model.mesh.addElementsByType(entity, kind, [], rows.ravel() + 1)
+            found[group] = [entity]
+    return found
+
+
+def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
+    """Return the groups of a model in the arm's frame and in m, interfaces by bores among them.
+
+    Raises:
+        InputError: there is no such bore.
+    """
+    bores = bores_of(arm)
+    if not bores and arm.mesh_scale == 1.0:
+        return groups
+    tags, places, _ = gmsh.model.mesh.getNodes()
+    number = np.zeros(int(tags.max()) + 1, dtype=int)
+    number[tags.astype(int)] = np.arange(len(tags))
+    points = arm.mesh_scale * places.reshape(-1, 3)
+    cells = {
+        group: number[elements_of(gmsh, 3, groups[group])] for group in REGIONS if groups[group]
+    }
+    widths = {rows.shape[1] for rows in cells.values()}
+    if len(widths) != 1 or not widths <= set(SIDES):
+        return groups  # told by its kinds of cells
+    facets = {
+        group: number[elements_of(gmsh, 2, groups[group])]
+        for group in interface_names(arm)
+        if group not in bores
+    }
+    outer = boundary(np.concatenate(list(cells.values()))) if bores else np.zeros((0, 3), dtype=int)
+    for group, bore in bores.items():
+        facets[group] = _of_bore(points, outer, bore, interface_names(arm)[group])
+    if (frame := frame_of(arm)) is not None:
+        points = (points - np.array(frame[0])) @ np.array(frame[1]).T
+    return into_model(gmsh, SolidCells(points, cells, facets))
+
+
+def _of_bore(points: np.ndarray, outer: np.ndarray, bore: Bore, name: str) -> np.ndarray:
+    """Return those of the outer facets whose corners are all as far from a bore's axis."""
+    axis = np.array(bore.axis) / np.linalg.norm(bore.axis)
+    apart = points - np.array(bore.point)
+    distance = np.linalg.norm(apart - np.outer(apart @ axis, axis), axis=1)
+    near = np.abs(distance - bore.radius) <= BORE_RADIUS_SHARE * bore.radius
+    found = outer[near[outer].all(axis=1)]
+    if not len(found):
+        used = np.unique(outer)
+        at = used[np.argmin(np.abs(distance[used] - bore.radius))]
+        place = ", ".join(f"{x:.6g}" for x in points[at])
+        raise InputError(
+            f'no bore of radius {bore.radius:g} m for interface "{name}": of the nodes on the '
+            f"surface the one at ({place}) m comes next, {distance[at]:.6g} m from the axis; state "
+            "point, axis and radius as the file has them, in m, and arms.mesh_scale"
+        )
+    return np.asarray(found)
+
+
+# -- A closed surface of triangles, meshed with tetrahedra; cells as a solid arm's .msh file -----
+
+
+@dataclass(frozen=True, eq=False)
+class Tetrahedra:
+    """A solid arm's mesh.
+
+    Attributes:
+        points: (n, 3) in the arm's frame, m.
+        cells: (m, 4) of positive volume.
+        inboard, outboard: (k, 3) nodes of the interfaces' facets.
+        further: those of further interfaces by their names.
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    inboard: np.ndarray
+    outboard: np.ndarray
+    further: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+
+    kind: ClassVar[str] = "tetrahedra"
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Volumes (m,) of the cells, m3; negative of those turned over."""
+        a, *rest = self.points[self.cells].swapaxes(0, 1)
+        b, c, d = (one - a for one in rest)
+        return np.asarray(np.einsum("na,na->n", b, np.cross(c, d)) / 6.0)
+
+    @property
+    def quality(self) -> np.ndarray:
+        """Shape (m,) of the cells: 12 (3 V)^(2/3) / (sum of squared edges), 1 of a regular one.
+
+        Source: Liu & Joe (1994), doi:10.1007/BF01955874.
+        """
+        corners = self.points[self.cells]
+        pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+        edges = corners[:, pairs[:, 0]] - corners[:, pairs[:, 1]]
+        volume = np.maximum(self.volumes, 0.0)
+        return np.asarray(12.0 * (3.0 * volume) ** (2.0 / 3.0) / np.square(edges).sum(axis=(1, 2)))
+
+    @property
+    def boundary(self) -> np.ndarray:
+        """Facets (k, 3) that only one cell has, counterclockwise from outside."""
+        facets = np.concatenate([self.cells[:, side] for side in SIDES[4]])
+        order = np.sort(facets, axis=1)
+        _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
+        return np.asarray(facets[count[which.ravel()] == 1])
+
+    def figures(self) -> dict[str, Any]:
+        """Return its entry of part.json."""
+        return {
+            self.kind: len(self.cells),
+            "volume": float(self.volumes.sum()),
+            "least_quality": float((quality := self.quality).min()),
+            "mean_quality": float(quality.mean()),
+        }
+
+    def write(self, path: Path) -> None:
+        """Write it as `arms.mesh` reads it back (.msh)."""
+        write_bytes(path, msh_bytes(self))
+
+
+def tetrahedra_of(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    size: float,
+    interfaces: tuple[np.ndarray, np.ndarray],
+    edge: float = FACES_EDGE_ANGLE,
+) -> Tetrahedra:
+    """Mesh the solid within a closed surface, on this process alone.
+
+    Faces are found by their edges and meshed anew.
+
+    Args:
+        points: (n, 3) corners of the surface in the arm's frame, m.
+        triangles: (m, 3) their indices, counterclockwise from outside.
+        size: of the cells, m.
+        interfaces: (m,) True of the triangles of the inboard and the outboard interface.
+        edge: between triangles, from which on there is an edge between faces, rad.
+
+    Raises:
+        InputError: Gmsh cannot mesh it; says why.
+    """
+    return in_child(_tetrahedra_of, points, triangles, size, interfaces, edge)
+
+
+def _tetrahedra_of(
+    points: np.ndarray,
+    triangles: np.ndarray,
+    size: float,
+    interfaces: tuple[np.ndarray, np.ndarray],
+    edge: float,
+) -> Tetrahedra:
+    with _meshing() as gmsh:
+        return _meshed(gmsh, points, triangles, size, interfaces, edge)
+
+
+def filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
+    """Return tetrahedra within the boundary of a mesh, whose triangles stay.
+
+    Args:
+        mesh: whose cells may be bad; its boundary does not cross itself.
+        size: of the cells inside, m.
+
+    Raises:
+        InputError: Gmsh cannot mesh it; says why.
+    """
+    return in_child(_filled_anew, mesh, size)
+
+
+def _filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
+    facets = mesh.boundary
+    rim = np.unique(facets)
+    number = np.full(len(mesh.points), -1)
+    number[rim] = np.arange(len(rim))
+    with _meshing() as gmsh:
+        model = gmsh.model
+        model.add("surface")
+        model.addDiscreteEntity(2, 1)
+        model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
+        model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
+        solid = _generated(gmsh, [1], size)
+        found = _cells(model, solid, {group: [] for group in ENDS})
+    if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
+        raise InputError("its cells do not fill it")
+    return replace(
+        found,
+        inboard=number[mesh.inboard],
+        outboard=number[mesh.outboard],
+        further={name: number[own] for name, own in mesh.further.items()},
+    )
+
+
+@contextmanager
+def _meshing() -> Iterator[Any]:
+    """Yield Gmsh on this process alone, whose errors are InputErrors then."""
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+        try:
+            with silent_terminal():
+                yield gmsh
+        except InputError:
+            raise
+        except Exception as error:
+            if type(error) is not Exception:  # Gmsh raises no other
+                raise
+            text = " ".join(str(error).split()) or "Gmsh failed"
+            raise InputError(f"its surface cannot be meshed ({text})") from None
+
+
+def _generated(gmsh: Any, faces: list[int], size: float) -> int:
+    """Mesh the solid within faces; return its number."""
+    geo = gmsh.model.geo
+    solid = geo.addVolume([geo.addSurfaceLoop(faces)])
+    geo.synchronize()
+    for key in ("Mesh.MeshSizeMin", "Mesh.MeshSizeMax"):
+        gmsh.option.setNumber(key, size)
+    gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+    gmsh.model.mesh.generate(3)
+    return int(solid)
+
+
+def _meshed(
+    gmsh: Any,
+    points: np.ndarray,
+    triangles: np.ndarray,
+    size: float,
+    interfaces: tuple[np.ndarray, np.ndarray],
+    edge: float,
+) -> Tetrahedra:
+    model = gmsh.model
+    model.add("surface")
+    model.addDiscreteEntity(2, 1)
+    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
+    model.mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
+    model.mesh.classifySurfaces(edge, True, True, math.pi)
+    model.mesh.createGeometry()
+    faces = [tag for _, tag in model.getEntities(2)]
+    chosen = {}
+    for group, mark in zip(ENDS, interfaces, strict=True):
+        chosen[group] = _faces_of(model, faces, points, triangles, mark)
+    solid = _generated(gmsh, faces, size)
+    for group, own in chosen.items():
+        if not own:
+            raise InputError(f"the {NAMES[group]} interface is lost in its faces")
+    found = _cells(model, solid, chosen)
+    volumes = found.volumes
+    a, b, c = points[triangles].swapaxes(0, 1)  # each with the origin a tetrahedron
+    expected = np.einsum("na,na->", a, np.cross(b, c)) / 6.0
+    if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST_VOLUME_SHARE * expected:
+        raise InputError("its cells do not fill it")
+    return found
+
+
+def _faces_of(
+    model: Any, faces: list[int], points: np.ndarray, triangles: np.ndarray, mark: np.ndarray
+) -> list[int]:
+    """Return the faces made of an interface's triangles (m,)."""
+    own = {tuple(row) for row in np.sort(triangles[mark], axis=1) + 1}
+    found = []
+    for face in faces:
+        nodes = model.mesh.getElementsByType(TRIANGLE, face)[1].reshape(-1, 3).astype(int)
+        inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
+        a, b, c = points[nodes - 1].swapaxes(0, 1)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        if area[inside].sum() > INTERFACE_AREA_SHARE * area.sum():
+            found.append(face)
+    return found
+
+
+def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
+    """Return the cells of a meshed solid with the facets of its interfaces' faces."""
+    tags, places, _ = model.mesh.getNodes()
+    nodes = model.mesh.getElementsByType(TETRAHEDRON, solid)[1].reshape(-1, 4).astype(int)
+    if not len(nodes):
+        raise InputError("its volume has no cells")
+    used, cells = np.unique(nodes, return_inverse=True)
+    number = np.full(int(tags.max()) + 1, -1)
+    number[used] = np.arange(len(used))
+    points = np.empty((len(number), 3))
+    points[tags.astype(int)] = places.reshape(-1, 3)
+    nodes_of = model.mesh.getElementsByType
+    facets = [
+        number[np.concatenate([[], *(nodes_of(TRIANGLE, face)[1] for face in own)]).astype(int)]
+        for own in (interfaces[group] for group in ENDS)
+    ]
+    inboard, outboard = (one.reshape(-1, 3) for one in facets)
+    return Tetrahedra(points[used], cells.reshape(-1, 4), inboard, outboard)
+
+
+class InterfaceMesh(Protocol):
+    """Cells of an arm in the plane or in space, with the facets of its interfaces."""
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, d) in the arm's frame, m."""
+
+    @property
+    def cells(self) -> np.ndarray:
+        """(m, c) nodes of triangles, tetrahedra or hexahedra."""
+
+    @property
+    def inboard(self) -> np.ndarray: ...  # (k, f) nodes of the interfaces' facets
+
+    @property
+    def outboard(self) -> np.ndarray: ...
+
+
+def msh_bytes(mesh: InterfaceMesh) -> bytes:
+    """Return the .msh file that `arms.mesh` reads back, on this process alone."""
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
+        add_cells(gmsh.model, mesh)
+        gmsh.option.setNumber("Mesh.Binary", 1)
+        gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
+        path = Path(folder) / "solid.msh"
+        gmsh.write(str(path))
+        return path.read_bytes()
+
+
+def add_cells(model: Any, mesh: InterfaceMesh) -> None:
+    """Make a mesh and its interfaces a model of Gmsh."""
+    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
+    cell, side = kinds[mesh.cells.shape[1]]
+    dim = mesh.points.shape[1]
+    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
+    model.add("solid")
+    solid = model.addDiscreteEntity(dim)
+    model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
+    model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
+    model.addPhysicalGroup(dim, [solid], DESIGN)
+    model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
+    named = [(INBOARD, NAMES[INBOARD], mesh.inboard), (OUTBOARD, NAMES[OUTBOARD], mesh.outboard)]
+    if isinstance(mesh, Tetrahedra):
+        named += [(FURTHER + k, name, own) for k, (name, own) in enumerate(mesh.further.items())]
+    for group, name, facets in named:
+        face = model.addDiscreteEntity(dim - 1)
+        model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
+        model.addPhysicalGroup(dim - 1, [face], group)
+        model.setPhysicalName(dim - 1, group, name)
