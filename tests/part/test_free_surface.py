@@ -86,9 +86,11 @@ def test_one_place_that_would_fold_does_not_keep_back_the_others(form):
         pytest.skip("plates are made of outlines")
     places, cell = free.mesh.points[free.nodes], free.part.domain.cell
     away = np.linalg.norm(places - places[0], axis=1)
-    folding = np.where(away < 0.5 * cell, 1.5 * cell, 0.1 * s)
+    # How far a place must move to fold depends on the mesh, which every Gmsh makes its own.
+    moves = (np.where(away < 0.5 * cell, far * cell, 0.1 * s) for far in (1.5, 3.0, 6.0))
+    folding = next(one for one in moves if not free._moved(one).is_valid)
     moved = free.moved(folding)
-    assert moved.is_valid and not free._moved(folding).is_valid
+    assert moved.is_valid
     went = ((moved.mesh.points - free.mesh.points)[free.nodes] * free.along).sum(axis=1)
     went /= np.square(free.along).sum(axis=1)
     far = away > 6.0 * cell
