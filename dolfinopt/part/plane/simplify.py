@@ -35,6 +35,8 @@ from dolfinopt.part.widths import polygon_of
 
 SPACING = 0.2  # of points along the outline, cells
 SHARES = (0.9, 0.6, 0.4, 0.25, 0.15, 0.08)  # of the distance, one attempt after the other
+# Of the distance, tried in turn: which lines are found hangs on rounding, and some lead nowhere.
+STARTS = (1.0, 0.95, 0.85, 0.65)
 LEVELS = (1.0, 0.5, 0.2, 0.08)  # shares of the distance for lines to choose from
 SPREAD = np.linspace(0.0, 1.0, 10)[:, None]  # of a fillet's radii to choose from, logarithmic
 GROWN = 1.1  # radius of a fillet that may be needed where sides move, over its least
@@ -114,7 +116,13 @@ def simple_shape(outline: Outline, distance: float, area: float) -> Shape | None
         area: to be enclosed, m2.
     """
     plain = replace(outline, centres=outline.centres[:0])  # the tool's arcs come anew
-    rings = [_merged(ring, 2.0 * distance) for ring in trace(plain, outline.tolerance)]
+    found = (_simple(plain, share * distance, area) for share in STARTS)
+    return next((shape for shape in found if shape is not None), None)
+
+
+def _simple(outline: Outline, distance: float, area: float) -> Shape | None:
+    """Return lines and arcs along an outline from one start."""
+    rings = [_merged(ring, 2.0 * distance) for ring in trace(outline, outline.tolerance)]
     places = [(i, k) for i, ring in enumerate(rings) for k, run in enumerate(ring) if not run.edge]
     if not places:
         return None
