@@ -108,7 +108,11 @@ def in_child(work: Callable[..., Result], *given: Any) -> Result:
         found = ours.recv()
     except EOFError:
         found = InputError("Gmsh gave up on it")
-    child.join()
+    except BaseException:  # Ctrl-C: nobody waits for it
+        child.kill()
+        raise
+    finally:
+        child.join()
     if isinstance(found, Exception):
         raise found
     return cast(Result, found)
@@ -116,6 +120,7 @@ def in_child(work: Callable[..., Result], *given: Any) -> Result:
 
 def _report(pipe: Connection, work: Callable[..., Any], given: tuple[Any, ...]) -> None:
     """Send what `work` returns, or raises."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     try:
         pipe.send(work(*given))
     except Exception as error:

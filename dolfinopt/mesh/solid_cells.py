@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -279,18 +278,7 @@ def tetrahedra_of(
     Raises:
         InputError: Gmsh cannot mesh it; says why.
     """
-    return in_child(_tetrahedra_of, points, triangles, size, interfaces, edge)
-
-
-def _tetrahedra_of(
-    points: np.ndarray,
-    triangles: np.ndarray,
-    size: float,
-    interfaces: tuple[np.ndarray, np.ndarray],
-    edge: float,
-) -> Tetrahedra:
-    with _meshing() as gmsh:
-        return _meshed(gmsh, points, triangles, size, interfaces, edge)
+    return in_child(_with_gmsh, _meshed, points, triangles, size, interfaces, edge)
 
 
 def filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
@@ -303,22 +291,21 @@ def filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
     Raises:
         InputError: Gmsh cannot mesh it; says why.
     """
-    return in_child(_filled_anew, mesh, size)
+    return in_child(_with_gmsh, _filled_anew, mesh, size)
 
 
-def _filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
+def _filled_anew(gmsh: Any, mesh: Tetrahedra, size: float) -> Tetrahedra:
     facets = mesh.boundary
     rim = np.unique(facets)
     number = np.full(len(mesh.points), -1)
     number[rim] = np.arange(len(rim))
-    with _meshing() as gmsh:
-        model = gmsh.model
-        model.add("surface")
-        model.addDiscreteEntity(2, 1)
-        model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
-        model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
-        solid = _generated(gmsh, [1], size)
-        found = _cells(model, solid, {group: [] for group in ENDS})
+    model = gmsh.model
+    model.add("surface")
+    model.addDiscreteEntity(2, 1)
+    model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
+    model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
+    solid = _generated(gmsh, [1], size)
+    found = _cells(model, solid, {group: [] for group in ENDS})
     if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
         raise InputError("its cells do not fill it")
     return replace(
@@ -329,13 +316,12 @@ def _filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
     )
 
 
-@contextmanager
-def _meshing() -> Iterator[Any]:
-    """Yield Gmsh on this process alone, whose errors are InputErrors then."""
+def _with_gmsh(work: Callable[..., Tetrahedra], *given: Any) -> Tetrahedra:
+    """Return what `work` makes with Gmsh, on this process alone; its errors are InputErrors."""
     with gmsh_on_root(MPI.COMM_SELF) as gmsh:
         try:
             with silent_terminal():
-                yield gmsh
+                return work(gmsh, *given)
         except InputError:
             raise
         except Exception as error:

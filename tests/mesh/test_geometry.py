@@ -1,7 +1,9 @@
 """Geometry files: arms with bores, a user's own, and one line for each that cannot be an arm."""
 
+import multiprocessing
 import os
 import re
+import time
 
 import numpy as np
 import pytest
@@ -662,3 +664,13 @@ def test_gmsh_may_end_its_own_process_alone():
     assert in_child(abs, -1) == 1
     with pytest.raises(ZeroDivisionError):
         in_child(divmod, 1, 0)
+
+
+def test_ctrl_c_ends_the_process_of_gmsh(monkeypatch):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("multiprocessing.connection.Connection.recv", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        in_child(time.sleep, 600.0)
+    assert not multiprocessing.active_children()
