@@ -8,11 +8,14 @@ from dolfinopt.part.domain import loops, recognise
 from dolfinopt.part.plane.curves import (
     Arc,
     Line,
+    Piece,
+    Shape,
     Spline,
     Target,
     curvature,
     direction,
     fit,
+    joined,
     sampled,
 )
 
@@ -166,3 +169,47 @@ def test_directions_at_the_ends_are_kept():
     found = fit(Target(wave(), first, last), 1e-3)
     np.testing.assert_allclose(direction(found, 0.0), first, atol=1e-9)
     np.testing.assert_allclose(direction(found, 1.0), last, atol=1e-9)
+
+
+def window(radius, stays=()):
+    """Return a hole of two waves and two arcs; pieces with the numbers in `stays` are not free."""
+    points = [[-1, radius], [-0.7, radius], [0.1, radius + 0.3], [0.6, radius], [1, radius]]
+    wave = Spline(np.array([0, 0, 0, 0, 0.4, 1, 1, 1, 1]), np.array(points))
+    right = Arc(np.array([1.0, 0.0]), radius, 0.5 * np.pi, -np.pi)
+    left = Arc(np.array([-1.0, 0.0]), radius, 1.5 * np.pi, -np.pi)
+    curves = [wave, right, Spline(wave.knots, -wave.points), left]
+    return Shape((tuple(Piece(one, free=k not in stays) for k, one in enumerate(curves)),))
+
+
+def test_free_curves_that_go_on_smoothly_are_one_spline():
+    shape = window(0.2)
+    [[piece]] = joined(shape).loops
+    curve = piece.curve
+    np.testing.assert_allclose(curve.start, curve.end, atol=1e-15)
+    assert curve.area == pytest.approx(shape.area, rel=1e-6)
+    boundary = shapely.LinearRing(shape.polygons(1e-7)[0])
+    apart = shapely.distance(shapely.points(fine(curve)), boundary)
+    assert apart.max() < 4.3e-6 * 0.2 + 1e-7  # arcs as cubics; chords of the polygon
+    # The speed is continuous, and the splines are themselves: any derivative is theirs.
+    t = curve.breaks[1:-1]
+    before, after = (curve.derivative(t + d) for d in (-1e-9, 1e-9))
+    np.testing.assert_allclose(before, after, rtol=1e-6, atol=1e-6)
+    share = curve.breaks[2]  # of the first spline, which has two polynomials
+    own = shape.loops[0][0].curve
+    for order in (1, 2):
+        found = curve.derivative(0.3 * t[1:2], order) * share**order
+        np.testing.assert_allclose(found, own.derivative([0.3], order), rtol=1e-9)
+    half = curve.part(0.1, 0.8)  # double knots within
+    at = np.linspace(0.0, 1.0, 50)
+    np.testing.assert_allclose(half.at(at), curve.at(0.1 + 0.7 * at), atol=1e-12)
+
+
+def test_corners_and_what_stays_part_curves():
+    corner = window(0.2)
+    loop = list(corner.loops[0])
+    loop[0].curve.points[1] += [0.0, 0.05]  # no longer level where the left arc ends
+    assert len(joined(corner).curves) == 1  # the hole begins and ends there
+    loop[0].curve.points[-2] += [0.0, 0.05]
+    assert len(joined(corner).curves) == 2
+    kept = joined(window(0.2, stays=(0,)))  # the arcs beside it are the tool's, and exact
+    assert [type(piece.curve) for piece in kept.pieces] == [Spline, Arc, Spline, Arc]

@@ -48,6 +48,8 @@ def test_frame(design):
     corners = sorted(tuple(np.round(curve.start, 12)) for curve in outer)
     assert corners == [(0.0, -0.03), (0.0, 0.03), (1.0, -0.03), (1.0, 0.03)]
     assert sorted(piece.label for piece in part.shape.loops[0]) == ["", "", "inboard", "outboard"]
+    # A curve around each hole; along a passive end its line, and the tool's arcs beside it.
+    assert [len(loop) for loop in part.shape.loops[1:]] == [4, 4, 1, 1]
     assert part.shape.control_points < 40 * 4
     # Flanges of 15 mm, struts of 25 mm; the level rounds corners and widens the windows for it.
     assert part.thinnest == pytest.approx(0.015, rel=0.05)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -158,6 +160,7 @@ class Spline:
         knots, points = self.knots, self.points
         for degree in range(DEGREE, DEGREE - order, -1):
             width = knots[degree + 1 : -1] - knots[1 : -degree - 1]
+            width[width == 0.0] = np.inf  # a double knot: no place where that B-spline counts
             points = degree * np.diff(points, axis=0) / width[:, None]
             knots = knots[1:-1]
         return points
@@ -208,7 +211,9 @@ class Spline:
     def over(self, breaks: np.ndarray) -> Spline:
         """Return the piece from the first to the last of some breaks, its own there among them."""
         first, last = breaks[[0, -1]]
-        knots = np.concatenate([[first] * DEGREE, breaks, [last] * DEGREE])
+        double = self.knots[1:][np.diff(self.knots) == 0.0]
+        double = double[(double > first) & (double < last)]
+        knots = np.sort(np.concatenate([[first] * DEGREE, breaks, double, [last] * DEGREE]))
         # It is a spline of these knots itself: interpolation in as many points gives it exactly.
         t = np.array([knots[k + 1 : k + 4].mean() for k in range(len(knots) - 4)])
         t = np.clip(t, first, last)  # a mean of equal numbers may differ from them
@@ -375,6 +380,82 @@ def _piece_apart(piece: Piece) -> float:
     there = shapely.distance(shapely.points(points), run).max()
     back = shapely.distance(shapely.points(piece.run), line).max()
     return float(max(there, back))
+
+
+# -- curves that go on smoothly as one spline ------------------------------------------------------
+
+OCTANT = 0.25 * np.pi  # sweep of an arc up to which a cubic follows it to 4.2e-6 of its radius
+GOES_ON = 1e-5  # turn at a joint up to which curves go on as one, rad
+
+
+def joined(shape: Shape) -> Shape:
+    """Return the shape with free curves that go on smoothly as one spline: a free hole has one.
+
+    The splines stay as they are to rounding, and arcs of the tool between them to 4.2e-6 of its
+    radius. Knots at the joints are double: the parameter runs on at the same speed, so that the
+    direction, not the curvature, is continuous. Arcs beside what stays remain arcs.
+    """
+    return replace(shape, loops=tuple(tuple(_joined(loop)) for loop in shape.loops))
+
+
+def _joined(loop: Sequence[Piece]) -> list[Piece]:
+    before, after = (*loop[-1:], *loop[:-1]), (*loop[1:], *loop[:1])
+    bends = [
+        one.free
+        and (isinstance(one.curve, Spline) or (isinstance(one.curve, Arc) and a.free and b.free))
+        for one, a, b in zip(loop, before, after, strict=True)
+    ]
+    goes_on = [
+        bends[k - 1]
+        and bends[k]
+        and angle_between(direction(before[k].curve, 1.0), direction(one.curve, 0.0)) < GOES_ON
+        for k, one in enumerate(loop)
+    ]
+    first = goes_on.index(False) if False in goes_on else 0
+    runs: list[list[Piece]] = []
+    for k in (*range(first, len(loop)), *range(first)):
+        if goes_on[k] and runs:
+            runs[-1].append(loop[k])
+        else:
+            runs.append([loop[k]])
+    return [_as_one(run) if len(run) > 1 else run[0] for run in runs]
+
+
+def _as_one(run: Sequence[Piece]) -> Piece:
+    """Return one spline along pieces that follow one another smoothly."""
+    splines = [_as_spline(piece.curve) for piece in run]
+    knots, points, length = splines[0].knots, splines[0].points, 1.0
+    for last, one in pairwise(splines):
+        # At the joint the speed stays: (end of the one before) / length = (start) / its length.
+        ends = last.derivative(np.ones(1)), one.derivative(np.zeros(1))
+        length *= float(np.linalg.norm(ends[1]) / np.linalg.norm(ends[0]))
+        knots = np.concatenate([knots[: -DEGREE + 1], knots[-1] + length * one.knots[DEGREE + 1 :]])
+        points = np.vstack([points[:-1], one.points[1:]])
+    lines = [
+        piece.curve.at(np.linspace(0.0, 1.0, 17)) if piece.run is None else piece.run
+        for piece in run
+    ]
+    return replace(
+        run[0],
+        curve=Spline(knots / knots[-1], points),
+        fixed=(run[0].fixed[0], run[-1].fixed[1]),
+        run=np.vstack([lines[0], *(line[1:] for line in lines[1:])]),
+    )
+
+
+def _as_spline(curve: Curve) -> Spline:
+    """Return a spline as it is, an arc as cubics with double knots between them."""
+    if isinstance(curve, Spline):
+        return curve
+    assert isinstance(curve, Arc)
+    count = int(np.ceil(abs(curve.sweep) / OCTANT))
+    ends = np.linspace(0.0, 1.0, count + 1)
+    # Handles along the tangents: 4/3 tan(sweep / 4) radii.
+    share = 4.0 / 3.0 * np.tan(0.25 * curve.sweep / count) / curve.sweep
+    at, along = curve.at(ends), share * curve.derivative(ends)
+    handles = np.stack([at[:-1] + along[:-1], at[1:] - along[1:]], axis=1).reshape(-1, 2)
+    knots = np.concatenate([[0.0] * 4, np.repeat(ends[1:-1], 2), [1.0] * 4])
+    return Spline(knots, np.vstack([at[:1], handles, at[-1:]]))
 
 
 SAMPLES = 9  # points of a spline at which a pair of arcs is compared with it

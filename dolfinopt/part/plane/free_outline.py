@@ -34,6 +34,7 @@ from dolfinopt.part.plane.curves import (
     Shape,
     Spline,
     direction,
+    joined,
 )
 from dolfinopt.part.plane.part import PlanePart
 
@@ -277,7 +278,7 @@ class FreeOutline:
         drawn = replace(part.outline, polygon=polygon)
         old, *gaps = part.shape.polygons(chord)
         apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
-        shape = replace(self.shape, apart=float(apart))
+        shape = replace(joined(self.shape), apart=float(apart))
         return replace(part, shape=shape, outline=drawn)
 
     def is_worn(self, mesh: BodyMesh) -> bool:

@@ -28,6 +28,7 @@ from dolfinopt.part.plane.curves import (
     angle_between,
     direction,
     fit,
+    joined,
     sampled,
     with_arcs,
 )
@@ -629,7 +630,7 @@ ARCS = 0.25  # share of the tolerance for arcs in place of splines
 def make_shape(
     outline: Outline, tolerance: float, arcs: bool = False, area: float | None = None
 ) -> Shape:
-    """Return the curves of an outline.
+    """Return the curves of an outline; free ones that go on smoothly are one spline.
 
     Args:
         outline: whose polygon they follow.
@@ -651,12 +652,13 @@ def make_shape(
         shape = with_area(_follow(outline, finest, finer), wanted, change)
         if shape.distance > tolerance or not shape.is_simple(0.1 * share * tolerance):
             continue
-        if shape.concave_radius >= ENOUGH * outline.tool_radius:
-            return shape
-        if best is None or shape.concave_radius > best.concave_radius:
+        enough = shape.concave_radius >= ENOUGH * outline.tool_radius
+        if enough or best is None or shape.concave_radius > best.concave_radius:
             best = shape
-    if best is not None:  # the command tells where
-        return best
+        if enough:
+            break
+    if best is not None:  # the command tells where it is sharper than the tool
+        return best if arcs else joined(best)
     raise InputError(
         f"arm {outline.domain.name!r}: no smooth curves within {tolerance:g} m of the outline; "
         "choose a smaller or larger --tolerance"
