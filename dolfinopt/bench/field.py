@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from mpi4py import MPI
 
-from dolfinopt.bench import crank
+from dolfinopt.bench import crank, ur10e
 from dolfinopt.data import benchmark_folder
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
@@ -72,6 +72,8 @@ class Case:
         scene: of the machine, or None where `program` makes it.
         overrides: "key.path=value" for the scene.
         program: a key of `PROGRAMS`, or "".
+        records: what the folder of the measured records is that `program` reads; "" where it
+            needs none.
         design: file of the design, or None for the scene's initial one.
         long: takes more than some ten seconds; runs with --all or by name.
         values: what is compared.
@@ -84,6 +86,7 @@ class Case:
     scene: Path | None
     overrides: tuple[str, ...]
     program: str
+    records: str
     design: Path | None
     long: bool
     values: tuple[Value, ...]
@@ -139,7 +142,9 @@ def read_case(file: Path) -> Case:
         raise InputError(f"{file}: {error}; a case is a TOML file") from None
     rows = tree.pop("values", [])
     here = file.parent
-    known = {"overrides": (), "scene": "", "program": "", "design": "", "long": False}
+    known = {
+        "overrides": (), "scene": "", "program": "", "records": "", "design": "", "long": False,
+    }  # fmt: skip
     tree = _with_defaults(file, tree, Case, known, without=("name", "values"))
     values = [_value(file, row) for row in rows]
     paths = {key: here / tree[key] if tree[key] else None for key in ("scene", "design")}
@@ -183,19 +188,34 @@ def _with_defaults(
 
 
 def chosen_cases(
-    names: Iterable[str], everything: bool, cases: Sequence[Case] | None = None
+    names: Iterable[str],
+    everything: bool,
+    records: bool = False,
+    cases: Sequence[Case] | None = None,
 ) -> tuple[Case, ...]:
     """Return the cases of these names; without names the quick ones, or all.
 
+    Args:
+        names: of cases.
+        everything: the long ones, too.
+        records: whether there are measured records; without them cases that need some are left
+            out.
+        cases: to choose from; None: the package's.
+
     Raises:
-        InputError: there is no such case.
+        InputError: there is no such case, or it needs records.
     """
     cases = read_cases() if cases is None else cases
     known = {case.name: case for case in cases}
     if wrong := [name for name in names if name not in known]:
         raise InputError(f"--case {wrong[0]}: no such case; expected {' | '.join(known)}")
+    for case in (known[name] for name in names):
+        if case.records and not records:
+            raise InputError(f"--case {case.name}: give --records DIR, {case.records}")
     wanted = tuple(known[name] for name in dict.fromkeys(names))
-    return wanted or tuple(case for case in cases if everything or not case.long)
+    return wanted or tuple(
+        case for case in cases if (everything or not case.long) and (records or not case.records)
+    )
 
 
 # -- what is compared ------------------------------------------------------------------------
@@ -287,7 +307,11 @@ HISTORIES: dict[str, History] = {
     "turning rate over time": _coordinate("turn", 1),
     "first arm's end along z over time": _first_end,
 }
-PROGRAMS: dict[str, Callable[[], dict[str, float]]] = {"crank": crank.values}
+# Of the folder of records, where there are some.
+PROGRAMS: dict[str, Callable[[Path | None], dict[str, float]]] = {
+    "crank": lambda _: crank.values(),
+    "ur10e": ur10e.values,
+}
 
 
 def read_table(name: str) -> dict[str, np.ndarray]:
@@ -301,14 +325,19 @@ def read_table(name: str) -> dict[str, np.ndarray]:
 # -- checking --------------------------------------------------------------------------------
 
 
-def check(case: Case) -> list[Checked]:
+def check(case: Case, records: Path | None = None) -> list[Checked]:
     """Run a case on this rank; return its values beside their references.
+
+    Args:
+        case: of the benchmark.
+        records: folder of the measured records, for a case that needs them.
 
     Raises:
         ConvergenceError: it cannot be simulated.
+        InputError: the records are not those of the case.
     """
     if case.scene is None:
-        found = PROGRAMS[case.program]()
+        found = PROGRAMS[case.program](records)
         return [_number(case, one, found[one.quantity]) for one in case.values]
     asked = any(one.quantity == "stress" for one in case.values)
     model = Model(case.scene, *case.overrides, comm=MPI.COMM_SELF)

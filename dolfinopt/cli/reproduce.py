@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from dolfinopt.cli.shared import out_option, plots_option, prepare, set_option, start, warn
+from dolfinopt.cli.shared import PATH, out_option, plots_option, prepare, set_option, start, warn
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
@@ -79,12 +79,16 @@ FIELD = "field"
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
 @click.option("--case", "cases", metavar="NAME", multiple=True, help="of field: this case alone")
 @click.option("--all", "everything", is_flag=True, help="of field: the long cases, too")
+@click.option(
+    "--records", type=PATH, metavar="DIR", help="of field: measured records that a case reads"
+)
 def bench(
     names: tuple[str, ...],
     out: Path | None,
     quick: bool,
     cases: tuple[str, ...],
     everything: bool,
+    records: Path | None,
 ) -> None:
     """Measure run time against error, or check the benchmark of the field.
 
@@ -97,24 +101,29 @@ def bench(
 
     `dolfinopt bench field` runs the published problems of the folder benchmarks and prints every
     value beside its reference, with difference, limit and verdict; exit status 1 where a limit is
-    missed. By default the quick cases, some ten seconds.
+    missed. By default the quick cases, some ten seconds; with --records DIR those, too, that read
+    measured records which cannot be copied: ur10e.
     """
     world = start()
     if FIELD in names:
         if len(names) > 1 or quick:
             other = "--quick" if quick else next(name for name in names if name != FIELD)
             raise InputError(f"bench field: {other} does not go with it; call it alone")
-        _check_field(world, out, cases, everything)
+        _check_field(world, out, cases, everything, records)
         return
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    if cases or everything:
-        raise InputError("bench: --case and --all belong to dolfinopt bench field")
+    if cases or everything or records:
+        raise InputError("bench: --case, --all and --records belong to dolfinopt bench field")
     _measure(names, out, quick)
 
 
 def _check_field(
-    world: MPI.Comm, out: Path | None, names: tuple[str, ...], everything: bool
+    world: MPI.Comm,
+    out: Path | None,
+    names: tuple[str, ...],
+    everything: bool,
+    records: Path | None,
 ) -> None:
     """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
@@ -124,8 +133,8 @@ def _check_field(
     if names and everything:
         raise InputError("bench field: --case and --all: give one of them")
     found = []
-    for case in chosen_cases(names, everything):
-        checked = on_root(world, check, case)
+    for case in chosen_cases(names, everything, records is not None):
+        checked = on_root(world, check, case, records)
         found += checked
         if world.rank == 0:
             table = table_of(checked).drop(columns="case").to_string(index=False)

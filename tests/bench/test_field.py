@@ -2,11 +2,17 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from runs import TWO_ARM, refused, run
 
-from dolfinopt.bench import field
+from dolfinopt.bench import field, ur10e
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.exchange.urdf.file import read_robot
+from dolfinopt.exchange.urdf.scene import INERTIA
+from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.machine import rigid_spatial_body
+from dolfinopt.multibody.motion import RigidMotion
 
 pytestmark = pytest.mark.serial  # a case runs on one rank
 
@@ -84,9 +90,58 @@ def test_command(tmp_path, monkeypatch, capsys):
         (("field", "--case", "rod", "--all"), ("--case", "--all")),
         (("field", "time"), ("field", "time")),
         (("field", "--quick"), ("field", "--quick")),
+        (("field", "--case", "ur10e"), ("--records", "dynamic_calibration")),
+        (("field", "--case", "ur10e", "--records", "nowhere"), ("nowhere", "ur10e.urdf")),
         (("time", "--all"), ("--all", "field")),
     ],
 )
 def test_wrong_words(words, told):
     with refused(*told):
         run("bench", *words)
+
+
+def write_robot(folder):
+    """Write six links on joints that turn about x, y and z, and records of their rigid motion."""
+    masses = [3.0, 2.5, 2.0, 1.0, 0.8, 0.5]
+    links, joints = ['<link name="link0"/>'], []
+    for k, mass in enumerate(masses, start=1):
+        inertia = f'ixx="{0.02 * mass}" iyy="{0.03 * mass}" izz="{0.015 * mass}"'
+        links.append(
+            f'<link name="link{k}"><inertial><origin xyz="0.05 0.02 {0.1 * k}"/><mass '
+            f'value="{mass}"/><inertia {inertia} ixy="0.001" ixz="0" iyz="0"/></inertial></link>'
+        )
+        axis = ("0 0 1", "0 1 0", "1 0 0")[k % 3]
+        joints.append(
+            f'<joint name="joint{k}" type="continuous"><parent link="link{k - 1}"/>'
+            f'<child link="link{k}"/><origin xyz="0.1 0 0.3" rpy="0 0.2 0"/><axis xyz="{axis}"/>'
+            "</joint>"
+        )
+    for file in (ur10e.ROBOT, ur10e.LEARNT[0], ur10e.PREDICTED[0]):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+    robot = f'<robot name="six">{"".join(links + joints)}</robot>'
+    (folder / ur10e.ROBOT).write_text(robot)
+    machine = ur10e.machine(folder / ur10e.ROBOT)
+    own = read_robot(folder / ur10e.ROBOT).links
+    bodies = [own[f"link{k}"].own for k in range(1, 7)]
+    rigid = [
+        rigid_spatial_body(b.mass, b.centre, [b.tensor[place] for place in INERTIA]) for b in bodies
+    ]
+    machine = replace(machine, bodies=tuple(rigid))
+    for number, (file, _, last) in enumerate((ur10e.LEARNT, ur10e.PREDICTED)):
+        t = 0.01 * np.arange(last + 50)
+        rate = np.array([0.7, 1.1, 0.9, 1.3, 1.7, 1.9]) + 0.1 * number
+        phase = np.outer(t, rate)
+        q, qd, qdd = np.sin(phase), rate * np.cos(phase), -(rate**2) * np.sin(phase)
+        none = np.zeros((len(t), 0))
+        torque = inverse_dynamics(machine, RigidMotion(q, qd, qdd), none, none, none)[1]
+        torque += 0.3 * qdd + 2.0 * qd - 0.5  # rotor and friction
+        np.savetxt(folder / file, np.column_stack([t, q, qd, torque / ur10e.GAINS]), delimiter=",")
+
+
+def test_torques_of_a_known_robot_are_predicted(tmp_path):
+    """What is left are the ends of the records, where the method has no accelerations."""
+    write_robot(tmp_path)
+    assert max(ur10e.values(tmp_path).values()) < 0.015
+    (tmp_path / ur10e.LEARNT[0]).write_text("1,2\n" * 700)
+    with pytest.raises(InputError, match="12harm"):
+        ur10e.values(tmp_path)
