@@ -73,7 +73,7 @@ def optimize(
     if resume:
         on_root(world, checkpoint.check, folder, loaded)
     else:
-        claim(world, folder, overwrite, resume=True, scene=loaded)
+        claim(world, folder, overwrite, resume=checkpoint.NAME, scene=loaded)
     with working_alone(world, folder):  # until all files of the run are written
         try:
             with progress(world, loaded) as report:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.part.check import Check
-    from dolfinopt.part.optimize import Optimized
+    from dolfinopt.part.checkpoint import Saved
+    from dolfinopt.part.optimize import Keep, Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
     from dolfinopt.scene.tables.design import Part as Asked
@@ -84,6 +85,9 @@ Say = Callable[[str], None]
     metavar="N",
     help="of --optimize: from N trusses, too; the best of all that keep the limits is kept (0)",
 )
+@click.option(
+    "--resume", is_flag=True, help="go on with the shapes of an --optimize that was interrupted"
+)
 @overwrite_option
 @plots_option
 def part(
@@ -97,6 +101,7 @@ def part(
     optimize: bool | None,
     iterations: int | None,
     starts: int | None,
+    resume: bool,
     overwrite: bool,
     plots: bool,
 ) -> None:
@@ -113,9 +118,12 @@ def part(
     """
     world = start()
     from dolfinopt.parallel import on_root, together
+    from dolfinopt.part import checkpoint
     from dolfinopt.part.folder import file_names
     from dolfinopt.part.part import Curves, PartsError, make_parts
 
+    if resume and overwrite:
+        raise InputError("--resume, --overwrite: expected only one of them")
     scene: Scene = on_root(world, scene_of, folder)
     target = out or folder / "part"
     if not scene.cell_counts:
@@ -124,7 +132,12 @@ def part(
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip
     asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
-    claim(world, target, overwrite, file_names(scene), scene=scene)
+    if resume and not asked.optimize:
+        raise InputError("--resume: goes on with --optimize, which is not asked for")
+    names = [*file_names(scene), checkpoint.NAME]
+    claim(world, target, overwrite or resume, names, resume=checkpoint.NAME, scene=scene)
+    kept = on_root(world, checkpoint.of_search, target, folder, scene, asked)
+    known = on_root(world, kept.read) if resume else ()
     with _stages(world) as say:
         say("outlines and surfaces")
         # Splines are optimised, then simplified.
@@ -145,15 +158,19 @@ def part(
                 made = Made(scene, parts, _meshes(parts, check or asked.optimize, say))
                 made = made.checked(folder, say) if check else made
                 if asked.optimize and made.meshes is not None:
-                    made = made.optimized(folder, asked, check, say)
+                    made = made.optimized(folder, asked, check, say, kept.replace, known)
                     if asked.simplify:
                         made = made.simplified(folder, asked.tolerance, check, say)
                 say("files")
                 made.write(folder, target, plots)
+                if made.shape is None or not made.shape.interrupted:
+                    kept.remove()
     if world.rank == 0:
         made.tell(target)
         if made.shape is not None and made.shape.interrupted:
-            raise KeyboardInterrupt(f"the best parts so far are in {target}")
+            raise KeyboardInterrupt(
+                f"the best parts so far are in {target}; to go on, add --resume"
+            )
 
 
 @contextmanager
@@ -227,14 +244,19 @@ class Made:
             warn([f"the machine with the parts cannot be compared: {error}"])
             return replace(self, check=None)
 
-    def optimized(self, run: Path, asked: Asked, check: bool, say: Say) -> Made:
+    def optimized(
+        self, run: Path, asked: Asked, check: bool, say: Say, keep: Keep, known: Sequence[Saved]
+    ) -> Made:
         """Return it with optimised shapes, the parts before beside them in the check."""
         from dolfinopt.part.optimize import optimize_parts
 
+        def tell(line: str) -> None:
+            click.echo(line, err=True)
+
         say("shapes")
         with _ended_as_interrupted():
-            given = self.scene, self.parts, asked.iterations
-            found = optimize_parts(*given, lambda line: click.echo(line, err=True), asked.starts)
+            given = self.scene, self.parts, asked.iterations, tell, asked.starts
+            found = optimize_parts(*given, keep, known)
         click.echo("\n".join(found.sentences))
         after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
         return self._followed_by(after, run, check, say)

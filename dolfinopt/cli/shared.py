@@ -117,7 +117,7 @@ def claim(
     overwrite: bool,
     names: Collection[str] = RUN_FILES,
     *,
-    resume: bool = False,
+    resume: str = "",
     scene: Scene | None = None,
 ) -> None:
     """Raise InputError if the folder holds results that --overwrite does not give up.

@@ -105,18 +105,18 @@ def check_sources(folder: Path, names: Iterable[str], scene: Scene) -> None:
             )
 
 
-def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: bool = False) -> None:
+def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: str = "") -> None:
     """Raise InputError if the folder holds a file of these names.
 
     Args:
         folder: need not exist.
         names: what the command would write.
-        resume: the command has an option --resume, too.
+        resume: file with which the command's option --resume goes on; "" where there is none.
     """
     found = [name for name in names if (folder / name).exists()]
     if found:
         more = f" and {len(found) - 1} more files" if len(found) > 1 else ""
-        others = "--resume to go on, " if resume and (folder / CHECKPOINT).exists() else ""
+        others = "--resume to go on, " if resume and (folder / resume).exists() else ""
         raise InputError(
             f"{folder}: holds results already ({found[0]}{more}); {others}--overwrite to replace "
             "them, or another --out"

@@ -243,7 +243,7 @@ def optimize(
     if folder is None:
         return _optimize(scene, None, False, False, world, report, built)
     on_root(world, check_sources, folder, RUN_FILES, scene)
-    check = None if resume or overwrite else partial(check_unused, folder, resume=True)
+    check = None if resume or overwrite else partial(check_unused, folder, resume=checkpoint.NAME)
     with working_alone(world, folder, check):
         return _optimize(scene, folder, resume, overwrite, world, report, built)
 

@@ -25,6 +25,7 @@ from dolfinopt.optimization.measured import LIMIT_PRICE
 from dolfinopt.optimization.mma import MMAState, Promise, initial_state, judge_step, mma_step
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
+from dolfinopt.part.checkpoint import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without
@@ -58,6 +59,7 @@ PRUNINGS = 3  # times that struts are left out from one start
 ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
 
 Tell = Callable[[str], None]
+Keep = Callable[[Sequence[Saved]], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +145,8 @@ def optimize_parts(
     iterations: int = ITERATIONS,
     tell: Tell = print,
     starts: int = 0,
+    keep: Keep | None = None,
+    known: Sequence[Saved] = (),
 ) -> Optimized:
     """Return parts that are better by the scene's objective and keep its limits.
 
@@ -156,6 +160,8 @@ def optimize_parts(
         iterations: at most, from every start.
         tell: gets a line an iteration.
         starts: trusses from which to begin, besides the parts themselves.
+        keep: is given where the searches are, after every step.
+        known: where those of an earlier call were, with which they go on.
 
     Raises:
         ConvergenceError: the machine with the parts cannot be simulated.
@@ -169,6 +175,13 @@ def optimize_parts(
         raise InputError("--optimize: the parts have no free curves: nothing can move")
     found: list[Found] = []
     interrupted = False
+    saved = {one.start: one for one in known}
+
+    def kept(one: Saved) -> None:
+        saved[one.start] = one
+        if keep is not None:
+            keep(tuple(saved.values()))
+
     for number in range(1 + starts):
         name = f"{TRUSSES} {number}" if number else "the densities' parts"
         descent = None
@@ -179,7 +192,8 @@ def optimize_parts(
                 outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
             if starts:
                 tell(f"from {name}")
-            descent = Descent(Problem(scene, parts, {}), outlines, iterations, tell)
+            begun = Problem(scene, parts, {}), outlines, iterations, tell
+            descent = Descent(*begun, number, kept, saved.get(number))
             found.append(descent.found(name))
         except (ConvergenceError, InputError) as error:  # the parts as they were remain
             tell(f"from {name}: {error}")
@@ -251,7 +265,7 @@ class Descent:
         state: the best of the searches that have ended.
         search: that goes on.
         done: steps taken in those that have ended.
-        best: of what finer meshes have judged.
+        best: of what finer meshes have judged, and `forms` its outlines.
     """
 
     def __init__(
@@ -260,14 +274,29 @@ class Descent:
         outlines: Mapping[int, FreeForm],
         iterations: int,
         tell: Tell,
+        number: int = 0,
+        keep: Callable[[Saved], None] = lambda _: None,
+        known: Saved | None = None,
     ):
-        """Begin at outlines."""
-        self.problem, self.iterations, self.tell = problem, iterations, tell
-        self.state, self.done = problem.evaluated(outlines, {}), 0
-        self.search, self.best = Search(problem, self.state), cast(Found | None, None)
+        """Begin at outlines, or where a search from them is known to have been."""
+        self.iterations, self.tell, self.number, self.keep = iterations, tell, number, keep
+        self.known, self.done = known, 0
+        self.best, self.forms = cast(Found | None, None), cast(Mapping[int, FreeForm], {})
+        if known is not None:
+            problem = replace(problem, tightened=known.tightened)
+            outlines, self.forms = _restored(outlines, known.forms), _restored(outlines, known.best)
+            self.done = known.done
+        self.problem, self.state = problem, problem.evaluated(outlines, {})
+        self.search = Search(problem, self.state)
 
     def found(self, start: str) -> Found:
         """Search to the end, and return the best of what finer meshes have judged."""
+        if self.known is not None and self.forms:  # by an earlier call
+            now, self.state = self.state, replace(self.state, outlines=self.forms)
+            found, _ = self._judged(start, self.known.ending)
+            if self.known.ending:
+                return found
+            self.state = now
         for _ in range(ROUNDS):
             ending = self._searched()
             found, limits = self._judged(start, ending)
@@ -275,7 +304,22 @@ class Descent:
             if self.done >= self.iterations or (kept and not ending.endswith(ENDED)):
                 break
             self._tighten(limits)
+        self._keep(ending)
         return replace(found, ending=ending)
+
+    def _keep(self, ending: str = "") -> None:
+        """Say where the search is."""
+        state = min(self.state, self.search.best, key=lambda one: one.rank)
+        forms, best = (
+            {k: one.arrays for k, one in some.items()} for some in (state.outlines, self.forms)
+        )
+        done = self.done + self.search.steps
+        self.keep(Saved(self.number, done, ending, self.problem.tightened, forms, best))
+
+    def _told(self, line: str) -> None:
+        """Tell of a step, which is kept first."""
+        self._keep()
+        self.tell(line)
 
     def so_far(self, start: str) -> Found:
         """Return the best so far of a search that was interrupted."""
@@ -307,6 +351,8 @@ class Descent:
             known = self.best
             worse = _rank(scene, value, limits) >= _rank(scene, known.value, known.limits)
             found = replace(known, iterations=self.done) if worse else found
+        if found.parts is made:
+            self.forms = outlines
         self.best = found
         return found, limits
 
@@ -330,7 +376,7 @@ class Descent:
         most = ceil(FIRST * self.iterations) if first else self.iterations
         for number in range(1 + PRUNINGS):
             search = self.search
-            ending = search.run(most - self.done, self.tell, self.done)
+            ending = search.run(most - self.done, self._told, self.done)
             self.done, search.steps = self.done + search.steps, 0
             if number and not search.best.rank < self.state.rank:
                 self.tell("no better without these struts: they stay")
@@ -385,6 +431,11 @@ class Descent:
             return None
 
 
+def _restored(outlines: Mapping[int, FreeForm], forms: Forms) -> dict[int, FreeForm]:
+    """Return what outlines had become, by what was kept of them."""
+    return {k: outlines[k].restored(arrays) for k, arrays in forms.items()}
+
+
 class FreeForm(Protocol):
     """The outline or surface of a part as variables x: moves s = F x along normals, m."""
 
@@ -416,6 +467,13 @@ class FreeForm(Protocol):
     @property
     def is_valid(self) -> bool:
         """Whether it can be a part: nothing crosses."""
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `restored` makes it of."""
+
+    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeForm:
+        """Return the form of these `arrays`, of one that this has become."""
 
     def filtered(self, x: np.ndarray) -> np.ndarray:
         """Return s = F x (count,)."""

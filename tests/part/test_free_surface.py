@@ -80,6 +80,16 @@ def test_nodes_stay_on_the_faces_of_the_arm(form):
         assert moved.made.volume == pytest.approx(moved.size, rel=2e-3)
 
 
+def test_kept_arrays_are_the_form(form):
+    free, (_, s) = form[4].outlines[1], moves_of(form)
+    moved = free.moved(s)
+    again = free.restored(moved.arrays)
+    assert again.count == moved.count and again.size == pytest.approx(moved.size, rel=1e-14)
+    assert np.array_equal(again.made.surface.points, moved.made.surface.points)
+    for one, other in zip(again.room(), moved.room(), strict=True):
+        assert one.shape == other.shape
+
+
 def test_one_place_that_would_fold_does_not_keep_back_the_others(form):
     free, (_, s) = form[4].outlines[1], moves_of(form)
     if not isinstance(free, FreeSurface):

@@ -9,12 +9,12 @@ import pytest
 import runs
 from cutter import deepest_left
 from parts import folder_with, frame, write_run
-from runs import refusal, run
+from runs import refusal, refused, run
 
 from dolfinopt import load_scene
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import InputError
-from dolfinopt.part.optimize import Problem, optimize_parts
+from dolfinopt.part.optimize import Descent, Problem, optimize_parts
 from dolfinopt.part.part import Curves, make_parts
 from dolfinopt.part.plane.curves import MIRROR, Arc, Spline, direction
 from dolfinopt.part.plane.free_outline import free_outline
@@ -169,6 +169,59 @@ def test_interrupted_search_keeps_the_best(made):
     found = optimize_parts(scene, parts, STEPS, tell)
     assert found.interrupted and found.best.ending == "interrupted"
     assert found.best.iterations == 2 and found.best.value < found.before
+
+
+class KilledError(Exception):
+    """What nothing catches, as a kill."""
+
+
+def test_killed_search_goes_on(made):
+    """From its second step on: the rest are two steps more, and the shape is no worse."""
+    _, scene, parts, whole, _ = made
+    kept, lines = [], []
+
+    def kill(_):
+        if kept[-1][0].done == 2:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        optimize_parts(scene, parts, STEPS, kill, keep=kept.append)
+    (there,) = kept[-1]
+    assert (there.done, there.ending, there.best) == (2, "", {})
+    again = kept.copy()
+    found = optimize_parts(scene, parts, STEPS, lines.append, keep=again.append, known=kept[-1])
+    assert len(lines) == STEPS - 2 and found.best.iterations == STEPS
+    assert found.before == whole.before
+    # Asymptotes begin anew: other steps, of which the last ones change little.
+    assert found.best.value == pytest.approx(whole.best.value, rel=2e-3)
+    (end,) = again[-1]
+    assert end.done == STEPS and end.ending == found.best.ending
+    lines.clear()
+    known = optimize_parts(scene, parts, STEPS, lines.append, known=again[-1])
+    assert not lines and known.best.value == pytest.approx(found.best.value, rel=1e-9)
+
+
+def test_command_goes_on(tmp_path, monkeypatch):
+    folder = folder_with(tmp_path / "run", frame, *SMALL, "part.optimize=true", "part.iterations=3")
+    words = ("part", folder, "--no-plots", "--no-check", "--out", tmp_path / "out")
+    with refused("--resume", "shapes.npz"):
+        run(*words, "--resume")
+
+    def kill(search, line):
+        search._keep()
+        raise KilledError
+
+    with monkeypatch.context() as changed, pytest.raises(KilledError):
+        changed.setattr(Descent, "_told", kill)
+        run(*words)
+    assert [one.name for one in (tmp_path / "out").iterdir()] == ["shapes.npz"]
+    with refused("--resume", "--overwrite", "shapes.npz"):
+        run(*words)
+    with refused("--resume", "other options"):
+        run(*words, "--resume", "--tool-radius", "0.004")
+    run(*words, "--resume")
+    assert json.loads((tmp_path / "out" / "part.json").read_text())["optimize"]["iterations"] == 3
+    assert not (tmp_path / "out" / "shapes.npz").exists()
 
 
 @pytest.mark.slow

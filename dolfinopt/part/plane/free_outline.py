@@ -12,7 +12,7 @@ them: moves are smooth over the length r. Source: Lazarov & Sigmund (2011), doi:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -280,6 +280,31 @@ class FreeOutline:
         apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
         shape = replace(joined(self.shape), apart=float(apart))
         return replace(part, shape=shape, outline=drawn)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `restored` makes it of."""
+        found = {
+            "points": np.vstack([run.points for run in self.runs]),
+            "counts": np.array([len(run.points) for run in self.runs]),
+            "closed": np.array([run.closed for run in self.runs]),
+            "corners": np.array([run.corners for run in self.runs]),
+        }
+        return found if self.partner is None else found | {"partner": self.partner}
+
+    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeOutline:
+        """Return the outline of these `arrays`, of one that this has become; holes may be gone."""
+        points = np.split(arrays["points"], np.cumsum(arrays["counts"])[:-1])
+        runs = tuple(
+            Run(place, bool(closed), (bool(first), bool(last)))
+            for place, closed, (first, last) in zip(
+                points, arrays["closed"], arrays["corners"], strict=True
+            )
+        )
+        # Loops with pieces that stay come first, and so do their runs.
+        loops = [loop for loop in self.loops if any(isinstance(one, Piece) for one in loop)]
+        loops += [(k,) for k, run in enumerate(runs) if run.closed]
+        return replace(self, loops=tuple(loops), runs=runs, partner=arrays.get("partner"))
 
     def is_worn(self, mesh: BodyMesh) -> bool:
         """Whether a mesh is to be made anew: a triangle is nearly flat."""

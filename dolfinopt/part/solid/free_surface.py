@@ -13,7 +13,7 @@ Source: Lazarov & Sigmund (2011), doi:10.1002/nme.3072.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -48,6 +48,7 @@ EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 WORN, SPOILT = 0.6, 0.2
 # What is left of moves, within how many cells of what would wear; tried in turn.
 KEPT_BACK = (0.5, 1.0), (0.5, 1.0), (0.0, 1.0), (0.0, 2.0), (0.0, 4.0)
+FURTHER = "further "  # what the names of arrays of further interfaces begin with
 LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 
 
@@ -117,6 +118,31 @@ class FreeSurface:
         far = float(np.linalg.norm(moves, axis=1).max())
         far += self.part.distance
         return replace(self.part, surface=surface, distance=far, moved=self.mesh)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `restored` makes it of."""
+        part, mesh = self.made, self.mesh
+        further = {f"{FURTHER}{name}": facets for name, facets in mesh.further.items()}
+        return {
+            "surface": part.surface.points, "triangles": part.surface.triangles,
+            "distance": np.array(part.distance), "points": mesh.points, "cells": mesh.cells,
+            "inboard": mesh.inboard, "outboard": mesh.outboard, **further,
+        }  # fmt: skip
+
+    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeSurface:
+        """Return the surface of these `arrays`, of one that this has become."""
+        further = {
+            name.removeprefix(FURTHER): facets
+            for name, facets in arrays.items()
+            if name.startswith(FURTHER)
+        }
+        mesh = Tetrahedra(
+            *(arrays[name] for name in ("points", "cells", "inboard", "outboard")), further=further
+        )
+        surface = Surface(arrays["surface"], arrays["triangles"])
+        far = float(arrays["distance"])
+        return free_surface(replace(self.part, surface=surface, distance=far, moved=mesh), mesh)
 
     @property
     def size(self) -> float:
@@ -317,6 +343,15 @@ class FreePlate:
     def size(self) -> float:
         """Volume, m3."""
         return self.outline.size * self.outline.part.domain.thickness
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `restored` makes it of."""
+        return self.outline.arrays
+
+    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreePlate:
+        """Return the plate of these `arrays`, of one that this has become."""
+        return replace(self, outline=self.outline.restored(arrays))
 
     @property
     def is_valid(self) -> bool:
