@@ -18,6 +18,7 @@ from dolfinopt.optimization.measured import (
     DEAREST_PRICE_FACTOR,
     FREE_ATTEMPTS,
     FREE_STEPS,
+    GREY_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
     LIMIT_PRICE,
     RELEASE_MERIT_SHARE,
@@ -109,6 +110,8 @@ class Iterate:
         size = abs(self.problem.f0) or 1.0
         self._seek(size=size, merit=self.problem.merit(size, self.search.weight), lag=0)
         self.keep_best()
+        if self.problem.excess == 0.0:  # with a sharper projection the search begins anew
+            self.best = replace(self.best, improved=self.iteration)
 
     def begin_stage(self) -> None:
         """Hold the smooth limits of these designs, and a price by the objective's size."""
@@ -119,7 +122,8 @@ class Iterate:
             self.convexity = np.zeros(len(self.problem.values))
 
     def keep_best(self) -> None:
-        """Remember x where it is better than what was known: of sharper designs, feasible ones."""
+        """Remember x where it is better than what was known (collective)."""
+        projected = bool(self.scene.design.projection)
         new = Best(
             self.x.copy(),
             self.iteration,
@@ -127,6 +131,7 @@ class Iterate:
             dict(self.continuation.thresholds),
             float(self.problem.values[0]),
             self.problem.excess,
+            crisp=projected and self._volumes()[2] <= GREY_SHARE,
         )
         if new.rank < self.best.rank:
             self.best = new.after(self.best)
@@ -403,6 +408,22 @@ class Iterate:
         """
         with self.evaluator.profile.phase("kkt residual"):
             self.residual = self._residual()
+        _, volume_fraction, self.grayness = self._volumes()
+        return HistoryRow(
+            iteration=self.iteration,
+            objective=self.problem.f0,
+            max_deviation=self.nominal.evaluation.max_deviation,
+            grayness=self.grayness,
+            volume_fraction=volume_fraction,
+            change=self.change,
+            seconds=0.0,
+            kkt=self.residual.rms,
+            constraints={one.name: one.value for one in self.problem.limits},
+            tightest=tightest(self.problem.limits),
+        )
+
+    def _volumes(self) -> tuple[float, float, float]:
+        """Return the volume of all arms, and which shares of it are filled, and grey."""
         parts = {}
         x_phys, arms = self.nominal.x_phys, self.evaluator.arms
         meshes = {k: arm.mesh for k, arm in arms.items()}
@@ -411,19 +432,7 @@ class Iterate:
             filled, x = kind.filled(x_phys[k]), kind.share(x_phys[k])
             parts[k] = np.array([volume.sum(), volume @ filled, volume @ (4.0 * x * (1.0 - x))])
         total, volume, grey = self.total(parts)
-        self.grayness = float(grey / total)
-        return HistoryRow(
-            iteration=self.iteration,
-            objective=self.problem.f0,
-            max_deviation=self.nominal.evaluation.max_deviation,
-            grayness=self.grayness,
-            volume_fraction=float(volume / total),
-            change=self.change,
-            seconds=0.0,
-            kkt=self.residual.rms,
-            constraints={one.name: one.value for one in self.problem.limits},
-            tightest=tightest(self.problem.limits),
-        )
+        return float(total), float(volume / total), float(grey / total)
 
     def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""

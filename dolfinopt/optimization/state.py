@@ -82,7 +82,10 @@ class FurtherRow(HistoryRow):
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """The best design so far: of the sharpest projection among those that keep all limits.
+    """The best design so far, among those that keep all limits; crisp ones before grey ones.
+
+    Of grey ones that of the sharpest projection counts: a projection that becomes steeper may lose
+    a design that was crisp already.
 
     Attributes:
         x: (n,) this rank's variables.
@@ -91,6 +94,7 @@ class Best:
         thresholds: per arm its eta.
         objective: what is minimised.
         excess: largest relative violation of a limit.
+        crisp: whether nearly all of it is solid or void.
         improved: iteration of the last design that was better than the one before by a tenth of a
             percent, and `reference` its objective, of an infeasible one its excess.
     """
@@ -101,6 +105,7 @@ class Best:
     thresholds: Mapping[int, float]
     objective: float
     excess: float
+    crisp: bool = False
     improved: int = 0
     reference: float = np.inf
 
@@ -110,16 +115,22 @@ class Best:
         return cls(x, -1, 0.0, {}, np.inf, np.inf)
 
     @property
+    def sharpness(self) -> float:
+        """Steepness of the projection, infinite of a crisp design."""
+        return np.inf if self.crisp else self.beta
+
+    @property
     def rank(self) -> tuple[bool, float, float]:
         """What is smaller for a better design; of infeasible ones the least violation counts."""
         if self.excess > 0.0:
             return True, self.excess, self.objective
-        return False, -self.beta, self.objective
+        return False, -self.sharpness, self.objective
 
     def after(self, before: Best) -> Best:
         """Return it with what it has improved since `before`, which it follows."""
         value = self.excess or self.objective
-        same = (self.excess > 0.0) == (before.excess > 0.0) and self.beta <= before.beta
+        same = (self.excess > 0.0) == (before.excess > 0.0)
+        same = same and self.sharpness <= before.sharpness
         if same and value > before.reference - IMPROVED_SHARE * abs(before.reference):
             return replace(self, improved=before.improved, reference=before.reference)
         return replace(self, improved=self.iteration, reference=value)

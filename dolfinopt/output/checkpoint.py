@@ -33,7 +33,7 @@ SEAL = "digest"  # of all other arrays
 FURTHER = "further/"  # before the names of what further iterations left
 # Keys a resumed run may change: they say when to stop, not what design is computed.
 # Numbers of the best design.
-BEST = "iteration", "beta", "objective", "excess", "improved", "reference"
+BEST = "iteration", "beta", "objective", "excess", "crisp", "improved", "reference"
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
 
 
@@ -334,6 +334,7 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
     change, age, held = arrays["last"].tolist()
     best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
     iteration = best["iteration"] = int(best["iteration"])
+    best["crisp"] = bool(best["crisp"])
     thresholds = {k: float(arrays[f"arm{k}/best_threshold"]) for k in cells}
     if iteration < 0:
         thresholds = {}
