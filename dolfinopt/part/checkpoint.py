@@ -108,7 +108,10 @@ def of_search(folder: Path, run: Path, scene: Scene, asked: Asked) -> Checkpoint
         scene: of the run.
         asked: of the parts; steps and starts may be others when it goes on.
     """
-    design = hashlib.blake2b((run / "design.npz").read_bytes(), digest_size=16).hexdigest()
+    file = run / "design.npz"
+    design = hashlib.blake2b(
+        file.read_bytes() if file.exists() else b"", digest_size=16
+    ).hexdigest()
     curves = asked.model_dump(include={"tool_radius", "tolerance", "curves", "minimum_member"})
     told = [__version__, NUMERICS, design, scene.to_dict(), curves]
     return Checkpoint(folder, json.dumps(told, sort_keys=True))

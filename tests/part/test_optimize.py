@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -169,6 +170,23 @@ def test_interrupted_search_keeps_the_best(made):
     found = optimize_parts(scene, parts, STEPS, tell)
     assert found.interrupted and found.best.ending == "interrupted"
     assert found.best.iterations == 2 and found.best.value < found.before
+
+
+def test_short_free_curves_stay(design):
+    """Of a free run between two corners 20 um apart nothing can move: both of its ends stay."""
+    part = make_part(design(frame))
+    first, *others = part.shape.loops[1]  # a spline, and along the passive end arc, line, arc
+    assert isinstance(first.curve, Spline)
+    small, rest = first.curve.part(0.0, 2e-4), first.curve.part(2e-4, 1.0)
+    along = rest.points[1] - rest.points[0]
+    rest.points[1] += 0.2 * np.array([-along[1], along[0]])  # a convex corner of the hole
+    loop = (replace(first, curve=small), replace(first, curve=rest), *others)
+    shape = replace(part.shape, loops=(part.shape.loops[0], loop, *part.shape.loops[2:]))
+    found = free_outline(replace(part, shape=shape))
+    assert found.is_valid
+    lengths = [np.linalg.norm(np.diff(run.points, axis=0), axis=1).sum() for run in found.runs]
+    assert min(lengths) > part.domain.cell
+    assert sum(isinstance(one, int) for one in found.loops[1]) == 1
 
 
 class KilledError(Exception):

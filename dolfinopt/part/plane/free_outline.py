@@ -616,7 +616,7 @@ def free_outline(part: PlanePart, minimum_gap: float = 0.0, scale: float = 1.0) 
     fixed = [loop for loop in shape.loops if not all(piece.free for piece in loop)]
     for loop in map(_with_fillets, fixed):
         found: list[Piece | int] = []
-        for one in _without_hooks(_lines(loop, chord), HOOK * cell, arm.boundary):
+        for one in _without_hooks(_lines(loop, chord, cell), HOOK * cell, arm.boundary):
             found.append(one if isinstance(one, Piece) else len(runs))
             if isinstance(one, _Line):
                 points = _fitted_open(one.points, SPACING * cell, one.tangents, FAIR)
@@ -649,12 +649,15 @@ class _Line:
     tangents: Tangents
 
 
-def _lines(loop: tuple[Piece, ...], chord: float) -> list[Piece | _Line]:
-    """Return a loop's pieces that stay, and one line for all free ones between two of them."""
+def _lines(loop: tuple[Piece, ...], chord: float, short: float) -> list[Piece | _Line]:
+    """Return a loop's pieces that stay, and one line for all free ones between two of them.
+
+    Free ones that are shorter in all than `short`, m, stay, too: both of their ends do.
+    """
     found: list[Piece | _Line] = []
     first = next(k for k, piece in enumerate(loop) if not piece.free)
     loop = (*loop[first:], *loop[:first])  # no line goes on beyond the last piece
-    line, tangent = np.empty((0, 2)), None
+    line, tangent, pieces = np.empty((0, 2)), None, []
     for piece, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
         a, b = direction(piece.curve, 1.0), direction(after.curve, 0.0)
         smooth = a @ b > np.cos(KINK)
@@ -664,9 +667,11 @@ def _lines(loop: tuple[Piece, ...], chord: float) -> list[Piece | _Line]:
             continue
         own = piece.curve.at(piece.curve.parameters(chord))
         line = np.vstack([line, own[1:]]) if len(line) else own
+        pieces.append(replace(piece, free=False))
         if not (after.free and smooth):
-            found.append(_Line(line, (tangent, b if smooth else None)))
-            line, tangent = np.empty((0, 2)), b if smooth else None
+            too_short = _length(line) < short
+            found += pieces if too_short else [_Line(line, (tangent, b if smooth else None))]
+            line, tangent, pieces = np.empty((0, 2)), b if smooth else None, []
     return found
 
 
@@ -717,14 +722,18 @@ def _straight(points: np.ndarray, side: Line, size: float, edge: Geometry) -> np
 
 
 def _with_fillets(loop: tuple[Piece, ...]) -> tuple[Piece, ...]:
-    """Return a loop whose arcs of the tool beside pieces that stay, stay with them."""
-    around = zip(loop, (loop[-1], *loop[:-1]), (*loop[1:], loop[0]), strict=True)
-    return tuple(
-        replace(piece, free=False)
-        if isinstance(piece.curve, Arc) and not (before.free and after.free)
-        else piece
-        for piece, before, after in around
-    )
+    """Return a loop whose arcs of the tool that touch pieces which stay, stay with them."""
+    found = []
+    for before, piece, after in zip(
+        (loop[-1], *loop[:-1]), loop, (*loop[1:], loop[0]), strict=True
+    ):
+        joints = ((before, before, piece), (after, piece, after))
+        stays = isinstance(piece.curve, Arc) and any(
+            not beside.free and direction(a.curve, 1.0) @ direction(b.curve, 0.0) > np.cos(KINK)
+            for beside, a, b in joints
+        )
+        found.append(replace(piece, free=False) if stays else piece)
+    return tuple(found)
 
 
 def _free_rings(shape: Shape, tool: float, chord: float, fixed: int) -> list[np.ndarray]:

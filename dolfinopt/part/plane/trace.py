@@ -107,8 +107,7 @@ def _runs(
     on = _without_specks(points, on, tol)
     count = len(edges)
     edges = [*edges, *_fillets(points, on, outline, count)]
-    if edges[count - 1].label == AXIS:
-        on = _without_stubs(points, on, count, tol)
+    on = _without_stubs(points, on, count, tol)
     reach = REACH * outline.domain.cell
     if outline.tool_radius > 0.0:  # its roundings are none
         reach = min(reach, 0.4 * outline.tool_radius)
@@ -169,14 +168,14 @@ def _fillets(points: np.ndarray, on: np.ndarray, outline: Outline, first: int) -
 
 
 def _without_stubs(points: np.ndarray, on: np.ndarray, first: int, size: float) -> np.ndarray:
-    """Give free blocks shorter than `size` between the axis and an arc of the tool to the arc."""
-    # Arcs have the numbers from `first` on, the axis the one before. A curve so short could not be
-    # meshed beside its mirror image.
+    """Give free blocks shorter than `size` between an arc of the tool and a curve to the arc."""
+    # Arcs have the numbers from `first` on. A curve so short could not be meshed beside its mirror
+    # image, nor move.
     step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     blocks = _blocks(on)
     for k, block in enumerate(blocks):
         beside = sorted((on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]))
-        is_stub = on[block[0]] == -1 and beside[0] == first - 1 and beside[1] >= first
+        is_stub = on[block[0]] == -1 and 0 <= beside[0] < first <= beside[1]
         if is_stub and step[block].sum() < size:
             on[block] = beside[1]
     return on
