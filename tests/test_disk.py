@@ -54,9 +54,6 @@ def small_files():
     resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-# -- writing ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "write",
     [
@@ -145,9 +142,6 @@ def test_standard_output_without_room(tmp_path):
     assert "standard output: No space left on device" in done.stderr.splitlines()[-1]
 
 
-# -- locks -----------------------------------------------------------------------------------
-
-
 def without(number):
     def lock(*arguments):
         raise OSError(number, os.strerror(number))
@@ -182,9 +176,6 @@ def test_studies_without_locks(shared_tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.count("continuing without") == 2 * (COMM.rank == 0)
 
 
-# -- what other programs have computed -------------------------------------------------------
-
-
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("name", "value"), [("NUMERICS", -1), ("__version__", "0.0.0")])
 def test_results_of_another_program_are_computed_anew(name, value, tmp_path, monkeypatch):
@@ -203,9 +194,6 @@ def test_results_of_another_program_are_computed_anew(name, value, tmp_path, mon
     with pytest.raises(InputError, match="another version of dolfinopt wrote this checkpoint"):
         checkpoint.check(tmp_path, scene)
     assert computed() == 0  # those of this program are still there
-
-
-# -- files of others -------------------------------------------------------------------------
 
 
 def npz_with_header(path, arrays, name, shape):

@@ -187,8 +187,6 @@ def test_ranks_end_together(body, status, line):
     assert run.stdout == ""
 
 
-# -- PETSc's options -------------------------------------------------------------------------
-
 ORDERING = "pc_factor_mat_ordering_type"
 VIEWED = {  # option, what the view shows by default and with the option
     "dolfinopt_stiffness_": ("ksp_view", f"{ORDERING} rcm", "ordering: natural", "ordering: rcm"),

@@ -35,9 +35,6 @@ def simulate(designs, *overrides):
     return built, x, *built.evaluate(x)
 
 
-# -- a NumPy/SciPy model of the same two arms -----------------------------------------------------
-
-
 @pytest.fixture(
     scope="module",
     params=TWO_ARM_VALUES["cases"],
@@ -103,9 +100,6 @@ def test_gradient_of_the_integrated_compliance(kind):
         expected = np.array(values[kind][k])
         # Measured: 7e-6 (esl), 1.7e-5 (exact).
         assert np.abs(boxes - expected).max() < 1e-4 * np.abs(expected).max()
-
-
-# -- geometrically exact beams --------------------------------------------------------------------
 
 
 def test_slow_motion_against_geometrically_exact_beams():

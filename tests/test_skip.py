@@ -60,8 +60,6 @@ def counts(folder: Path) -> Counts:
     return json.loads((folder / "summary.json").read_text())["counts"]
 
 
-# -- scene by scene --------------------------------------------------------------------------
-
 EACH = ARMS * DESIGNS  # once for every design of every arm
 ONCE = {"assemblies": 2 * EACH, "factorisations": EACH, "reductions": EACH}  # stiffness and mass
 LOADS = 4 * ARMS  # once a run: whether loads stiffen the arms is estimated
@@ -170,9 +168,6 @@ def test_nothing_moves_unless_asked(kind: str) -> None:
     assert moved.objective == still.objective and moved.max_deviation > 0.0
 
 
-# -- load cases ------------------------------------------------------------------------------
-
-
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("gradient", ["esl", "exact"])
 def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
@@ -189,9 +184,6 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
     assert few == many
     if gradient == "esl":
         assert few["energy_fields"] == 3 * EACH
-
-
-# -- warm starts -----------------------------------------------------------------------------
 
 
 @cache
@@ -229,8 +221,6 @@ def test_modes_and_trajectory_start_from_the_last_designs(
     if not overrides:
         assert 0 < 2 * warm["newton_iterations"] <= cold["newton_iterations"]
 
-
-# -- what is not asked for -------------------------------------------------------------------
 
 # Prints which of the modules it is told are there in the end, whatever the command does.
 LOADED = """

@@ -49,9 +49,6 @@ class Awkward(ConvergenceError):
         self.action = action
 
 
-# -- the context itself ----------------------------------------------------------------------
-
-
 def test_nothing_happens_to_good_work():
     with together(COMM):
         value = 3
@@ -134,9 +131,6 @@ def test_an_abandoned_generator_does_not_meet_anybody():
         next(generator)
         generator.close()
     COMM.Barrier()
-
-
-# -- every place that can fail on one rank ---------------------------------------------------
 
 
 def coarse(*overrides):
@@ -326,9 +320,6 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
     COMM.Barrier()
 
 
-# -- arms that several ranks share -----------------------------------------------------------
-
-
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
@@ -348,9 +339,6 @@ def test_a_shared_arm(owner, name, monkeypatch):
     with pytest.raises(Unusual, match=f"^{name}$"):
         evaluating(None, "arms.1.rigid=true")()
     COMM.Barrier()
-
-
-# -- studies ---------------------------------------------------------------------------------
 
 
 def payloads(*overrides):
@@ -395,9 +383,6 @@ def test_tables(monkeypatch, shared_tmp_path):
     with pytest.raises(Unusual, match=r"^tabulated$"):
         study.study(coarse(), None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
-
-
-# -- as a command ----------------------------------------------------------------------------
 
 
 # What fails, on which rank, in which command; the other places above end in the same two handlers.

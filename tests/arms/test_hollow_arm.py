@@ -144,8 +144,6 @@ def test_short_wide_boxes(size, cells, lag):
     assert flexibility("box", size, cells) == pytest.approx(solids, rel=3e-3)
 
 
-# -- gradients: the whole program, the wall of every cell free ------------------------------------
-
 KEYS = ("wall=0.002", "min_wall=0.001", "max_wall=0.005", "hollow=true")
 COARSE = (
     *(f"arms.{link}.{key}" for link in ("link1", "link2") for key in KEYS),
@@ -189,9 +187,6 @@ def test_gradients_by_the_wall(changes):
     known = {h: values(h) for h in (0.0, 5e-3, 1e-2)}
     for k, slope in enumerate(slopes):
         assert rates(lambda h, k=k: known[h][k], slope, (1e-2, 5e-3)) == pytest.approx(2.0, abs=0.1)
-
-
-# -- one design on any ranks ---------------------------------------------------------------------
 
 
 def test_the_same_on_any_ranks():

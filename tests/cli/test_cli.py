@@ -195,9 +195,6 @@ def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
         assert f"{kind} gradient in" in capsys.readouterr().out
 
 
-# -- used folders ----------------------------------------------------------------------------
-
-
 @pytest.mark.serial
 def test_the_launchers_set_up_does_not_count(monkeypatch):
     """The launcher's process, which may have installed everything, becomes the command's."""
@@ -330,9 +327,6 @@ def test_a_run_that_is_killed_leaves_nothing_old(shared_tmp_path, monkeypatch, h
     WORLD.barrier()
     assert {path.name for path in folder.iterdir()} == {"checkpoint.npz", "history.csv"}
     refusal(lambda: run("plot", folder), "summary.json")
-
-
-# -- bad input -------------------------------------------------------------------------------
 
 
 # Words of the command line (OUT: its folder), and words of the message.

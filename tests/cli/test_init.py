@@ -27,9 +27,6 @@ def errors(data: object) -> list[str]:
     return [error.message for error in jsonschema.Draft7Validator(schema).iter_errors(data)]
 
 
-# -- init ------------------------------------------------------------------------------------
-
-
 def test_every_template_is_offered():
     assert {path.stem for path in template_folder().glob("*.toml")} == set(TEMPLATES)
 
@@ -89,9 +86,6 @@ def test_init_replaces_nothing(tmp_path):
     assert load_scene(tmp_path / "deep" / "c.toml").name == "c"
 
 
-# -- keys ------------------------------------------------------------------------------------
-
-
 def test_keys_are_explained_by_pattern(capsys):
     run("keys")
     said = capsys.readouterr().out
@@ -106,9 +100,6 @@ def test_keys_are_explained_by_pattern(capsys):
     assert "arms.regions.circle" in names
     assert [line.split(":")[0].split(" ")[0] for line in heads] == names
     refusal(lambda: run("keys", "payload.mas2"), "payload.mas2", "payload.mass")
-
-
-# -- schema ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
@@ -149,9 +140,6 @@ def test_schema_finds_what_is_wrong():
         node[path[-1]] = value
         [message] = errors(data)
         assert word in message
-
-
-# -- ./dolfinopt.sh python -------------------------------------------------------------------
 
 
 def set_up(folder, interpreter, *stamps):

@@ -241,9 +241,6 @@ def test_what_other_programs_write(tmp_path):
         assert data.Gr.M0[2, 5] == value
 
 
-# -- damaged files ---------------------------------------------------------------------------
-
-
 def edited(old, new, count=1):
     assert old in bar()
     return bar().replace(old, new, count)

@@ -67,9 +67,6 @@ def in_scene(robot, mechanism, q):
     return np.column_stack([by_name[mechanism.joints[i].name] for i in mechanism.movable])
 
 
-# -- kinematics and inertia ------------------------------------------------------------------
-
-
 def test_the_scene_moves_as_the_robot(imported):
     """Frames of all bodies against yourdfpy's, the end-effector's the tool's."""
     file, scene, links = imported
@@ -157,9 +154,6 @@ def test_roll_pitch_yaw_comes_back():
     for R in (*some, *upright):
         R = some[0].T @ (some[0] @ R)  # to rounding, as products of poses are
         assert np.abs(roll_pitch_yaw(roll_pitch_yaw_of(R)) - R).max() < 1e-14
-
-
-# -- solids ----------------------------------------------------------------------------------
 
 
 def test_a_solid_lies_along_its_link():
@@ -269,8 +263,6 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     fractions = [arm.volume_fraction(start[k]) for k, arm in arms.items()]
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
 
-
-# -- shapes ----------------------------------------------------------------------------------
 
 SIDES = (0.5, 0.1, 0.08)
 SPAN = SimpleNamespace(frame=np.eye(4), length=0.4)  # joints at x = 0 and 0.4 m

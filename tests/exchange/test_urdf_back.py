@@ -262,9 +262,6 @@ def test_before_and_after():
     refusal(lambda: before_after(one, one | {"mass": {"link": 1.0}}), *words)
 
 
-# -- the demo --------------------------------------------------------------------------------
-
-
 def test_the_demo_is_what_the_import_writes(tmp_path):
     """But for what its head says is edited; its record leads to the robot."""
     run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")

@@ -17,8 +17,6 @@ yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 
-# -- the command -----------------------------------------------------------------------------
-
 
 def test_import_says_what_it_made(tmp_path, capsys):
     run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
@@ -272,9 +270,6 @@ def test_limits_and_friction_come_into_the_scene(tmp_path):
         else:
             assert (one.velocity_limit, one.effort_limit) == (joint.velocity, joint.effort)
             assert one.friction is None
-
-
-# -- inertias --------------------------------------------------------------------------------
 
 
 TENSOR = 'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"'

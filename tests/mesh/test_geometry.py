@@ -132,8 +132,6 @@ def test_bores_that_do_not_fit():
     refused(BORES, "overlap", "length 0.05 m", length=0.05)
 
 
-# --- a user's own files ----------------------------------------------------------------------
-
 PLAIN = """
 Point(1) = {0, -0.03, 0, 0.02}; Point(2) = {0.5, -0.03, 0, 0.02};
 Point(3) = {0.5, 0.03, 0, 0.02}; Point(4) = {0, 0.03, 0, 0.02};
@@ -383,9 +381,6 @@ def named(text, kind, fits):
             if fits(vertices):
                 marked = marked.replace(f"{kind}('{number}'", f"{kind}('x'")
     return re.sub(rf"{kind}\('\d+'", f"{kind}(''", marked)
-
-
-# --- what cannot be an arm -------------------------------------------------------------------
 
 
 BOTH = 'Physical Surface("design") = {1}; Physical Surface("passive") = {1};'

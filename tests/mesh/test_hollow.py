@@ -133,9 +133,6 @@ def test_no_plane_arm_is_hollow():
         do.load_scene(ROOT / "demos" / "two_arm.toml", ("arms.hollow=true", "arms.wall=0.002"))
 
 
-# -- hulls from a file ---------------------------------------------------------------------------
-
-
 def taper(cells: tuple[int, int, int] = (6, 4, 4)) -> Member:
     """Return a solid whose section shrinks along it from 60 x 40 mm to half of both."""
     counts = np.array(cells) + 1

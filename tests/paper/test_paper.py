@@ -60,9 +60,6 @@ def made_up():
 RESULTS = made_up()
 
 
-# -- checks on made-up results ---------------------------------------------------------------
-
-
 def test_made_up_results_meet_all_demands():
     """All that `reproduce --check` demands."""
     checks = check_paper(RESULTS)
@@ -136,9 +133,6 @@ def test_filter_that_is_asked_for_stays():
     assert full.design.radius == 0.0075 and len(filter_warnings(full, paper.cell_sizes(full))) == 1
 
 
-# -- measures --------------------------------------------------------------------------------
-
-
 def test_measures():
     x = np.linspace(4.0, 8.0, 9)
     assert span([2.0, 4.0]) == 0.5
@@ -155,9 +149,6 @@ def test_losses():
         columns=["made_for", 0.0, 0.5, 1.0],
     ).melt("made_for", var_name="x", value_name="compliance")
     np.testing.assert_allclose(paper.loss(rows, "compliance"), [[0.0, 0.25], [0.5, 0.0]])
-
-
-# -- what is planned -------------------------------------------------------------------------
 
 
 def test_scene_comes_with_the_package():

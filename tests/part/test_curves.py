@@ -72,9 +72,6 @@ def test_parts_of_a_spline_are_the_spline():
     np.testing.assert_allclose(middle, spline.at(np.array([0.15, 0.5, 0.85])), atol=1e-8)
 
 
-# --- recognised shapes ------------------------------------------------------------------------
-
-
 def kinds(points, labels=None):
     labels = np.full(len(points), "") if labels is None else labels
     return [edge.curve for edge in recognise(points, labels, float(np.ptp(points)))]
@@ -144,9 +141,6 @@ def test_curves_do_not_go_beyond_a_label():
 def test_sides_are_chained_to_loops():
     found = loops(np.array([[0, 1], [5, 6], [1, 2], [6, 7], [2, 0], [7, 5]]))
     assert sorted(sorted(loop.tolist()) for loop in found) == [[0, 1, 2], [5, 6, 7]]
-
-
-# --- splines through points -------------------------------------------------------------------
 
 
 def wave(count=400):

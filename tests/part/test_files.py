@@ -175,9 +175,6 @@ def test_browser_draws_the_svg(part, tmp_path):
     assert covered * (25.4 / 96.0) ** 2 == pytest.approx(1e6 * figures["area"], rel=5e-3)
 
 
-# --- commands ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

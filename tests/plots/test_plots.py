@@ -98,9 +98,6 @@ def shown(figure) -> np.ndarray:
     return image
 
 
-# -- numbers ---------------------------------------------------------------------------------
-
-
 def test_magnification_is_round_from_1_to_100_and_turns_ends_no_further_than_arms_do():
     for largest, expected in ((0.0556, 5.0), (0.00775, 20.0), (1.0, 1.0), (1e-6, 100.0), (0, 1.0)):
         assert animation.round_magnification(largest, 2.0) == expected
@@ -138,9 +135,6 @@ def test_areas_and_volume_fraction_of_any_polygons():
     corners = np.array([[[0, 0], [0, 1], [3, 1], [3, 0]], [[3, 0], [4, 0], [4, 1], [3, 1]]], float)
     view = ArmView("a", corners, corners.mean(axis=1), np.array([1.0, 0.2]), np.zeros((2, 4, 2, 0)))
     assert design.volume_fraction(view) == pytest.approx(0.8)  # the first one is clockwise
-
-
-# -- designs ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("arms", [1, 6])
@@ -205,9 +199,6 @@ def test_stress_says_where_when_and_in_what_unit():
     np.testing.assert_allclose(first.lines[0].get_xydata(), views[0].centroid[:1])
     assert not second.lines
     shown(figure)
-
-
-# -- curves ----------------------------------------------------------------------------------
 
 
 def history(count: int) -> list[HistoryRow]:
@@ -283,9 +274,6 @@ def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
     assert "[s]" in axes.get_xlabel() and "[mm]" in axes.get_ylabel()
 
 
-# -- motion ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("magnification", [1.0, 20.0])
 def test_magnified_arms_join(magnification):
     views, mechanism = manipulator(3)
@@ -355,9 +343,6 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
     assert (pictures[3] != pictures[0]).any(axis=2).sum() > 1000
 
 
-# -- the machine -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("arms", [1, 3])
 def test_machine_shows_every_arm_where_it_is(arms):
     views, mechanism = manipulator(arms)
@@ -376,9 +361,6 @@ def test_machine_shows_every_arm_where_it_is(arms):
     np.testing.assert_allclose(ends, machine.plane(place[at, -1]))
     solid = np.abs(shown(figure) - [8, 29, 88]).max(axis=2) < 12
     assert solid.sum() > 2000
-
-
-# -- closed loops and control ----------------------------------------------------------------
 
 
 def slider_crank(count: int = 61) -> tuple[list[ArmView], Any]:
@@ -475,9 +457,6 @@ def test_machine_shows_one_turn_of_a_loop():
     assert [len(end) for end in ends] == [1] * 4
     np.testing.assert_allclose(np.concatenate(ends)[:, 1], 0.0, atol=2e-6)
     shown(figure)
-
-
-# -- drives ----------------------------------------------------------------------------------
 
 
 def simulated(scene):

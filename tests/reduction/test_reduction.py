@@ -116,9 +116,6 @@ def at(shared_arm, own_arm):
     ]
 
 
-# -- against dense algebra ------------------------------------------------------------------------
-
-
 @pytest.mark.serial
 @pytest.mark.parametrize("design", DESIGNS)
 def test_statics(at, design):
@@ -216,9 +213,6 @@ def test_too_many_modes_are_an_error_that_says_so():
         lowest_eigenpairs(interior_pencil(arm), 5, None)
 
 
-# -- the search's start ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("method", "q"), [("craig-bampton", 4), ("craig-bampton", 8), ("modal", 4)]
 )
@@ -300,9 +294,6 @@ def test_modes_point_the_same_way_on_any_mesh():
         ways = [np.sign(value[larger, np.arange(len(larger))]) for value in values]
         assert np.array_equal(ways[0], ways[1]) and np.array_equal(ways[0], ways[2])
         assert ways[0].all()
-
-
-# -- subspaces ------------------------------------------------------------------------------------
 
 
 def inputs(arm):
@@ -489,9 +480,6 @@ def test_adjoint_of_modes_is_no_answer_where_a_product_is_no_number(iterative):
             complement_solve(pencil, modes, values, right)
 
 
-# -- ranks ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
 @pytest.mark.parametrize(
     ("method", "q"),
@@ -514,8 +502,6 @@ def test_ranks_agree_with_one_rank(at, method, q):
         scale = np.abs(reference).max(initial=0.0)  # of further interfaces: none
         assert np.abs(np.asarray(ours) - reference).max(initial=0.0) <= 1e-9 * scale
 
-
-# -- against beam theory --------------------------------------------------------------------------
 
 SHEAR = YOUNG / (2.0 * (1.0 + POISSON))  # Pa
 AREA, INERTIA = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0  # m2, m4

@@ -27,8 +27,6 @@ pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
 JOINTS = {"path": "joints", "file": str(TWO_ARM)}
 
-# --- valid scenes ----------------------------------------------------------------------------
-
 
 def test_demo_holds_the_defaults():
     demo = load_scene(TWO_ARM)
@@ -124,9 +122,6 @@ def test_borders_of_the_ranges_are_allowed(paths, value):
         scene_from_dict(data, overrides=["arms.passive=0"])
 
 
-# --- what an arm derives from its keys -------------------------------------------------------
-
-
 def test_reducible_dofs():
     # 3 x 2 cells: 2 columns of interior nodes with 3 nodes of 2 dofs, and the outboard interface.
     assert Arm(**ARM, cells=(3, 2)).n_reducible == 2 * 3 * 2 + 3
@@ -164,9 +159,6 @@ def test_ends_are_solid_unless_the_scene_says_otherwise():
     data = scene_from_dict(minimal()).to_dict()  # the default is not frozen by writing it
     ends = [arm.solid_ends for arm in scene_from_dict(data, overrides=["arms.height=0.1"]).arms]
     assert ends == [0.025, 0.025]
-
-
-# --- overrides -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -271,8 +263,6 @@ def test_several_problems_are_counted(pairs, overrides, more):
 def test_the_file_or_the_last_override_is_blamed(path, value, overrides, start):
     assert refused(changed(path, value), overrides=overrides).startswith(FILE + start)
 
-
-# --- bad values ------------------------------------------------------------------------------
 
 LENGTHS, MODULI = "a number >= 1e-06 and <= 10000", "a number >= 1 and <= 1e+15"
 FLAGS, STRING = "true or false", "a string"
@@ -559,9 +549,6 @@ def test_whatever_is_shown_is_short_and_printable():
         refused(data, "a table of scene keys", written(data))
 
 
-# --- unknown and missing keys ----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("path", "unknown", "closest", "allowed"),
     [
@@ -652,9 +639,6 @@ def test_gradient_is_exact_but_of_the_esl_objective_alone(tables, gradient):
         assert scene_from_dict(scene.to_tree(), overrides=[change]).objective.gradient == later
 
 
-# --- documentation ---------------------------------------------------------------------------
-
-
 def test_every_key_is_described_with_a_unit():
     keys = describe_keys()
     assert len({info.key for info in keys}) == len(keys)
@@ -688,9 +672,6 @@ def test_described_defaults():
     }
 
 
-# --- scenarios -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("scenario", "words"),
     [
@@ -719,9 +700,6 @@ def test_scenarios_change_what_they_name():
     assert first.scenarios == second.scenarios == () and first.objective.scenarios == "sum"
     assert first.objective.gradient == second.objective.gradient == scene.objective.gradient
     assert scene_from_dict(scene.to_dict()) == scene
-
-
-# --- arms that share a design, are rigid, or come from a file --------------------------------
 
 
 def test_who_owns_which_design():
@@ -789,8 +767,6 @@ def test_length_of_a_body_from_a_file(tmp_path):
     first = scene_from_dict(data, str(tmp_path / "scene.toml")).arms[0]
     assert first.height == first.thickness == pytest.approx(0.04)
 
-
-# -- options that nothing uses -----------------------------------------------------------------
 
 # Key, a value that is not its default, and settings with which something uses it.
 UNUSED = {

@@ -51,9 +51,6 @@ def killed(*args, **kwargs):
     raise Killed
 
 
-# -- keys ------------------------------------------------------------------------------------
-
-
 CHANGES = {
     "material": "material.density=2701",
     "interpolation": "interpolation.penalty=3.1",
@@ -136,9 +133,6 @@ def test_batches_have_one_basis():
     assert Case(scene(gramian, damped)).batch_key != Case(scene(gramian)).batch_key
     chosen = Case(scene("reduction.coordinates=auto"))
     assert chosen.batch_key == chosen.key
-
-
-# -- doing them ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -293,9 +287,6 @@ def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batche
         assert_close(after[one], outcomes[one])
 
 
-# -- interruptions and failures --------------------------------------------------------------
-
-
 @alone
 def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch, batches):
     """Nothing of it is in place: it is computed anew as a whole, to the same bits."""
@@ -412,9 +403,6 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
 def test_another_run_is_refused(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(disk, "try_lock", lambda *arguments: False)
     refusal(lambda: run_cases(plan, tmp_path, SELF, shown=False), str(tmp_path), "another run")
-
-
-# -- progress --------------------------------------------------------------------------------
 
 
 def test_plain_lines_tell_of_every_case(plan, shared_tmp_path, capsys):

@@ -173,9 +173,6 @@ def test_sweep_looks_as_it_did(tmp_path):
     assert difference(PICTURE, sweep_figure(1.05), tmp_path) > TOLERANCE
 
 
-# -- files ------------------------------------------------------------------------------------
-
-
 def test_table():
     columns = ["a|b [m]", "n", "x"]
     rows = [("one|two", 3, 1.23456), ("", 4, np.nan)]

@@ -66,9 +66,6 @@ def search(members, values):
         return end.value, asked
 
 
-# -- the search ------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def bars(tmp_path_factory):
     return Members(do.load_scene(TWO_ARM), "solid bar", FLAT_BAR, tmp_path_factory.mktemp("m"))
@@ -130,9 +127,6 @@ def test_of_the_same_mass(bars):
     assert bars.of_mass({0: 0.81, 1: 1.7}) is None
 
 
-# -- who wins --------------------------------------------------------------------------------
-
-
 def row(kind, mass, deviation=0.9, lightest=False, objective=1.0):
     values = {} if deviation is None else {"deviation": deviation}
     return Row(kind, "", "", Found(values, mass, objective), lightest)
@@ -163,9 +157,6 @@ def row(kind, mass, deviation=0.9, lightest=False, objective=1.0):
 )  # fmt: skip
 def test_the_sentence(rows, said):
     assert said in verdict(do.load_scene(TWO_ARM), rows)
-
-
-# -- the command -----------------------------------------------------------------------------
 
 
 def test_bars_in_the_plane(shared_tmp_path, capsys):
@@ -269,9 +260,6 @@ def test_arms_that_no_member_replaces(shared_tmp_path):
         changed = scene.model_copy(update={"arms": arms})
         refusal(lambda: study_sections(changed, (), shared_tmp_path / "o", WORLD), *words)  # noqa: B023
     assert not (shared_tmp_path / "o").exists()
-
-
-# -- the page of before and after ----------------------------------------------------------------
 
 
 @alone

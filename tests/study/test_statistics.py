@@ -34,9 +34,6 @@ TEXTS = (
 )
 
 
-# -- distributions ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("text", "mean", "variance"),
     [
@@ -116,9 +113,6 @@ def quadrature(law: Distribution) -> tuple[np.ndarray, np.ndarray]:
     return x, w * law.law.pdf(x)
 
 
-# -- samples ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
 def test_seeds_repeat(sampler):
     one = unit_points(50, 3, sampler, 7)
@@ -142,9 +136,6 @@ def test_saltelli_points():
     for i in range(3):
         np.testing.assert_array_equal(mixed[i][:, i], B[:, i])
         np.testing.assert_array_equal(np.delete(mixed[i], i, axis=1), np.delete(A, i, axis=1))
-
-
-# -- statistics ------------------------------------------------------------------------------
 
 
 def test_statistics_of_a_normal_sample():
@@ -192,8 +183,6 @@ def test_few_samples_bound_no_quantile():
     assert constant["mean"] == (3.0, 3.0, 3.0)
     assert constant["standard deviation"] == (0.0, 0.0, 0.0)
 
-
-# -- Sobol' indices --------------------------------------------------------------------------
 
 A, B = 7.0, 0.1
 

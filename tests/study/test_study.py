@@ -45,9 +45,6 @@ def is_drawn(path):
     return np.asarray(Image.open(path).convert("L")).std() > 5.0
 
 
-# -- what is asked ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("text", "values"),
     [
@@ -120,9 +117,6 @@ def test_missing_words_and_the_command_of_before():
     refusal(lambda: run_command("study", TWO_ARM, "payload", "--designs", "a.npz"), "sweep")
     with pytest.raises(click.UsageError, match="what"):
         run_command("compare", TWO_ARM)
-
-
-# -- sweeps ----------------------------------------------------------------------------------
 
 
 def evaluated(scene, result, x=None):
@@ -240,9 +234,6 @@ def test_what_needs_reoptimising(folder, vary, made):
     assert made or first[1] < second[1]  # the initial design
 
 
-# -- names and folders -----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("preset", "vary", "name"),
     [
@@ -297,9 +288,6 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
     assert files() == before
     computed(*other, "--overwrite", "--no-plots")
     assert files()["payload.mass.csv"] != before["payload.mass.csv"]
-
-
-# -- objectives and reductions ---------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -427,9 +415,6 @@ def test_failures_end_with_status_one(folder, monkeypatch):
     rows = rows_of(folder / "payload.csv")
     assert rows[0]["failed"] == "" and rows[0]["initial design: compliance [N m]"]
     assert rows[1]["failed"] == "no solution" and not rows[1]["initial design: compliance [N m]"]
-
-
-# -- killed ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -54,9 +54,6 @@ def evaluated(*overrides, density=0.5):
     return do.evaluate(other, partition, arms, x, do.Profile())[0]
 
 
-# -- what is asked ---------------------------------------------------------------------------
-
-
 BAD = [
     (["payload.mass"], [], "KEY=DISTRIBUTION"),
     (["payload.mass=cauchy:6:1"], [], "one of normal"),
@@ -118,9 +115,6 @@ def test_a_sample_out_of_reach_names_its_number():
     assert with_sample(scene(), (), 0) == scene()
     words = "--random", "sample 2", "motion.radius=5.0"
     refusal(lambda: with_sample(scene(), ("motion.radius=5.0",), 2), *words)
-
-
-# -- samples ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -252,9 +246,6 @@ def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch)
     assert len(rows) == 10 and "" in {row["solid: compliance [N m]"] for row in rows}
     found, computed, failures = respond(cases, tmp_path, SELF)
     assert computed == CHUNK and not failures and np.isfinite(found).all()
-
-
-# -- what comes out --------------------------------------------------------------------------
 
 
 @pytest.mark.slow
