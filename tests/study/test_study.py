@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, command, environment, overrides, refusal
+from runs import ROOT, TWO_ARM, by_root, command, contents, environment, overrides, refusal
 from runs import run as run_command
 from studies import COARSE, cells_of, column, rows_of, write_uniform
 
@@ -138,9 +138,8 @@ def test_bad_input_is_one_line(refused, shared_tmp_path):
     """Of sweeps, comparisons, random values and the paper: before anything is written."""
     words, *expected = refused
     other = shared_tmp_path / "OTHER.npz"
-    if WORLD.rank == 0:
-        np.savez(other, **{"leg/centroid": np.zeros((1, 2)), "leg/density": np.ones(1)})
-    WORLD.barrier()
+    arrays = {"leg/centroid": np.zeros((1, 2)), "leg/density": np.ones(1)}
+    by_root(lambda: np.savez(other, **arrays))
     line = [str(other) if part == other.name else part for part in words]
     refusal(lambda: run_command(*line, *SETTINGS, "--out", shared_tmp_path / "o"), *expected)
     assert not (shared_tmp_path / "o").exists()
@@ -173,7 +172,6 @@ def test_payload(folder, capsys):
     if WORLD.rank == 0:
         assert "5 cases computed" in first.out
         assert (folder / "payload.md").read_text() in first.out
-    WORLD.barrier()
     before = (folder / "payload.csv").read_bytes()
     run(*arguments)
     if WORLD.rank == 0:
@@ -286,16 +284,12 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
         said = capsys.readouterr().out
         return int(re.search(r"(\d+) cases computed", said)[1]) if WORLD.rank == 0 else None
 
-    def files():
-        WORLD.barrier()
-        return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-
     first = computed("--vary", "payload.mass=4,8")
-    before = files()
+    before = contents(folder)
     names = {f"payload.mass{end}" for end in (".csv", ".md", ".json", ".png", "_curves.csv")}
     assert set(before) == names
     computed("--vary", "motion.duration=1.9,2.1", "--no-plots")
-    after = files()
+    after = contents(folder)
     assert {name: after[name] for name in names} == before
     others = {f"motion.duration{end}" for end in (".csv", ".md", ".json", "_curves.csv")}
     assert set(after) == names | others
@@ -303,14 +297,14 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
     if WORLD.rank == 0:
         # Two designs by value; the optimised design is made once, and 12 kg alone is new.
         assert (first, grown) == (1 + 4, 2)
-    assert "payload.mass.png" not in files()  # it showed two values
+    assert "payload.mass.png" not in contents(folder)  # it showed two values
     assert len(rows_of(folder / "payload.mass.csv")) == 3
-    before = files()
+    before = contents(folder)
     other = ["--vary", "payload.mass=4,8", "--set", "payload.inertia=0.1"]
     refusal(lambda: run(TWO_ARM, *other, *quick), "payload.mass.*", "another scene")
-    assert files() == before
+    assert contents(folder) == before
     computed(*other, "--overwrite", "--no-plots")
-    assert files()["payload.mass.csv"] != before["payload.mass.csv"]
+    assert contents(folder)["payload.mass.csv"] != before["payload.mass.csv"]
 
 
 @pytest.mark.slow
