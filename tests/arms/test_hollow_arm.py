@@ -37,9 +37,8 @@ def flexibility(section: str, size: tuple[float, float, float], cells) -> np.nda
 def box(size: tuple[float, float, float]) -> np.ndarray:
     """Return the same by Timoshenko, and Bredt with both ends held from warping (Benscoter).
 
-    Round sharp corners shear flows on a shorter way than along the middle of the wall. With
-    mu = ((h - b) / (h + b))^2 and k^2 = mu G J / (E I_w) the ends take 2 mu / k tanh(k L / 2) of
-    the length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
+    mu = ((h - b) / (h + b))^2, k^2 = mu G J / (E I_w): the ends take 2 mu / k tanh(k L / 2) of the
+    length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
     """
     L, h, b = size
     t = min(h, b) / 40.0
@@ -157,11 +156,8 @@ COARSE = (
     "changes",
     [
         ("objective.kind=esl", "constraints.mass=2.0", "constraints.tip_deflection=1e-3"),
-        pytest.param(
-            ("objective.kind=mass", "constraints.deviation=0.01", "constraints.stress=1e8",
-             "constraints.first_frequency=100"),
-            marks=pytest.mark.slow,
-        ),
+        pytest.param(("objective.kind=mass", "constraints.deviation=0.01", "constraints.stress=1e8",
+                      "constraints.first_frequency=100"), marks=pytest.mark.slow),
     ],
     ids=["esl", "mass"],
 )  # fmt: skip
