@@ -36,21 +36,17 @@ def fine(curve):
 
 
 @pytest.mark.parametrize("curve", CURVES)
-def test_area_is_that_of_many_chords(curve):
-    x, y = fine(curve).T
+def test_curves_reversed_and_mirrored(curve):
+    """They run through the same points; their area is that of many chords."""
+    points, t = fine(curve), np.linspace(0.0, 1.0, 6)
+    x, y = points.T
     expected = 0.5 * (x[:-1] * y[1:] - x[1:] * y[:-1]).sum()
     assert curve.area == pytest.approx(expected, abs=1e-7)
-    assert curve.reversed().area == pytest.approx(-curve.area, rel=1e-12)
-    assert curve.mirrored().area == pytest.approx(-curve.area, rel=1e-12)
-
-
-@pytest.mark.parametrize("curve", CURVES)
-def test_reversed_and_mirrored_run_through_the_same_points(curve):
-    points = fine(curve)
+    for other in (curve.reversed(), curve.mirrored()):
+        assert other.area == pytest.approx(-curve.area, rel=1e-12)
     np.testing.assert_allclose(fine(curve.reversed()), points[::-1], atol=1e-12)
     np.testing.assert_allclose(fine(curve.mirrored()), points * [1.0, -1.0], atol=1e-12)
     np.testing.assert_allclose(direction(curve, 0.0), -direction(curve.reversed(), 1.0), atol=1e-9)
-    t = np.linspace(0.0, 1.0, 6)
     np.testing.assert_allclose(curvature(curve.mirrored(), t), -curvature(curve, t), atol=1e-9)
 
 
