@@ -17,14 +17,7 @@ from runs import ROOT, TWO_ARM, command, environment, overrides, refusal, run
 import dolfinopt as do
 from dolfinopt import disk
 from dolfinopt.data import paper_scene
-from dolfinopt.disk import (
-    append_text,
-    make_folder,
-    working_in,
-    write_arrays,
-    write_atomically,
-    write_text,
-)
+from dolfinopt.disk import append_text, working_in, write_text
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
@@ -58,7 +51,7 @@ def small_files():
     "write",
     [
         lambda path: write_text(path, 5000 * "x"),
-        lambda path: write_arrays(path, {"a": np.arange(5000.0)}),
+        lambda path: disk.write_arrays(path, {"a": np.arange(5000.0)}),
         lambda path: append_text(path, 5000 * "x"),
     ],
     ids=["text", "arrays", "append"],
@@ -77,11 +70,6 @@ def not_written(write, *words):
     assert all(word in str(caught.value) for word in words)
 
 
-def test_folders(tmp_path):
-    (tmp_path / "file").write_text("")
-    not_written(lambda: make_folder(tmp_path / "file" / "a"), "a: ", "Not a directory", "a folder")
-
-
 @pytest.mark.parametrize("step", ["open", "fsync", "replace"])
 def test_every_step_of_writing(step, tmp_path, monkeypatch):
     path = tmp_path / "file"
@@ -93,6 +81,8 @@ def test_every_step_of_writing(step, tmp_path, monkeypatch):
     not_written(lambda: write_text(path, "after\n"), "No space left on device")
     monkeypatch.undo()
     assert path.read_text() == "before\n" and len(list(tmp_path.iterdir())) == 1
+    words = "a: ", "Not a directory", "a folder"
+    not_written(lambda: disk.make_folder(path / "a"), *words)
 
 
 def test_errors_of_a_format_are_not_the_disks(tmp_path):
@@ -100,7 +90,7 @@ def test_errors_of_a_format_are_not_the_disks(tmp_path):
         raise OSError("no such format")
 
     with pytest.raises(OSError, match="no such format"):
-        write_atomically(tmp_path / "picture", write)
+        disk.write_atomically(tmp_path / "picture", write)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -221,19 +211,13 @@ def design(tmp_path_factory):
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("kind", "word"),
-    [
-        ("npy", ".npz file"),
-        ("8 TiB", ".npz file"),
-        ("complex", "complex128"),
-        ("text", "<U3"),
-        ("pipe", "no regular file"),
-    ],
-)
+    [("npy", ".npz file"), ("8 TiB", ".npz file"), ("complex", "complex128"), ("text", "<U3"),
+     ("pipe", "no regular file")],
+)  # fmt: skip
 def test_designs_that_are_none(design, tmp_path, kind, word):
     path = tmp_path / "design.npz"
     if kind == "npy":
-        with open(path, "wb") as stream:
-            np.save(stream, np.zeros(3))
+        np.lib.format.write_array(path.open("wb"), np.zeros(3))
     elif kind == "8 TiB":
         npz_with_header(path, design, "arm1/density", (2**40,))
     elif kind == "pipe":
@@ -271,14 +255,11 @@ def test_edited_checkpoints(tmp_path):
         refusal(lambda: run(*line), checkpoint.NAME, "cannot read")  # noqa: B023
 
 
-def test_a_pipe_is_no_scene(tmp_path):
-    """Opening it would wait for ever."""
+def test_a_pipe_is_no_scene_and_a_device_no_folder_for_forms(tmp_path, monkeypatch):
+    """Opening a pipe would wait for ever."""
     path = tmp_path / f"{COMM.rank}.toml"
     os.mkfifo(path)
     refusal(lambda: load_scene(path), str(path), "no regular file")
-
-
-def test_folder_for_forms_that_cannot_be_made(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     compat.check_form_cache.cache_clear()
     refusal(compat.check_form_cache, "/dev/null", "XDG_CACHE_HOME")

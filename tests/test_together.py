@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import build
-from runs import TWO_ARM, environment, overrides
+from runs import TWO_ARM, by_root, environment, overrides
 
 import dolfinopt as do
 from dolfinopt.arms import arm, design_state
@@ -49,15 +49,12 @@ class Awkward(ConvergenceError):
         self.action = action
 
 
-def test_nothing_happens_to_good_work():
-    with together(COMM):
-        value = 3
-    assert value == 3
-
-
 @pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError, KeyboardInterrupt, SystemExit])
 @pytest.mark.parametrize("rank", [0, COMM.size - 1])
 def test_one_ranks_exception_is_raised_on_all(kind, rank):
+    with together(COMM):
+        value = 3
+    assert value == 3  # nothing happens to good work
     with pytest.raises(kind) as raised, together(COMM):
         if COMM.rank == rank:
             raise kind(f"on rank {rank}")
@@ -75,22 +72,15 @@ def test_any_exception_of_the_root_is_raised_on_all(kind):
 
     with pytest.raises(kind, match=r"^at the root$"):
         on_root(COMM, fail)
-    COMM.Barrier()
-
-
-def test_a_result_that_cannot_be_sent_is_an_exception_on_all():
     if COMM.size > 1:  # on one rank nothing is sent
         with pytest.raises((pickle.PicklingError, AttributeError)):
             on_root(COMM, lambda: lambda: None)
     COMM.Barrier()
 
 
-def test_the_first_of_several_is_raised():
+def test_the_first_of_several_is_raised_and_a_failure_before_those_who_gave_up():
     with pytest.raises(ValueError, match=r"^of rank 0$"), together(COMM):
         raise ValueError(f"of rank {COMM.rank}")
-
-
-def test_a_failure_goes_before_those_who_gave_up():
     with pytest.raises(Unusual), together(COMM):
         raise Unusual("why") if COMM.rank == COMM.size - 1 else OthersFailed("given up")
 
@@ -104,8 +94,8 @@ def test_an_exception_that_cannot_be_sent_arrives_as_its_nearest_relative():
     class Local(InputError):
         pass
 
-    assert type(pickle.loads(_pickled(Local("no")))) is InputError
-    assert str(pickle.loads(_pickled(Local("no")))) == "no"
+    sent = pickle.loads(_pickled(Local("no")))
+    assert type(sent) is InputError and str(sent) == "no"
 
 
 def test_parts_of_the_ranks_agree_first():
@@ -213,9 +203,7 @@ def writing_gradients(folder):
 def reading_designs(folder):
     built = build(*COARSE)
     found = do.gather_views(*built.place, built.uniform())
-    if COMM.rank == 0:
-        design.write_design(folder, found)
-    COMM.Barrier()
+    by_root(lambda: design.write_design(folder, found))
     return lambda: design.read_design(folder / "design.npz", built.partition, built.arms)
 
 
@@ -323,14 +311,9 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [
-        (mesh, "mesh_geo"),
-        (mesh, "_arm_mesh"),
-        (elements, "_full"),
-        (elasticity, "AffineMatrix"),
-        (design_state, "interpolate"),
-    ],
-)
+    [(mesh, "mesh_geo"), (mesh, "_arm_mesh"), (elements, "_full"), (elasticity, "AffineMatrix"),
+     (design_state, "interpolate")],
+)  # fmt: skip
 def test_a_shared_arm(owner, name, monkeypatch):
     """The ranks of an arm meet in between: none is left in a collective of the arm."""
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)
@@ -411,12 +394,8 @@ main()
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
 @pytest.mark.parametrize(
     ("place", "kind"),
-    [
-        ("mesh", "ConvergenceError"),
-        ("checkpoint", "ConvergenceError"),
-        ("mesh", "ZeroDivisionError"),
-        ("simulation", "ZeroDivisionError"),
-    ],
+    [(place, "ConvergenceError") for place in ("mesh", "checkpoint")]
+    + [(place, "ZeroDivisionError") for place in ("mesh", "simulation")],
 )
 def test_commands(place, kind, tmp_path):
     """All ranks end by themselves, with one message: nobody has to be aborted."""
