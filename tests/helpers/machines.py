@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
-from runs import ROOT, TWO_ARM, scene
+from runs import ROOT, TWO_ARM, by_root, scene
 
 import dolfinopt as do
 from dolfinopt.dynamics.collocation import Solution
@@ -340,9 +339,7 @@ def demo_machine(name: str, changes: Sequence[str], folder: Path, *, one_arm: bo
     """
     told = [change.replace("FOLDER", str(folder)) for change in changes]
     if not name:
-        if MPI.COMM_WORLD.rank == 0:
-            (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
-        MPI.COMM_WORLD.barrier()
+        by_root(lambda: (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n"))
         return scene_from_dict(fork(), str(folder / "fork.toml"), told)
     path = ROOT / "demos" / f"{name}.toml"
     if not one_arm:

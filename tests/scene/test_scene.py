@@ -464,11 +464,6 @@ def test_value_that_is_shown_otherwise(path, value, shown, allowed):
     assert "more)" not in message
 
 
-def test_more_arms_than_any_machine_has():
-    """They were read for half a minute without a word."""
-    refused(minimal(1001), "arms: 1001", "at most 1000")
-
-
 def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
@@ -539,6 +534,7 @@ def test_contradictions(n_arms, changes, shown, allowed):
 
 
 def test_whatever_is_shown_is_short_and_printable():
+    refused(minimal(1001), "arms: 1001", "at most 1000")  # more than any machine has
     assert len(refused(changed("objective.kind", 10_000 * "x"), "...")) < 500
     with pytest.raises(InputError) as caught:
         scene_from_dict(changed("objective.kind", "\x1b[31m\u2028\n"), "a\nb\udc80.toml")
@@ -578,11 +574,11 @@ def test_unknown_key(path, unknown, closest, allowed):
 
 
 def test_misspelt_key_comes_before_the_missing_one():
+    refused(minimal(payload={1: 2}), "unknown key payload.1", "mass")  # a key that is no string
     data = minimal()
     data["material"]["youngs_modulus"] = data["material"].pop("young_modulus")
     words = "unknown key material.youngs_modulus", "material.young_modulus?"
     assert refused(data, *words).endswith("(and 1 more)")
-    refused(minimal(payload={1: 2}), "unknown key payload.1", "mass")  # a key that is no string
 
 
 @pytest.mark.parametrize(
@@ -639,7 +635,7 @@ def test_gradient_is_exact_but_of_the_esl_objective_alone(tables, gradient):
         assert scene_from_dict(scene.to_tree(), overrides=[change]).objective.gradient == later
 
 
-def test_every_key_is_described_with_a_unit():
+def test_every_key_is_described_with_a_unit_and_its_default():
     keys = describe_keys()
     assert len({info.key for info in keys}) == len(keys)
     tables = {info.key.partition(".")[0] for info in keys}
@@ -647,13 +643,7 @@ def test_every_key_is_described_with_a_unit():
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info
-
-
-BORE = ("point", "axis", "radius")
-
-
-def test_described_defaults():
-    defaults = {info.key: info.default for info in describe_keys()}
+    defaults = {info.key: info.default for info in keys}
     assert defaults["arms.cells"] == "[200, 12]"
     assert defaults["reduction.method"] == '"craig-bampton"'
     required = {key for key, default in defaults.items() if not default}
@@ -661,15 +651,15 @@ def test_described_defaults():
         "name",  # of the file
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
-        *("motion.path", "payload.mass"),
-        *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
-        *("closures.name", "closures.kind", "closures.between"),
-        *("arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm"),
-        *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
+        "motion.path", "payload.mass", "forces.arm",
+        "scenarios.changes", "arms.regions.kind",  # of every one that there is
+        "closures.name", "closures.kind", "closures.between",
+        "arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm",
+        "control.stiffness", "control.damping", "closure.kind",  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
-        "forces.arm",
-        *(f"arms.{end}_bore.{key}" for end in ("inboard", "outboard") for key in BORE),
-    }
+        *(f"arms.{end}_bore.{key}" for end in ("inboard", "outboard")
+          for key in ("point", "axis", "radius")),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -702,7 +692,7 @@ def test_scenarios_change_what_they_name():
     assert scene_from_dict(scene.to_dict()) == scene
 
 
-def test_who_owns_which_design():
+def test_who_owns_which_design_and_limits():
     data = minimal(4)
     data["arms"][1]["rigid"] = True
     data["arms"][3]["design"] = "arm1"
@@ -710,6 +700,11 @@ def test_who_owns_which_design():
     assert scene.owners == (0, None, 2, 0)
     assert scene.cell_counts == {0: 2400, 2: 2400}
     assert [arm.rigid for arm in scene.arms] == [False, True, False, False]  # not inherited
+    # One limit for all or one for each flexible arm; none at all.
+    scene = scene_from_dict(minimal(constraints={"first_frequency": [10.0, 20.0]}))
+    assert scene.constraints.first_frequency == (10.0, 20.0)
+    assert scene_from_dict(scene.to_dict()).constraints == scene.constraints
+    scene_from_dict(minimal(objective={"kind": "mass", "direction": "maximize"}))
 
 
 def test_nothing_attached_needs_solid_ends():
@@ -740,14 +735,6 @@ def test_volume_is_limited_unless_mass_is(tables, limit):
     # What was stated stays when the mass is limited later.
     stated = scene_from_dict(scene.to_tree(), overrides=["constraints.mass=1.0"])
     assert stated.design.volume_fraction == tables.get("design", {}).get("volume_fraction")
-
-
-def test_limits_of_every_arm():
-    """One for all or one for each: of the flexible arms, and of those with a design."""
-    scene = scene_from_dict(minimal(constraints={"first_frequency": [10.0, 20.0]}))
-    assert scene.constraints.first_frequency == (10.0, 20.0)
-    assert scene_from_dict(scene.to_dict()).constraints == scene.constraints
-    scene_from_dict(minimal(objective={"kind": "mass", "direction": "maximize"}))  # no limit
 
 
 def test_length_of_a_body_from_a_file(tmp_path):
@@ -807,12 +794,9 @@ def test_every_option_of_a_response_is_used_by_one():
     """The table of their users names options, objectives and limits that there are."""
     for key, (objectives, limits) in OPTIONS.items():
         assert key in Objective.model_fields
-        assert set(objectives) <= set(get_args(ObjectiveKind)) and set(limits) <= set(
-            Constraints.model_fields
-        )
-
-
-def test_no_volume_is_shared_where_none_is_limited():
+        assert set(objectives) <= set(get_args(ObjectiveKind))
+        assert set(limits) <= set(Constraints.model_fields)
+    # No volume is shared where none is limited.
     lightest, shared = TWO_ARM.with_name("lightest_two_arm.toml"), "design.shared_volume=true"
     assert load_scene(lightest, ["design.volume_fraction=0.4", shared]).design.shared_volume
     refusal(lambda: load_scene(lightest, [shared]), "design.shared_volume = true", "false")
