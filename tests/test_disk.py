@@ -16,16 +16,15 @@ from runs import ROOT, TWO_ARM, command, environment, overrides, refusal, run
 
 import dolfinopt as do
 from dolfinopt import disk
+from dolfinopt.cli.studies import _write_question
 from dolfinopt.data import paper_scene
 from dolfinopt.disk import append_text, working_in, write_text
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
-from dolfinopt.output.folders import write_question
 from dolfinopt.parallel import abort_together
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study.cases import Case
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 ROUGH = ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
@@ -282,7 +281,7 @@ def test_a_package_that_is_missing_is_named(tmp_path, name):
 
 def test_question_on_a_full_disk(tmp_path, small_files):
     question = {"scene": 5000 * "x"}
-    not_written(lambda: write_question(tmp_path, "sweep", question, []), "sweep.json")
+    not_written(lambda: _write_question(tmp_path, "sweep", question, []), "sweep.json")
     assert not list(tmp_path.iterdir())
 
 

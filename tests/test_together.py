@@ -25,10 +25,9 @@ from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study import store
+from dolfinopt.study import cases as computing
 from dolfinopt.study import studies as study
-from dolfinopt.study.cases import Case
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 COMM = MPI.COMM_WORLD
@@ -333,7 +332,7 @@ def payloads(*overrides):
 @pytest.mark.parametrize("name", ["_optimise", "_read"])
 def test_cases(name, monkeypatch, shared_tmp_path):
     """A rank that fails ends the others' work, too; what they have finished stays."""
-    fail_on(monkeypatch, LONE, store, name)
+    fail_on(monkeypatch, LONE, computing, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
         run_cases(payloads(), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -345,7 +344,7 @@ def test_cases(name, monkeypatch, shared_tmp_path):
 def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
     """An optimisation that would go on for long ends in the iteration in which it hears of it."""
     long = payloads("optimizer.max_iterations=100000", "optimizer.tolerance=1e-300")
-    fail_on(monkeypatch, LONE, store, "_optimise")
+    fail_on(monkeypatch, LONE, computing, "_optimise")
     with pytest.raises(Unusual):
         run_cases(long, shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -354,7 +353,7 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
 @ON_RANKS
 def test_samples(monkeypatch, shared_tmp_path):
     samples = [(), *((f"payload.mass={mass}",) for mass in np.linspace(4.0, 6.0, 60))]
-    fail_on(monkeypatch, LONE, store, "_sample")
+    fail_on(monkeypatch, LONE, computing, "_sample")
     with pytest.raises(Unusual, match=r"^_sample$"):
         run_cases(sample_cases(coarse(), samples, "", None), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()

@@ -11,9 +11,8 @@ import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.study import cases as computing
 from dolfinopt.study import uncertainty
-from dolfinopt.study.cases import scales_bodies, with_sample
+from dolfinopt.study.cases import run_cases, scales_bodies, with_sample
 from dolfinopt.study.figures import draw
-from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import (
     Sampling,
     nominal_value,
