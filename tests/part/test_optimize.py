@@ -116,7 +116,9 @@ def test_lightest_part_keeps_its_limit(made):
     assert found.best.limits[0].value == pytest.approx(deviation / 1.02, rel=2e-2)
 
 
-def test_arcs_and_values_of_the_table_are_refused(made):
+def test_arcs_and_values_of_the_table_are_refused(made, monkeypatch):
+    """Before any outline is made."""
+    monkeypatch.setattr("dolfinopt.part.part.make_parts", None)
     for change, words in (('part.curves="arcs"', ("part.curves", "splines")),
                           ("part.starts=-1", ("0",))):  # fmt: skip
         refusal(lambda: runs.scene("part.optimize=true", change), *words)  # noqa: B023
