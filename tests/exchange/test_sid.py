@@ -236,9 +236,9 @@ def test_what_other_programs_write(tmp_path):
         assert read(tmp_path, edited("= 0.125", f"= {text}")).Gr.M0[2, 5] == value
 
 
-def edited(old, new, count=1):
+def edited(old, new):
     assert old in bar()
-    return bar().replace(old, new, count)
+    return bar().replace(old, new, 1)
 
 
 def without(name):

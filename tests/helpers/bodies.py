@@ -416,14 +416,14 @@ def posed_motion(motion: RigidMotion) -> RigidMotion:
 # -- changes and derivatives -----------------------------------------------------------------
 
 
-def stiffened(rng: np.random.Generator, body: ShapeIntegrals, along: float = 0.1) -> ShapeIntegrals:
+def stiffened(rng: np.random.Generator, body: ShapeIntegrals) -> ShapeIntegrals:
     """Return a body with some geometric stiffness by all 7 or 18 loads and more."""
     q, b, frame = body.num_modes, len(body.outboard), len(body.w) + len(body.W)
     K0 = rng.normal(scale=0.2, size=(frame + b + q, q, q))
     K0 = K0 + K0.swapaxes(1, 2)
     # The modes of light clouds move little mass.
     parts = {"K0": K0[:frame], "K0_outboard": K0[frame : frame + b]}
-    return replace(body, **parts, along_modes=along * K0[frame + b :])
+    return replace(body, **parts, along_modes=0.1 * K0[frame + b :])
 
 
 def change_of(rng: np.random.Generator, body: ShapeIntegrals, name: str) -> np.ndarray:

@@ -225,10 +225,10 @@ def delta() -> Tree:
     }  # fmt: skip
 
 
-def flexible_slider_crank(folder: Path, torque: float = 0.5) -> Scene:
-    """Return the machine of `flexible_slider_crank_in_space.csv`: torque, N m, on a free crank."""
+def flexible_slider_crank(folder: Path) -> Scene:
+    """Return the machine of `flexible_slider_crank_in_space.csv`: 0.5 N m on a free crank."""
     wide, last = 0.01, 0.02  # m, s
-    text = f"t,turn\n0,{torque}\n{last},{torque}\n"
+    text = f"t,turn\n0,0.5\n{last},0.5\n"
     by_root(lambda: (folder / "torque.csv").write_text(text))
     slide = {"name": "slide", "type": "prismatic", "parent": "ground", "child": "piston",
              "origin": [0, 0.11, -wide], "axis": [0, 1, 0], "passive": True}  # fmt: skip

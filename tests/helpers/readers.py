@@ -23,12 +23,9 @@ class State:
     qdd: np.ndarray
 
 
-def random_state(rng: np.random.Generator, q: int, plane: bool = False) -> State:
-    """Return any state, or one of motion in x-y."""
-    a, w, g = rng.normal(size=(3, 3))
-    if plane:
-        a[2] = w[0] = w[1] = g[0] = g[1] = 0.0
-    return State(a, w, g, *rng.normal(scale=0.5, size=(3, q)))
+def random_state(rng: np.random.Generator, q: int) -> State:
+    """Return any state."""
+    return State(*rng.normal(size=(3, 3)), *rng.normal(scale=0.5, size=(3, q)))
 
 
 def forces_of_sid(data: StandardInputData, s: State) -> Forces:

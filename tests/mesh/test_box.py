@@ -67,11 +67,10 @@ def test_facets_of_cells_in_the_order_of_the_reference_cell():
 FIVE = np.array([[0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7], [1, 2, 4, 7]])
 
 
-def row(count: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and cells of cubes in a row along z."""
-    grid = np.stack(np.meshgrid(np.arange(count + 1), [0, 1], [0, 1], indexing="ij"), axis=3)
-    points = grid.reshape(-1, 3)[:, ::-1].astype(float)
-    return points, np.arange(8) + 4 * np.arange(count)[:, None]
+def row() -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells of three cubes in a row along z."""
+    grid = np.stack(np.meshgrid(np.arange(4), [0, 1], [0, 1], indexing="ij"), axis=3)
+    return grid.reshape(-1, 3)[:, ::-1].astype(float), np.arange(8) + 4 * np.arange(3)[:, None]
 
 
 # Three tetrahedra at one facet, the second one on its other side.

@@ -527,11 +527,11 @@ def test_options_of_one_file_do_not_reach_the_next(write):
     assert np.array_equal(figures(arm_mesh(COMM, entry(path))), alone)
 
 
-def fan(turns, count=12):
+def fan(turns):
     """Return triangles about the origin through so many turns, neighbours sharing a side."""
-    angle = np.linspace(0.0, 2.0 * np.pi * turns, count + 1)
-    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count + 1)], axis=1)
-    cells = np.array([[0, k, k + 1] for k in range(1, count + 1)])
+    angle = np.linspace(0.0, 2.0 * np.pi * turns, 13)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(13)], axis=1)
+    cells = np.array([[0, k, k + 1] for k in range(1, 13)])
     return np.concatenate([np.zeros((1, 3)), rim]), cells
 
 

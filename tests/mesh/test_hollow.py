@@ -117,9 +117,9 @@ def test_what_a_hollow_arm_cannot_have(changes, words):
         do.load_scene(ROOT / "demos" / "two_arm.toml", ("arms.hollow=true", "arms.wall=0.002"))
 
 
-def taper(cells: tuple[int, int, int] = (6, 4, 4)) -> Member:
+def taper() -> Member:
     """Return a solid whose section shrinks along it from 60 x 40 mm to half of both."""
-    counts = np.array(cells) + 1
+    counts = np.array([7, 5, 5])
     grid = np.indices(counts).reshape(3, -1).T / (counts - 1.0)
     x, y, z = grid.T
     points = np.column_stack([0.5 * x, *((1.0 - 0.5 * x) * (np.array([[0.06], [0.04]])

@@ -68,14 +68,14 @@ def test_parts_of_a_spline_are_the_spline():
     np.testing.assert_allclose(middle, spline.at(np.array([0.15, 0.5, 0.85])), atol=1e-8)
 
 
-def kinds(points, labels=None):
-    labels = np.full(len(points), "") if labels is None else labels
+def kinds(points):
+    labels = np.full(len(points), "")
     return [edge.curve for edge in recognise(points, labels, float(np.ptp(points)))]
 
 
-def circle(count, radius=0.01, centre=(0.3, 0.1), first=0.0):
-    angle = first + 2.0 * np.pi * np.arange(count) / count
-    return np.array(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def circle(count):
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return np.array([0.3, 0.1]) + 0.01 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 @pytest.mark.parametrize("shift", [0, 3, 17])

@@ -16,13 +16,13 @@ pytestmark = pytest.mark.serial
 LENGTH, HEIGHT, RADIUS = 0.3, 0.06, 0.015
 
 
-def strip(radius=RADIUS):
+def strip():
     """A rectangle with a round hole in its middle."""
     corners = np.array([[0, -1], [2, -1], [2, 1], [0, 1]]) * [0.5 * LENGTH, 0.5 * HEIGHT]
     labels = ("", "outboard", "", "inboard")
     ends = zip(corners, np.roll(corners, -1, axis=0), labels, strict=True)
     outer = tuple(Piece(Line(a, b), label) for a, b, label in ends)
-    hole = Arc(np.array([0.5 * LENGTH, 0.0]), radius, 0.0, -2.0 * np.pi)
+    hole = Arc(np.array([0.5 * LENGTH, 0.0]), RADIUS, 0.0, -2.0 * np.pi)
     return Shape((outer, (Piece(hole),)))
 
 

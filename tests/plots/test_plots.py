@@ -73,10 +73,10 @@ def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Closure | N
     )  # fmt: skip
 
 
-def swinging(mechanism: Mechanism, count: int = 41) -> Any:
+def swinging(mechanism: Mechanism) -> Any:
     """Return a motion; the deviation is some centimetres."""
     arms = len(mechanism.bodies)
-    t = np.linspace(0.0, 2.0, count)
+    t = np.linspace(0.0, 2.0, 41)
     q_r = np.column_stack([0.3 * t] + [0.9 * np.cos(t + k) for k in range(arms)])
     return motion(mechanism, t, q_r, 0.01 * np.sin(np.outer(t, 2.0 + np.arange(2 * arms))))
 
@@ -347,13 +347,13 @@ def test_machine_shows_every_arm_where_it_is(arms):
     assert solid.sum() > 2000
 
 
-def slider_crank(count: int = 61) -> tuple[list[ArmView], Any]:
+def slider_crank() -> tuple[list[ArmView], Any]:
     """Return a rigid crank and a bending rod whose end is on y = 0, over more than a turn."""
     crank = replace(beam("crank", 0.3, 0.2, 10, 2), modes=np.zeros((20, 4, 2, 0)), designed=False)
     views = [crank, beam("rod", 0.7, 0.06, 20, 4)]
     bodies = (body(np.zeros((3, 0)), 0.3), beam_body(0.7))
     mechanism = plane_chain(bodies, 0.5, 0.0, (0.0, 0.0), joint_height=0.0)
-    t = np.linspace(0.0, 0.1, count)
+    t = np.linspace(0.0, 0.1, 61)
     angle = 80.0 * t
     desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
     q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
