@@ -1,14 +1,13 @@
-"""Set-up of the tests: the environment that MPI and the pictures read, and the plugin of the ranks.
+"""Set-up of the tests: environment, read by MPI and pictures, plugin of the ranks, fixtures.
 
-The environment is completed here, before anything imports MPI, so that a plain `pytest` from any
-folder behaves as one started by the launcher. What the user has set stays.
+The environment is completed before anything imports MPI; what the user has set stays.
 """
 
 from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -69,6 +68,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     world = MPI.COMM_WORLD
     return world.bcast(tmp_path_factory.mktemp("kept") if world.rank == 0 else None, root=0)
+
+
+@pytest.fixture
+def write(shared_tmp_path: Path) -> Callable[[str, str], Path]:
+    """Return what writes a text file on the root and returns its path on all ranks."""
+    from mpi4py import MPI
+
+    def write(name: str, text: str) -> Path:
+        path = shared_tmp_path / name
+        if MPI.COMM_WORLD.rank == 0:
+            path.write_text(text + "\n")  # Gmsh ignores a last statement without it
+        MPI.COMM_WORLD.barrier()
+        return path
+
+    return write
 
 
 @pytest.fixture

@@ -28,9 +28,7 @@ def rooms():
 def test_picture_is_that_of_the_code():
     """If it is not: `python docs/rooms.py`."""
     assert rooms().PICTURE.read_text(encoding="utf-8") == rooms().svg()
-
-
-def test_arrows_that_follow_from_others_are_left_out():
+    # Arrows that follow from others are left out.
     graph = {"a": {"b", "c", "d"}, "b": {"c"}, "c": {"d"}, "d": set()}
     assert rooms().shortest(graph) == [("a", "b"), ("b", "c"), ("c", "d")]
 
@@ -48,12 +46,8 @@ def test_files_that_the_pages_name_exist():
         assert (ROOT / "dolfinopt" / name).parent.is_dir()
     named = re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py|tests/[\w/]+(?:\.py)?)`", every)
     for name in {*named} - INVENTED:
-        path = (
-            ROOT / name
-            if name.startswith(("tests/", "docs/", "demos/"))
-            else ROOT / "dolfinopt" / name
-        )
-        assert path.exists(), name
+        above = "" if name.startswith(("tests/", "docs/", "demos/")) else "dolfinopt"
+        assert (ROOT / above / name).exists(), name
 
 
 def test_words_of_the_scene_are_those_of_the_code():

@@ -16,23 +16,15 @@ from runs import ROOT, TWO_ARM, command, environment, overrides, refusal, run
 
 import dolfinopt as do
 from dolfinopt import disk
+from dolfinopt.cli.studies import _write_question
 from dolfinopt.data import paper_scene
-from dolfinopt.disk import (
-    append_text,
-    make_folder,
-    working_in,
-    write_arrays,
-    write_atomically,
-    write_text,
-)
+from dolfinopt.disk import append_text, working_in, write_text
 from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
-from dolfinopt.output.folders import write_question
 from dolfinopt.parallel import abort_together
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study.cases import Case
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 ROUGH = ("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
@@ -54,14 +46,11 @@ def small_files():
     resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-# -- writing ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "write",
     [
         lambda path: write_text(path, 5000 * "x"),
-        lambda path: write_arrays(path, {"a": np.arange(5000.0)}),
+        lambda path: disk.write_arrays(path, {"a": np.arange(5000.0)}),
         lambda path: append_text(path, 5000 * "x"),
     ],
     ids=["text", "arrays", "append"],
@@ -80,11 +69,6 @@ def not_written(write, *words):
     assert all(word in str(caught.value) for word in words)
 
 
-def test_folders(tmp_path):
-    (tmp_path / "file").write_text("")
-    not_written(lambda: make_folder(tmp_path / "file" / "a"), "a: ", "Not a directory", "a folder")
-
-
 @pytest.mark.parametrize("step", ["open", "fsync", "replace"])
 def test_every_step_of_writing(step, tmp_path, monkeypatch):
     path = tmp_path / "file"
@@ -96,6 +80,8 @@ def test_every_step_of_writing(step, tmp_path, monkeypatch):
     not_written(lambda: write_text(path, "after\n"), "No space left on device")
     monkeypatch.undo()
     assert path.read_text() == "before\n" and len(list(tmp_path.iterdir())) == 1
+    words = "a: ", "Not a directory", "a folder"
+    not_written(lambda: disk.make_folder(path / "a"), *words)
 
 
 def test_errors_of_a_format_are_not_the_disks(tmp_path):
@@ -103,7 +89,7 @@ def test_errors_of_a_format_are_not_the_disks(tmp_path):
         raise OSError("no such format")
 
     with pytest.raises(OSError, match="no such format"):
-        write_atomically(tmp_path / "picture", write)
+        disk.write_atomically(tmp_path / "picture", write)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -145,9 +131,6 @@ def test_standard_output_without_room(tmp_path):
     assert "standard output: No space left on device" in done.stderr.splitlines()[-1]
 
 
-# -- locks -----------------------------------------------------------------------------------
-
-
 def without(number):
     def lock(*arguments):
         raise OSError(number, os.strerror(number))
@@ -182,9 +165,6 @@ def test_studies_without_locks(shared_tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.count("continuing without") == 2 * (COMM.rank == 0)
 
 
-# -- what other programs have computed -------------------------------------------------------
-
-
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("name", "value"), [("NUMERICS", -1), ("__version__", "0.0.0")])
 def test_results_of_another_program_are_computed_anew(name, value, tmp_path, monkeypatch):
@@ -203,9 +183,6 @@ def test_results_of_another_program_are_computed_anew(name, value, tmp_path, mon
     with pytest.raises(InputError, match="another version of dolfinopt wrote this checkpoint"):
         checkpoint.check(tmp_path, scene)
     assert computed() == 0  # those of this program are still there
-
-
-# -- files of others -------------------------------------------------------------------------
 
 
 def npz_with_header(path, arrays, name, shape):
@@ -233,19 +210,13 @@ def design(tmp_path_factory):
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("kind", "word"),
-    [
-        ("npy", ".npz file"),
-        ("8 TiB", ".npz file"),
-        ("complex", "complex128"),
-        ("text", "<U3"),
-        ("pipe", "no regular file"),
-    ],
-)
+    [("npy", ".npz file"), ("8 TiB", ".npz file"), ("complex", "complex128"), ("text", "<U3"),
+     ("pipe", "no regular file")],
+)  # fmt: skip
 def test_designs_that_are_none(design, tmp_path, kind, word):
     path = tmp_path / "design.npz"
     if kind == "npy":
-        with open(path, "wb") as stream:
-            np.save(stream, np.zeros(3))
+        np.lib.format.write_array(path.open("wb"), np.zeros(3))
     elif kind == "8 TiB":
         npz_with_header(path, design, "arm1/density", (2**40,))
     elif kind == "pipe":
@@ -283,14 +254,11 @@ def test_edited_checkpoints(tmp_path):
         refusal(lambda: run(*line), checkpoint.NAME, "cannot read")  # noqa: B023
 
 
-def test_a_pipe_is_no_scene(tmp_path):
-    """Opening it would wait for ever."""
+def test_a_pipe_is_no_scene_and_a_device_no_folder_for_forms(tmp_path, monkeypatch):
+    """Opening a pipe would wait for ever."""
     path = tmp_path / f"{COMM.rank}.toml"
     os.mkfifo(path)
     refusal(lambda: load_scene(path), str(path), "no regular file")
-
-
-def test_folder_for_forms_that_cannot_be_made(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     compat.check_form_cache.cache_clear()
     refusal(compat.check_form_cache, "/dev/null", "XDG_CACHE_HOME")
@@ -313,7 +281,7 @@ def test_a_package_that_is_missing_is_named(tmp_path, name):
 
 def test_question_on_a_full_disk(tmp_path, small_files):
     question = {"scene": 5000 * "x"}
-    not_written(lambda: write_question(tmp_path, "sweep", question, []), "sweep.json")
+    not_written(lambda: _write_question(tmp_path, "sweep", question, []), "sweep.json")
     assert not list(tmp_path.iterdir())
 
 

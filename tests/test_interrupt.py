@@ -68,7 +68,7 @@ def test_under_mpirun(module, tmp_path):
     assert done.returncode == 130
 
 
-def test_a_signal_that_is_somebody_elses_is_left_alone():
+def test_a_signal_that_is_somebody_elses_is_left_alone_and_gmsh_leaves_it_alone():
     before = signal.getsignal(signal.SIGINT)
     try:
         for handler in (signal.SIG_IGN, lambda *arguments: None):
@@ -83,11 +83,7 @@ def test_a_signal_that_is_somebody_elses_is_left_alone():
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def test_gmsh_leaves_interrupts_alone():
-    """On no rank does Ctrl-C kill without a word, during a session or after it."""
-    before = signal.getsignal(signal.SIGINT)
+    # On no rank does Ctrl-C kill without a word, during a session of Gmsh or after it.
     with gmsh_on_root(MPI.COMM_WORLD):
         assert signal.getsignal(signal.SIGINT) is before
     assert signal.getsignal(signal.SIGINT) is before
@@ -109,9 +105,8 @@ time.sleep(60)
 
 @pytest.mark.serial
 def test_ranks_end_with_a_launcher_that_is_killed():
-    with subprocess.Popen(
-        [sys.executable, "-c", LAUNCHER], stdout=subprocess.PIPE, text=True
-    ) as launcher:
+    line = [sys.executable, "-c", LAUNCHER]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as launcher:
         rank = int(launcher.stdout.readline())
         os.kill(rank, 0)  # it is there
         launcher.kill()

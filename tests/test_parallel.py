@@ -156,6 +156,13 @@ def test_what_all_ranks_raise_the_root_reports_once(error, status, message, caps
         assert said == (message if COMM.rank == 0 else "")
 
 
+TOGETHER = """from mpi4py import MPI
+from dolfinopt.errors import InputError
+from dolfinopt.parallel import abort_together
+world = MPI.COMM_WORLD
+assert world.size == 2
+with abort_together(world):
+    """
 LONE = "if world.rank == 1: raise {}\nworld.Barrier()"
 ENDINGS = [
     pytest.param(LONE.format("RuntimeError('lost')"), 1, "RuntimeError: lost", id="lone rank"),
@@ -170,14 +177,7 @@ ENDINGS = [
 @pytest.mark.parametrize(("body", "status", "line"), ENDINGS)
 def test_ranks_end_together(body, status, line):
     """Nobody waits for ever, the message stands once, and the status says what happened."""
-    script = (
-        "from mpi4py import MPI\n"
-        "from dolfinopt.errors import InputError\n"
-        "from dolfinopt.parallel import abort_together\n"
-        "world = MPI.COMM_WORLD\n"
-        "assert world.size == 2\n"
-        "with abort_together(world):\n    " + body.replace("\n", "\n    ") + "\n"
-    )
+    script = TOGETHER + body.replace("\n", "\n    ") + "\n"
     words = ["mpirun", "-n", "2", sys.executable, "-c", script]
     run = subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment())
     assert run.returncode == status, run.stderr
@@ -186,8 +186,6 @@ def test_ranks_end_together(body, status, line):
     assert ("Traceback" in run.stderr) == ("RuntimeError" in body)
     assert run.stdout == ""
 
-
-# -- PETSc's options -------------------------------------------------------------------------
 
 ORDERING = "pc_factor_mat_ordering_type"
 VIEWED = {  # option, what the view shows by default and with the option

@@ -35,9 +35,6 @@ def simulate(designs, *overrides):
     return built, x, *built.evaluate(x)
 
 
-# -- a NumPy/SciPy model of the same two arms -----------------------------------------------------
-
-
 @pytest.fixture(
     scope="module",
     params=TWO_ARM_VALUES["cases"],
@@ -105,15 +102,8 @@ def test_gradient_of_the_integrated_compliance(kind):
         assert np.abs(boxes - expected).max() < 1e-4 * np.abs(expected).max()
 
 
-# -- geometrically exact beams --------------------------------------------------------------------
-
-
 def test_slow_motion_against_geometrically_exact_beams():
-    """Beams of large deformation without a floating frame, and the vibration they are left with.
-
-    The last comes eight periods after the motion: cells that are 0.5 % too stiff, as linear ones,
-    would be out of step by 1.2 % of the maximum.
-    """
+    """Up to eight periods after the motion: 0.5 % more stiffness would be 1.2 % out of step."""
     table = np.loadtxt(REFERENCE / "exudyn_beam_slow.csv", delimiter=",", skiprows=1)
     *_, found = simulate(["half", "half"], "motion.duration=3.0", "motion.horizon=6.0")
     samples = np.rint(table[:, 0] / 1e-3).astype(int)

@@ -1,14 +1,10 @@
-"""What a scene does not need is not done: the list, scene by scene, read from summary.json.
+"""What a scene does not need is not done: scene by scene, by the counters of `profile.Counts`.
 
-Counters tell how often the costly things were done, see `profile.Counts`; those of an optimisation
-are its iterations'. What they cannot tell, imports and files, is looked at itself. That a part of
-the program does nothing twice is tested where that part is: materials in test_elasticity, scenarios
-of one design in test_scenarios and test_cases, time steps that start warm in test_integrators and
-test_batch; that reading a scene needs neither NumPy nor MPI, in test_scene.
+What they cannot tell, imports and files, is looked at itself. That a part of the program does
+nothing twice is tested where that part is.
 """
 
 import ast
-import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,10 +15,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import build, wave
-from runs import ROOT, TWO_ARM, environment
+from runs import ROOT, TWO_ARM, environment, summary_of
 from runs import overrides as set_keys
+from runs import run as run_command
 
-from dolfinopt.cli import commands
 from dolfinopt.fem import interior
 from dolfinopt.output import run_folder as results
 
@@ -48,8 +44,7 @@ def run(folder: Path) -> Run:
         line = [command, str(TWO_ARM), "--no-plots", "--out", str(made[-1])]
         line += ["--design", str(design)] if design else []
         line += set_keys(*QUICK, f"optimizer.max_iterations={ITERATIONS}", *overrides)
-        commands.main(line, standalone_mode=False, obj=WORLD)
-        WORLD.barrier()
+        run_command(*line)
         return made[-1]
 
     return once
@@ -57,10 +52,8 @@ def run(folder: Path) -> Run:
 
 def counts(folder: Path) -> Counts:
     """Return the counters of a run."""
-    return json.loads((folder / "summary.json").read_text())["counts"]
+    return summary_of(folder)["counts"]
 
-
-# -- scene by scene --------------------------------------------------------------------------
 
 EACH = ARMS * DESIGNS  # once for every design of every arm
 ONCE = {"assemblies": 2 * EACH, "factorisations": EACH, "reductions": EACH}  # stiffness and mass
@@ -141,7 +134,7 @@ def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most) -
             "simulation.sample=0.05", "simulation.tolerance=1e-2", "objective.load_cases=3",
             "objective.kind=static", f"optimizer.max_iterations={ITERATIONS}")  # fmt: skip
     line += set_keys(*kept, *overrides)
-    commands.main(line, standalone_mode=False, obj=MPI.COMM_SELF)
+    run_command(*line, world=MPI.COMM_SELF)
     found = counts(tmp_path / "out")
     assert found["factorisations"] == EACH and found["reductions"] == 0
     if most < 6:
@@ -170,17 +163,10 @@ def test_nothing_moves_unless_asked(kind: str) -> None:
     assert moved.objective == still.objective and moved.max_deviation > 0.0
 
 
-# -- load cases ------------------------------------------------------------------------------
-
-
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("gradient", ["esl", "exact"])
 def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
-    """From as many load cases as coordinates on their number changes no count.
-
-    Without normal modes, whose search for other designs takes other numbers of solves; Newton's
-    iterations depend on the design, too.
-    """
+    """From as many as coordinates on their number changes no count but Newton's iterations."""
     kept = ("reduction.coordinates=3", f"objective.gradient={gradient}")
     few, many = (
         counts(run("optimize", *kept, f"objective.load_cases={cases}")) for cases in (3, 200)
@@ -191,16 +177,9 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
         assert few["energy_fields"] == 3 * EACH
 
 
-# -- warm starts -----------------------------------------------------------------------------
-
-
 @cache
 def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
-    """Return what the second design takes in an optimisation, and by itself.
-
-    The optimiser's step is small, 0.02, and the tolerance of the usual size: at 1e-2 as many
-    steps as the motion needs to look smooth are enough from cold, too.
-    """
+    """Return what the second design, a small step on, takes in an optimisation, and by itself."""
     small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=1e-5")
     first = counts(run("optimize", *small, "optimizer.max_iterations=0"))
     folder = run("optimize", *small, "optimizer.max_iterations=1")
@@ -218,10 +197,7 @@ def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
 def test_modes_and_trajectory_start_from_the_last_designs(
     run: Run, overrides: tuple[str, ...]
 ) -> None:
-    """Residuals are looked at after every step of a search from the last design's modes.
-
-    Half of Newton's iterations or fewer: from cold it takes a second grid, too.
-    """
+    """Half of Newton's iterations or fewer: from cold it takes a second grid, too."""
     warm, cold = warm_and_cold(run, *overrides)
     assert warm["factorisations"] == cold["factorisations"] == ARMS
     assert 3 * ARMS < warm["solves"] < cold["solves"]
@@ -229,8 +205,6 @@ def test_modes_and_trajectory_start_from_the_last_designs(
     if not overrides:
         assert 0 < 2 * warm["newton_iterations"] <= cold["newton_iterations"]
 
-
-# -- what is not asked for -------------------------------------------------------------------
 
 # Prints which of the modules it is told are there in the end, whatever the command does.
 LOADED = """
@@ -256,30 +230,20 @@ def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
 
 
 @pytest.mark.serial
-def test_the_package_imports_nothing() -> None:
-    assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
-
-
-@pytest.mark.serial
 def test_model_imports_nothing_of_studies_pictures_and_space() -> None:
+    """And the package nothing at all."""
+    assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
     others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.multibody.inverse_kinematics"}
     assert loaded(others | {"dolfinx"}, "from dolfinopt import Model") == {"dolfinx"}
 
 
 # What can be answered before MPI and PETSc are loaded, which takes a second.
 WORDS = [
-    [],
-    ["--help"],
-    ["--version"],
-    ["optimize", "--help"],
-    ["optimise", TWO_ARM],
-    ["optimize", TWO_ARM, "--nonsense"],
-    ["simulate"],
-    ["gradient", TWO_ARM, "--kind", "fast"],
-    ["optimize", TWO_ARM, "--set", "payload.mas=1"],
+    [], ["--help"], ["--version"], ["optimize", "--help"], ["optimise", TWO_ARM],
+    ["optimize", TWO_ARM, "--nonsense"], ["simulate"], ["gradient", TWO_ARM, "--kind", "fast"],
+    ["optimize", TWO_ARM, "--set", "payload.mas=1"], ["simulate", "nowhere.toml"],
     ["simulate", TWO_ARM, "--set", "payload.mass=-1"],
-    ["simulate", "nowhere.toml"],
-]
+]  # fmt: skip
 ONE_BY_ONE = """
 from dolfinopt.cli import main
 for line in {!r}:

@@ -14,18 +14,24 @@ from dolfinopt.solver import BandCholesky, PetscFactor, direct_solver
 COMM = MPI.COMM_WORLD
 
 
-@pytest.mark.parametrize("ordering", ["natural", "rcm", "nd"])
-def test_direct_solver(ordering):
-    """A chain of springs, distributed: exact up to rounding, on any number of ranks."""
-    size = 30
+def assembled(size, entries):
+    """Return the symmetric matrix of all ranks whose rows have these entries (column, value)."""
     mat = PETSc.Mat().createAIJ((size, size), nnz=3, comm=COMM)
     for row in range(*mat.getOwnershipRange()):
-        for col, value in ((row - 1, -1.0), (row, 2.5), (row + 1, -1.0)):
+        for col, value in entries(row):
             if 0 <= col < size:
                 mat.setValue(row, col, value)
     mat.assemble()
     for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
         mat.setOption(option, True)
+    return mat
+
+
+@pytest.mark.parametrize("ordering", ["natural", "rcm", "nd"])
+def test_direct_solver(ordering):
+    """A chain of springs, distributed: exact up to rounding, on any number of ranks."""
+    size = 30
+    mat = assembled(size, lambda row: ((row - 1, -1.0), (row, 2.5), (row + 1, -1.0)))
     x, b = mat.createVecs()
     first, last = mat.getOwnershipRange()
     x.array = np.sin(np.arange(first, last))
@@ -43,9 +49,8 @@ def test_band_cholesky(bandwidth):
     """One matrix after the other in the same band, one right side or many: as NumPy solves them."""
     size = 90
     rng = np.random.default_rng(bandwidth)
-    rows, columns = np.nonzero(
-        np.abs(np.subtract.outer(np.arange(size), np.arange(size))) <= bandwidth
-    )
+    apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    rows, columns = np.nonzero(apart <= bandwidth)
     band = BandCholesky(rows, columns, size)
     assert band.bandwidth == bandwidth
     for _ in range(2):
@@ -60,26 +65,17 @@ def test_band_cholesky(bandwidth):
             assert np.array_equal(right, kept)
     dense[size // 2, size // 2] = -1.0
     assert not band.factorise(dense[rows, columns][band.taken])  # not positive definite
-
-
-def test_an_empty_band():
-    none = np.empty(0, dtype=int)
-    band = BandCholesky(none, none, 0)
-    assert band.factorise(np.empty(0))
-    assert band.solve(np.empty((0, 3))).shape == (0, 3)
+    empty = BandCholesky(rows[:0], rows[:0], 0)
+    assert empty.factorise(np.empty(0))
+    assert empty.solve(np.empty((0, 3))).shape == (0, 3)
 
 
 @pytest.mark.parametrize("pivot", [2.0, 0.0])
 def test_mumps_solves_several_loads_at_once(pivot):
     """As one by one, on any number of ranks; of a singular matrix all are said to fail."""
     size = 12
-    mat = PETSc.Mat().createAIJ((size, size), nnz=1, comm=COMM)
+    mat = assembled(size, lambda row: ((row, pivot if row == 5 else 1.0 + row),))
     first, last = mat.getOwnershipRange()
-    for row in range(first, last):
-        mat.setValue(row, row, pivot if row == 5 else 1.0 + row)
-    mat.assemble()
-    for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
-        mat.setOption(option, True)
     solver = direct_solver(mat, "natural", "test_", own=False)
     solver.setUp()
     factor = PetscFactor(solver)

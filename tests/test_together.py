@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import build
-from runs import TWO_ARM, environment, overrides
+from runs import TWO_ARM, by_root, environment, overrides
 
 import dolfinopt as do
 from dolfinopt.arms import arm, design_state
@@ -25,10 +25,9 @@ from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
-from dolfinopt.study import store
+from dolfinopt.study import cases as computing
 from dolfinopt.study import studies as study
-from dolfinopt.study.cases import Case
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 COMM = MPI.COMM_WORLD
@@ -49,18 +48,12 @@ class Awkward(ConvergenceError):
         self.action = action
 
 
-# -- the context itself ----------------------------------------------------------------------
-
-
-def test_nothing_happens_to_good_work():
-    with together(COMM):
-        value = 3
-    assert value == 3
-
-
 @pytest.mark.parametrize("kind", [InputError, np.linalg.LinAlgError, KeyboardInterrupt, SystemExit])
 @pytest.mark.parametrize("rank", [0, COMM.size - 1])
 def test_one_ranks_exception_is_raised_on_all(kind, rank):
+    with together(COMM):
+        value = 3
+    assert value == 3  # nothing happens to good work
     with pytest.raises(kind) as raised, together(COMM):
         if COMM.rank == rank:
             raise kind(f"on rank {rank}")
@@ -78,22 +71,15 @@ def test_any_exception_of_the_root_is_raised_on_all(kind):
 
     with pytest.raises(kind, match=r"^at the root$"):
         on_root(COMM, fail)
-    COMM.Barrier()
-
-
-def test_a_result_that_cannot_be_sent_is_an_exception_on_all():
     if COMM.size > 1:  # on one rank nothing is sent
         with pytest.raises((pickle.PicklingError, AttributeError)):
             on_root(COMM, lambda: lambda: None)
     COMM.Barrier()
 
 
-def test_the_first_of_several_is_raised():
+def test_the_first_of_several_is_raised_and_a_failure_before_those_who_gave_up():
     with pytest.raises(ValueError, match=r"^of rank 0$"), together(COMM):
         raise ValueError(f"of rank {COMM.rank}")
-
-
-def test_a_failure_goes_before_those_who_gave_up():
     with pytest.raises(Unusual), together(COMM):
         raise Unusual("why") if COMM.rank == COMM.size - 1 else OthersFailed("given up")
 
@@ -107,8 +93,8 @@ def test_an_exception_that_cannot_be_sent_arrives_as_its_nearest_relative():
     class Local(InputError):
         pass
 
-    assert type(pickle.loads(_pickled(Local("no")))) is InputError
-    assert str(pickle.loads(_pickled(Local("no")))) == "no"
+    sent = pickle.loads(_pickled(Local("no")))
+    assert type(sent) is InputError and str(sent) == "no"
 
 
 def test_parts_of_the_ranks_agree_first():
@@ -134,9 +120,6 @@ def test_an_abandoned_generator_does_not_meet_anybody():
         next(generator)
         generator.close()
     COMM.Barrier()
-
-
-# -- every place that can fail on one rank ---------------------------------------------------
 
 
 def coarse(*overrides):
@@ -219,9 +202,7 @@ def writing_gradients(folder):
 def reading_designs(folder):
     built = build(*COARSE)
     found = do.gather_views(*built.place, built.uniform())
-    if COMM.rank == 0:
-        design.write_design(folder, found)
-    COMM.Barrier()
+    by_root(lambda: design.write_design(folder, found))
     return lambda: design.read_design(folder / "design.npz", built.partition, built.arms)
 
 
@@ -326,20 +307,12 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
     COMM.Barrier()
 
 
-# -- arms that several ranks share -----------------------------------------------------------
-
-
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [
-        (mesh, "mesh_geo"),
-        (mesh, "_arm_mesh"),
-        (elements, "_full"),
-        (elasticity, "AffineMatrix"),
-        (design_state, "interpolate"),
-    ],
-)
+    [(mesh, "mesh_geo"), (mesh, "_arm_mesh"), (elements, "_full"), (elasticity, "AffineMatrix"),
+     (design_state, "interpolate")],
+)  # fmt: skip
 def test_a_shared_arm(owner, name, monkeypatch):
     """The ranks of an arm meet in between: none is left in a collective of the arm."""
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)
@@ -348,9 +321,6 @@ def test_a_shared_arm(owner, name, monkeypatch):
     with pytest.raises(Unusual, match=f"^{name}$"):
         evaluating(None, "arms.1.rigid=true")()
     COMM.Barrier()
-
-
-# -- studies ---------------------------------------------------------------------------------
 
 
 def payloads(*overrides):
@@ -362,7 +332,7 @@ def payloads(*overrides):
 @pytest.mark.parametrize("name", ["_optimise", "_read"])
 def test_cases(name, monkeypatch, shared_tmp_path):
     """A rank that fails ends the others' work, too; what they have finished stays."""
-    fail_on(monkeypatch, LONE, store, name)
+    fail_on(monkeypatch, LONE, computing, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
         run_cases(payloads(), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -374,7 +344,7 @@ def test_cases(name, monkeypatch, shared_tmp_path):
 def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
     """An optimisation that would go on for long ends in the iteration in which it hears of it."""
     long = payloads("optimizer.max_iterations=100000", "optimizer.tolerance=1e-300")
-    fail_on(monkeypatch, LONE, store, "_optimise")
+    fail_on(monkeypatch, LONE, computing, "_optimise")
     with pytest.raises(Unusual):
         run_cases(long, shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -383,7 +353,7 @@ def test_a_failed_rank_stops_the_others(monkeypatch, shared_tmp_path):
 @ON_RANKS
 def test_samples(monkeypatch, shared_tmp_path):
     samples = [(), *((f"payload.mass={mass}",) for mass in np.linspace(4.0, 6.0, 60))]
-    fail_on(monkeypatch, LONE, store, "_sample")
+    fail_on(monkeypatch, LONE, computing, "_sample")
     with pytest.raises(Unusual, match=r"^_sample$"):
         run_cases(sample_cases(coarse(), samples, "", None), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -395,9 +365,6 @@ def test_tables(monkeypatch, shared_tmp_path):
     with pytest.raises(Unusual, match=r"^tabulated$"):
         study.study(coarse(), None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
-
-
-# -- as a command ----------------------------------------------------------------------------
 
 
 # What fails, on which rank, in which command; the other places above end in the same two handlers.
@@ -426,12 +393,8 @@ main()
 @pytest.mark.skipif(shutil.which("mpirun") is None, reason="no mpirun")
 @pytest.mark.parametrize(
     ("place", "kind"),
-    [
-        ("mesh", "ConvergenceError"),
-        ("checkpoint", "ConvergenceError"),
-        ("mesh", "ZeroDivisionError"),
-        ("simulation", "ZeroDivisionError"),
-    ],
+    [(place, "ConvergenceError") for place in ("mesh", "checkpoint")]
+    + [(place, "ZeroDivisionError") for place in ("mesh", "simulation")],
 )
 def test_commands(place, kind, tmp_path):
     """All ranks end by themselves, with one message: nobody has to be aborted."""

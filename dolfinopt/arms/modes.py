@@ -291,17 +291,8 @@ def by_integrals(by_matrix: np.ndarray) -> ShapeIntegrals:
     first = np.array([mixed[k, j] - mixed[j, k] for j, k in ((1, 2), (2, 0), (0, 1))])
     second = np.trace(turning) * ONE - turning
     zero = rigid_spatial_body(0.0, np.zeros(3), np.zeros(6))
-    return ShapeIntegrals(
-        mass=float(np.trace(by_matrix[:3, :3])),
-        w=first[:, None],
-        W=second.reshape(9, 1, 1),
-        K=zero.K,
-        D=zero.D,
-        outboard=zero.outboard,
-        outboard_point=zero.outboard_point,
-        K0=zero.K0,
-        K0_outboard=zero.K0_outboard,
-    )
+    mass = float(np.trace(by_matrix[:3, :3]))
+    return replace(zero, mass=mass, w=first[:, None], W=second.reshape(9, 1, 1))
 
 
 @dataclass(frozen=True, eq=False)

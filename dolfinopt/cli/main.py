@@ -19,9 +19,8 @@ import click
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.reproduce import bench, reproduce
 from dolfinopt.cli.shared import PATH, Start, end_before_start, led_by_another
-from dolfinopt.cli.studies import compare, sweep, uncertainty
+from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
 from dolfinopt.version import __version__

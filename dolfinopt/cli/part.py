@@ -132,6 +132,8 @@ def part(
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip
     asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
+    if asked.optimize and asked.curves == "arcs":  # at once: outlines and meshes take a while
+        raise InputError("--optimize: expected splines, not --curves arcs")
     if resume and not asked.optimize:
         raise InputError("--resume: goes on with --optimize, which is not asked for")
     names = [*file_names(scene), checkpoint.NAME]

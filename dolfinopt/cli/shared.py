@@ -219,13 +219,35 @@ def draw(
         draw_motion(folder / "motion.gif", views, trajectory)
 
 
+def _deflection_sentence(budget: Mapping[str, Any]) -> str:
+    """Return the shares of all kinds of parts in a line, the links' first."""
+    links, *others = [f"{name} {100.0 * x:.3g} %" for name, x in budget["shares"].items()]
+    held = links.replace("links ", "links hold ", 1)
+    return f"{held} of the deflection{''.join(f', {one}' for one in others)}"
+
+
+def _deflection_table(budget: Mapping[str, Any]) -> list[str]:
+    """Return the parts as lines of a table."""
+    head = (
+        f"at {budget['instant']:.3f} s, {1e3 * budget['linear']:.4g} mm to first order "
+        f"({1e3 * budget['deviation']:.4g} mm simulated):"
+    )
+    width = max(len(one["name"]) for one in budget["parts"])
+    return [
+        head,
+        *(
+            f"  {one['kind']:<8} {one['name']:<{width}} {1e3 * one['deflection']:>10.4g} mm "
+            f"{100.0 * one['share']:>6.1f} %"
+            for one in budget["parts"]
+        ),
+    ]
+
+
 def conclude(summary: Mapping[str, Any], folder: Path) -> None:
     """Print what the deviation comes from, the run's warnings, and its figures in one line."""
-    from dolfinopt.output.summary import deflection_sentence, deflection_table
-
     optimised, parts = summary["kkt"] is not None, summary["deflection_budget"]
     if parts is not None:
-        for line in [deflection_sentence(parts), *([] if optimised else deflection_table(parts))]:
+        for line in [_deflection_sentence(parts), *([] if optimised else _deflection_table(parts))]:
             click.echo(line)
     warn(summary["warnings"])
     found = summary["reduction"]

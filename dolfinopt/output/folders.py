@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import FULL, unwritten, working_in, write_text
+from dolfinopt.disk import FULL, unwritten, working_in
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, named_files
@@ -191,7 +191,7 @@ def record_of_parts(design: Path | None, folder: Path, files: Iterable[str]) -> 
 
 def stale_parts(folder: Path) -> str:
     """Return why a folder's parts are not those of the design beside them; "" if they may be."""
-    made_of = _json(folder / PARTS_LIST).get("design")
+    made_of = read_record(folder / PARTS_LIST).get("design")
     if not isinstance(made_of, dict) or not isinstance(made_of.get("file"), str):
         return ""
     design = folder / made_of["file"]
@@ -209,7 +209,7 @@ def remove_stale_parts(run: Path) -> str:
     folder = run / PARTS
     if not stale_parts(folder):
         return ""
-    names = [name for name in _json(folder / PARTS_LIST).get("files", []) if _is_name(name)]
+    names = [name for name in read_record(folder / PARTS_LIST).get("files", []) if _is_name(name)]
     remove_stale(folder, [PARTS_LIST, *names])
     with suppress(OSError):  # something of the user's is in it
         folder.rmdir()
@@ -220,45 +220,7 @@ def _is_name(name: Any) -> bool:
     return isinstance(name, str) and Path(name).name == name
 
 
-def check_question(folder: Path, name: str, question: Mapping[str, Any]) -> None:
-    """Raise InputError if the folder's files of this name answer another question.
-
-    Args:
-        folder: need not exist.
-        name: of the study's files.
-        question: JSON data by topic ("scene", "designs").
-    """
-    known = _record(folder, name).get("question")
-    question = json.loads(json.dumps(question))
-    if known is None or known == question:
-        return
-    parts = [part for part in question if known.get(part) != question[part]]
-    what = f"other {' and '.join(parts)}".replace("other scene", "another scene")
-    raise InputError(
-        f"{folder}: {name}.* there belong to {what}; --overwrite to replace them, or another --out"
-    )
-
-
-def remove_listed(folder: Path, name: str) -> None:
-    """Remove what a study of this name has written before."""
-    for file in _record(folder, name).get("files", ()):
-        if _is_name(file):
-            (folder / file).unlink(missing_ok=True)
-
-
-def write_question(
-    folder: Path, name: str, question: Mapping[str, Any], files: Sequence[str]
-) -> None:
-    """Write what a study asked, and its files, as FOLDER/NAME.json."""
-    text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
-    write_text(folder / f"{name}.json", text + "\n")
-
-
-def _record(folder: Path, name: str) -> dict[str, Any]:
-    return _json(folder / f"{name}.json")
-
-
-def _json(path: Path) -> dict[str, Any]:
+def read_record(path: Path) -> dict[str, Any]:
     """Return the content of a JSON file, nothing if it holds no table."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))

@@ -682,27 +682,3 @@ def write_budget(folder: Path, budget: Mapping[str, Any] | None) -> None:
         for one in budget["parts"]
     ]
     write_text(folder / BUDGET_FILE, "".join(["kind,part,deflection [m],share [-]\n", *rows]))
-
-
-def deflection_sentence(budget: Mapping[str, Any]) -> str:
-    """Return the shares of all kinds of parts in a line, the links' first."""
-    links, *others = [f"{name} {100.0 * x:.3g} %" for name, x in budget["shares"].items()]
-    held = links.replace("links ", "links hold ", 1)
-    return f"{held} of the deflection{''.join(f', {one}' for one in others)}"
-
-
-def deflection_table(budget: Mapping[str, Any]) -> list[str]:
-    """Return the parts as lines of a table."""
-    head = (
-        f"at {budget['instant']:.3f} s, {1e3 * budget['linear']:.4g} mm to first order "
-        f"({1e3 * budget['deviation']:.4g} mm simulated):"
-    )
-    width = max(len(one["name"]) for one in budget["parts"])
-    return [
-        head,
-        *(
-            f"  {one['kind']:<8} {one['name']:<{width}} {1e3 * one['deflection']:>10.4g} mm "
-            f"{100.0 * one['share']:>6.1f} %"
-            for one in budget["parts"]
-        ),
-    ]

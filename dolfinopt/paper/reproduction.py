@@ -30,8 +30,7 @@ from dolfinopt.output.folders import prepare_folder
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene.load import Scene, load_scene, tomllib
 from dolfinopt.study import studies, variants
-from dolfinopt.study.cases import Case, Outcome, Outcomes
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
 from dolfinopt.study.tables import Figure, LineFigure, Panel, Table, embedded, html_page
 

@@ -6,7 +6,6 @@ Matplotlib is imported where it is used: most commands draw nothing.
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -248,13 +247,6 @@ def colour_scale(
     axes = figure.add_axes((0.5 - 2.5 / width, 0.55 / height, 5.0 / width, 0.15 / height))
     shown = ScalarMappable(Normalize(0.0, marks[-1]), colours)
     figure.colorbar(shown, cax=axes, orientation="horizontal", ticks=list(marks), label=label)
-
-
-def png(figure: Figure) -> bytes:
-    """Return a figure as PNG."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
 
 
 def save(figure: Figure, path: PathLike) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -15,12 +16,14 @@ from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.output.views import designed
-from dolfinopt.plots.style import look, png
+from dolfinopt.plots.style import look
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, html_page
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from dolfinopt.multibody.mechanism import Mechanism
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.output.views import ArmView
@@ -149,7 +152,7 @@ def before_after_page(
     machines = []
     for label, side in sides.items():
         drawn = solid_machine_figure(side.views, side.mechanism, side.t, side.q_r, label)
-        machines.append((label, embedded(png(drawn))))
+        machines.append((label, _embedded(drawn)))
     return html_page(
         "before_after.html",
         title=table.title,
@@ -177,7 +180,7 @@ def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
         own = [(label, view) for label, view in found if view.name == name]
         masses = {label: sides[label].summary["mass"][name] for label, _ in own}
         views = [replace(view, name=label) for label, view in own]
-        yield name, embedded(png(solid_design_figure(views, name, masses)))
+        yield name, _embedded(solid_design_figure(views, name, masses))
 
 
 def _curves(sides: Mapping[str, Side], table: Table) -> Iterator[tuple[str, str, Image]]:
@@ -209,4 +212,11 @@ def _plot(sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.
 
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return embedded(png(line_figure(LineFigure("", title, (panel,)), LOOKS)))
+    return _embedded(line_figure(LineFigure("", title, (panel,)), LOOKS))
+
+
+def _embedded(figure: Figure) -> Image:
+    """Return a figure as a picture of the page."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return embedded(stream.getvalue())

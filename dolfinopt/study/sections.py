@@ -36,8 +36,7 @@ from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
 from dolfinopt.scene.tables.arms import WALL_KEYS
-from dolfinopt.study.cases import Case, Outcome
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, Outcome, run_cases
 from dolfinopt.study.studies import (
     COMPLIANCE,
     DEVIATION,
@@ -380,7 +379,7 @@ def study_sections(
     Args:
         scene: whose designed arms are replaced, all by one kind of section.
         designs: design.npz of the design; none: it is optimised.
-        folder, world, shown: see `store.run_cases`.
+        folder, world, shown: see `cases.run_cases`.
 
     Raises:
         InputError: the scene's arms cannot be replaced; nothing was computed.

@@ -25,8 +25,7 @@ from dolfinopt.output.design import arms_with_design, read_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.cases import Case, Outcome, Outcomes
-from dolfinopt.study.store import run_cases
+from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.tables import (
     DesignFigure,
     Figure,

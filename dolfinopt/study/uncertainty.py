@@ -20,8 +20,7 @@ from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.tables.base import without_none
 from dolfinopt.study import statistics as stats
-from dolfinopt.study.cases import Case, scales_bodies, with_sample
-from dolfinopt.study.store import SAMPLED
+from dolfinopt.study.cases import SAMPLED, Case, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
     Design,

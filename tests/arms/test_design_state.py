@@ -50,9 +50,8 @@ def test_what_states_share() -> None:
     counts = arm.profile.counts
     x = arm.uniform(0.5)
     body = arm.reduce(x)
-    damped = arm.under(
-        do.load_scene(TWO_ARM, ("arms.cells=[16,3]", "damping.stiffness_proportional=1e-3"))
-    )
+    changes = ("arms.cells=[16,3]", "damping.stiffness_proportional=1e-3")
+    damped = arm.under(do.load_scene(TWO_ARM, changes))
     assert damped.basis is arm.basis
     assert np.allclose(damped.reduce(x).D, 5.0 * body.D, rtol=1e-12)
     assert counts.reductions == 1

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from mpi4py import MPI
 from remainders import built_of, rates
 from runs import ROOT
 from scipy.sparse.linalg import splu
-from solids import DENSITY, POISSON, YOUNG, solid_arm
+from solids import DENSITY, POISSON, YOUNG, rigid_tip, solid_arm
 
 import dolfinopt as do
 from dolfinopt.responses.evaluation import constraint_gradients
@@ -37,9 +36,8 @@ def flexibility(section: str, size: tuple[float, float, float], cells) -> np.nda
 def box(size: tuple[float, float, float]) -> np.ndarray:
     """Return the same by Timoshenko, and Bredt with both ends held from warping (Benscoter).
 
-    Round sharp corners shear flows on a shorter way than along the middle of the wall. With
-    mu = ((h - b) / (h + b))^2 and k^2 = mu G J / (E I_w) the ends take 2 mu / k tanh(k L / 2) of
-    the length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
+    mu = ((h - b) / (h + b))^2, k^2 = mu G J / (E I_w): the ends take 2 mu / k tanh(k L / 2) of the
+    length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
     """
     L, h, b = size
     t = min(h, b) / 40.0
@@ -86,12 +84,7 @@ def test_stiffness_of_thin_walls(section, size, cells):
 
 
 def box_of_solids(size: tuple[float, float, float], along: int) -> np.ndarray:
-    """Return the same of a box in hexahedra of scikit-fem, quadratic, one through the wall.
-
-    Args:
-        size: length, height and thickness, m.
-        along: cells over the length; about as long as wide.
-    """
+    """Return the same of a box in quadratic hexahedra of scikit-fem, one through the wall."""
     sk = pytest.importorskip("skfem")
     from skfem.helpers import ddot, sym_grad, trace
 
@@ -112,21 +105,10 @@ def box_of_solids(size: tuple[float, float, float], along: int) -> np.ndarray:
         e, f = sym_grad(u), sym_grad(v)
         return lame * trace(e) * trace(f) + 2.0 * G * ddot(e, f)
 
-    K = stiffness.assemble(basis)
-    x, y, z = basis.doflocs
-    axis = np.empty(basis.N, dtype=int)  # of every degree of freedom
-    for dofs in (basis.nodal_dofs, basis.edge_dofs, basis.facet_dofs, basis.interior_dofs):
-        axis[dofs] = np.arange(len(dofs))[:, None] % 3
-    rigid = np.eye(6)[:, axis].T  # (N, 6): displacements of the outer end, then rotations
-    rigid[axis == 0, 4], rigid[axis == 0, 5] = z[axis == 0], -y[axis == 0]
-    rigid[axis == 1, 3], rigid[axis == 2, 3] = -z[axis == 1], y[axis == 2]
-    rigid[x < L - 1e-9] = 0.0
-    free = np.flatnonzero((x > 1e-9) & (x < L - 1e-9))
-    move = sp.hstack([sp.identity(basis.N, format="csr")[:, free], rigid]).tocsc()
-    right = np.zeros((len(free) + 6, 4))
-    right[len(free) + np.array([1, 2, 0, 3]), range(4)] = 1.0
-    found = splu((move.T @ K @ move).tocsc()).solve(right)
-    return found[len(free) + np.array([1, 2, 0, 3]), range(4)]
+    T = rigid_tip(basis, L)
+    right = np.vstack([np.zeros((T.shape[1] - 6, 4)), LOADS.T])
+    found = splu((T.T @ stiffness.assemble(basis) @ T).tocsc()).solve(right)
+    return (found * right).sum(axis=0)
 
 
 @pytest.mark.serial
@@ -144,8 +126,6 @@ def test_short_wide_boxes(size, cells, lag):
     assert flexibility("box", size, cells) == pytest.approx(solids, rel=3e-3)
 
 
-# -- gradients: the whole program, the wall of every cell free ------------------------------------
-
 KEYS = ("wall=0.002", "min_wall=0.001", "max_wall=0.005", "hollow=true")
 COARSE = (
     *(f"arms.{link}.{key}" for link in ("link1", "link2") for key in KEYS),
@@ -159,11 +139,8 @@ COARSE = (
     "changes",
     [
         ("objective.kind=esl", "constraints.mass=2.0", "constraints.tip_deflection=1e-3"),
-        pytest.param(
-            ("objective.kind=mass", "constraints.deviation=0.01", "constraints.stress=1e8",
-             "constraints.first_frequency=100"),
-            marks=pytest.mark.slow,
-        ),
+        pytest.param(("objective.kind=mass", "constraints.deviation=0.01", "constraints.stress=1e8",
+                      "constraints.first_frequency=100"), marks=pytest.mark.slow),
     ],
     ids=["esl", "mass"],
 )  # fmt: skip
@@ -189,9 +166,6 @@ def test_gradients_by_the_wall(changes):
     known = {h: values(h) for h in (0.0, 5e-3, 1e-2)}
     for k, slope in enumerate(slopes):
         assert rates(lambda h, k=k: known[h][k], slope, (1e-2, 5e-3)) == pytest.approx(2.0, abs=0.1)
-
-
-# -- one design on any ranks ---------------------------------------------------------------------
 
 
 def test_the_same_on_any_ranks():

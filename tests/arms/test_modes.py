@@ -39,14 +39,13 @@ def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
     return field(0, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0]))
 
 
-def chain_of_points(
-    rng: np.random.Generator, arms: int
-) -> tuple[Chain, list[tuple[np.ndarray, np.ndarray]]]:
-    """Return a chain of random bodies and each one's point masses (m, x + i y)."""
-    clouds = [
-        (rng.uniform(0.1, 1.0, 7), rng.normal(size=7) + 1j * rng.normal(size=7))
-        for _ in range(arms)
-    ]
+Cloud = tuple[np.ndarray, np.ndarray]  # masses and places x + i y
+
+
+def chain_of_points(rng: np.random.Generator, arms: int) -> tuple[Chain, list[Cloud]]:
+    """Return a chain of random bodies and each one's point masses."""
+    clouds = [(rng.uniform(0.1, 1.0, 7), rng.normal(size=7) + 1j * rng.normal(size=7))
+              for _ in range(arms)]  # fmt: skip
     bodies = [RigidIntegrals(m.sum(), complex(m @ z), float(m @ np.abs(z) ** 2)) for m, z in clouds]
     reach = [complex(*rng.normal(size=2)) for _ in range(arms)]
     angles = list(rng.uniform(-3.0, 3.0, arms))
@@ -54,12 +53,8 @@ def chain_of_points(
     return Chain(bodies, reach, angles, loads, "rigid-body"), clouds
 
 
-def direct_inertia(chain: Chain, clouds: list[tuple[np.ndarray, np.ndarray]], k: int) -> np.ndarray:
-    """Return the inertia (3, 3) of all that arm k carries, summed point by point.
-
-    Every outboard point is placed in arm k's frame, its velocity under (u_x, u_y, theta) of arm
-    k's outboard point written down, and the kinetic energy's matrix summed.
-    """
+def direct_inertia(chain: Chain, clouds: list[Cloud], k: int) -> np.ndarray:
+    """Return the inertia (3, 3) of all that arm k carries, by velocities of all points."""
     masses, places = [np.array([chain.loads[k].mass])], [np.zeros(1, dtype=complex)]
     origin, turn = 0j, 1.0 + 0j
     for j in range(k + 1, len(clouds)):
@@ -123,10 +118,7 @@ def test_carried_inertia_of_a_frozen_tree():
 
 
 def test_rigid_integrals_of_a_bar() -> None:
-    """Solid, and with the outer half empty: m, m L / 2, m (L^2 / 3 + h^2 / 12).
-
-    Gmsh places nodes to 1e-12 of the length.
-    """
+    """Solid, and with the outer half empty; Gmsh places nodes to 1e-12 of the length."""
     arm = arm_of((20, 2))
     for share in (1.0, 0.5):
         solid = arm.mesh.centroid[:, 0] < share
@@ -161,28 +153,21 @@ def test_dense_eigenproblem(carried: RigidIntegrals) -> None:
 
 
 def test_an_arm_cut_in_two() -> None:
-    """The same on the ranks that share an arm."""
+    """The same on the ranks that share an arm; of solids that float, the refinement, too."""
     carried = RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)
-    found = []
+    values, floating = [], []
     for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
         arm = arm_of((24, 3), comm=comm)
         arm.set_design(design_of(arm))
-        found.append(loaded_modes(arm.elastic, carried, 3, None).values)
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
-
-
-def test_ranks_agree_on_floating_solids() -> None:
-    """The refinement of what floats, summed over the ranks, is that of one rank."""
-    found = []
-    for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
+        values.append(loaded_modes(arm.elastic, carried, 3, None).values)
         arm = arm_of((60, 6), "interpolation.floor=1e-9", comm=comm)
-        arm.set_design(
-            design_of(arm, lambda k, x, y: np.floor(12.0 * x) % 2.0 == 0.0).astype(float)
-        )
-        found.append(np.linalg.inv(arm.elastic.constraint_modes().stiffness))
+        stripes = design_of(arm, lambda k, x, y: np.floor(12.0 * x) % 2.0 == 0.0)
+        arm.set_design(stripes.astype(float))
+        floating.append(np.linalg.inv(arm.elastic.constraint_modes().stiffness))
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-9)
     assert floats(arm.elastic)
-    scale = np.sqrt(np.outer(np.diag(found[0]), np.diag(found[0])))
-    np.testing.assert_allclose(found[1] / scale, found[0] / scale, atol=1e-4)
+    scale = np.sqrt(np.outer(np.diag(floating[0]), np.diag(floating[0])))
+    np.testing.assert_allclose(floating[1] / scale, floating[0] / scale, atol=1e-4)
 
 
 STUBBY = ("arms.length=0.3", "arms.height=0.9")
@@ -205,10 +190,8 @@ def stubby() -> Arm:
 def coinciding() -> RigidIntegrals:
     """Return what the stubby arm carries when its two lowest frequencies are equal.
 
-    Both are bending, one shifts the body and one turns it; they repel each other unless two
-    numbers are right, the place of the centre of mass along the arm and the inertia. Newton's
-    method: by perturbation theory a change dM gives the pair's matrix -lambda phi' dM phi, which
-    has to close the gap and must not mix them.
+    They repel each other unless two numbers are right, by Newton's method: a change dM gives the
+    pair's matrix -lambda phi' dM phi, which has to close the gap and must not mix them.
     """
     arm, moment, inertia = stubby(), -0.15 * MASS, 2.5 + 0.15**2 * MASS
     for _ in range(20):
@@ -246,15 +229,10 @@ def slopes_at(
 @pytest.mark.parametrize("exponent", [4.0, 20.0])
 @pytest.mark.parametrize("direction", [uneven, wave])
 def test_p_mean_where_modes_coincide(direction: Field, exponent: float) -> None:
-    """The two lowest eigenvalues are equal to 1e-11, their vectors any: the gradient is one.
-
-    Of either mode alone it is none: the remainder is of first order. Rounding turns the vectors;
-    where they nearly fit the direction, the part of second order is as large with steps of 1e-3,
-    but 3 % of it with those for one mode alone.
-    """
+    """The gradient of equal eigenvalues is one, of either mode alone it is none: rates 2 and 1."""
     arm, carried = stubby(), coinciding()
     x, d = design_of(arm, symmetric), design_of(arm, direction)
-    orders = []
+    orders = []  # with small steps, beside which the part of second order is 3 % of the first
     for follow, steps in ((False, (1e-3, 2.5e-4)), (True, (4e-5, 1e-5))):
         modes, slope = slopes_at(arm, carried, exponent, follow)
 
@@ -323,10 +301,9 @@ def test_first_frequency_of_a_solid_arm() -> None:
 
 
 def euler_value(mass: float, inertia: float, height: float) -> float:
-    """Return the lowest squared frequency of the scene's arm as Euler's beam with a tip body.
+    """Return the lowest squared frequency of Euler's beam, 1 m long, with a tip body.
 
-    w = A (cosh bx - cos bx) + B (sinh bx - sin bx), b^4 = s^2 mu / EI at the frequency s, with
-    EI w_xx = s^2 J w_x and EI w_xxx = -s^2 m w at the tip; the arm is 1 m long.
+    w = A (cosh bx - cos bx) + B (sinh bx - sin bx), EI w_xx = s^2 J w_x, EI w_xxx = -s^2 m w.
     """
     bending, line = 70e9 * 0.01 * height**3 / 12.0, 2700.0 * 0.01 * height  # N m2, kg/m
 
@@ -349,9 +326,8 @@ def test_a_motor_at_the_elbow_lowers_the_frequency(key: str, mass: float, inerti
     """Objective and limit against a slender beam with that body at its end, in closed form."""
     light = "arms.arm2.rigid=true", "arms.arm2.mass=1e-6", "arms.arm2.inertia=0.0"
     motor = f"arms.arm1.joint_mass={mass}", f"arms.arm1.joint_inertia={inertia}"
-    asked = "objective.kind=eigenfrequency"
-    if key == "first_frequency":
-        asked = "constraints.first_frequency=1.0"
+    limit = key == "first_frequency"
+    asked = "constraints.first_frequency=1.0" if limit else "objective.kind=eigenfrequency"
     none = "arms.arm2.joint_mass=0.0", "arms.arm2.joint_inertia=0.0", "payload.mass=0.0"
     linear = "arms.arm1.height=0.02", "simulation.stiffening=false"
     built = build(*light, *motor, *none, asked, *linear, cells=(100, 2))

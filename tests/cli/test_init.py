@@ -7,6 +7,7 @@ import sys
 import jsonschema
 import pytest
 from runs import ROOT, TWO_ARM, environment, refusal, run, shell, tomllib
+from scenes import put_at
 
 import dolfinopt
 from dolfinopt.cli.main import TEMPLATES
@@ -27,13 +28,6 @@ def errors(data: object) -> list[str]:
     return [error.message for error in jsonschema.Draft7Validator(schema).iter_errors(data)]
 
 
-# -- init ------------------------------------------------------------------------------------
-
-
-def test_every_template_is_offered():
-    assert {path.stem for path in template_folder().glob("*.toml")} == set(TEMPLATES)
-
-
 def test_one_of_two_ranks_writes(tmp_path):
     done = shell("init", tmp_path / "machine", ranks=2)
     assert done.returncode == 0, done.stderr
@@ -44,6 +38,7 @@ def test_one_of_two_ranks_writes(tmp_path):
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_a_template_is_a_scene(tmp_path, capsys, template):
     """Complete but for the own geometry, plausible, and known to the schema in its first line."""
+    assert {path.stem for path in template_folder().glob("*.toml")} == set(TEMPLATES)
     run("init", tmp_path / 'my "machine"', "--template", template)
     scene = tmp_path / 'my "machine".toml'
     said = capsys.readouterr().out
@@ -66,10 +61,7 @@ def test_a_template_is_a_scene(tmp_path, capsys, template):
 @pytest.mark.slow
 @pytest.mark.parametrize("template", [name for name in TEMPLATES if name != "step"])
 def test_a_template_is_improved_by_its_optimisation(tmp_path, template):
-    """On its own mesh. Flanges make an arm several times as stiff as the same material spread out.
-
-    The template pick-and-place once ended four times softer than it began: with its exact gradient.
-    """
+    """On its own mesh; pick-and-place ended softer than it began with its exact gradient."""
     run("init", tmp_path / "machine", "--template", template)
     scene = load_scene(tmp_path / "machine.toml", ["optimizer.max_iterations=30"])
     history = dolfinopt.optimize(scene).history
@@ -89,9 +81,6 @@ def test_init_replaces_nothing(tmp_path):
     assert load_scene(tmp_path / "deep" / "c.toml").name == "c"
 
 
-# -- keys ------------------------------------------------------------------------------------
-
-
 def test_keys_are_explained_by_pattern(capsys):
     run("keys")
     said = capsys.readouterr().out
@@ -108,15 +97,10 @@ def test_keys_are_explained_by_pattern(capsys):
     refusal(lambda: run("keys", "payload.mas2"), "payload.mas2", "payload.mass")
 
 
-# -- schema ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("path", DEMOS, ids=lambda path: path.stem)
-def test_schema_takes_the_demos(path):
-    assert errors(tomllib.loads(path.read_text())) == []
-
-
 def test_schema_knows_every_key_with_its_meaning(capsys):
+    """And takes the demos."""
+    for path in DEMOS:
+        assert errors(tomllib.loads(path.read_text())) == [], path
     run("schema")
     schema = json.loads(capsys.readouterr().out)
     assert schema == scene_schema()
@@ -143,15 +127,9 @@ def test_schema_finds_what_is_wrong():
         (("arms", 0, "cells"), [10, 2, 2, 2], "[10, 2, 2, 2]"),
     ):
         data = tomllib.loads(TWO_ARM.read_text())
-        node = data
-        for part in path[:-1]:
-            node = node[part]
-        node[path[-1]] = value
+        put_at(data, path, value)
         [message] = errors(data)
         assert word in message
-
-
-# -- ./dolfinopt.sh python -------------------------------------------------------------------
 
 
 def set_up(folder, interpreter, *stamps):
@@ -190,9 +168,8 @@ def test_launcher_runs_a_script(tmp_path, ranks):
     """With the interpreter of the set-up, its settings, and all arguments."""
     launcher = set_up(tmp_path, f'exec {sys.executable} "$@"', "ready")
     script = tmp_path / "my script.py"
-    script.write_text(
-        "import os, sys\nsys.stdout.write(f'{sys.argv[1:]} {os.environ[\"OMP_NUM_THREADS\"]}\\n')\n"
-    )
+    told = "f'{sys.argv[1:]} {os.environ[\"OMP_NUM_THREADS\"]}\\n'"
+    script.write_text(f"import os, sys\nsys.stdout.write({told})\n")
     line = ["bash", str(launcher), *(["-n", str(ranks)] if ranks else []), "python"]
     env = {k: v for k, v in environment().items() if k != "OMP_NUM_THREADS"}
     options = {"capture_output": True, "text": True, "env": env, "timeout": 60}

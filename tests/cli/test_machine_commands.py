@@ -1,12 +1,10 @@
 """The commands on controlled machines and closed loops."""
 
-import json
-
 import numpy as np
 import pytest
 from machines import controlled, loop
 from mpi4py import MPI
-from runs import refusal, run
+from runs import by_root, contents, refusal, run, summary_of
 from scipy.io import loadmat
 
 from dolfinopt.part.folder import toml_text
@@ -15,13 +13,10 @@ WORLD = MPI.COMM_WORLD
 QUICK = ["--set", "simulation.tolerance=1e-3"]
 
 
-def write_scene(scene, folder):
-    """Write a scene's file on the root; return its path."""
-    path = folder / "machine.toml"
-    if WORLD.rank == 0:
-        path.write_text(toml_text({"name": scene.name} | scene.to_tree()))
-    WORLD.barrier()
-    return path
+@pytest.fixture
+def write_scene(write):
+    """Return what writes a scene's file on the root; it returns its path."""
+    return lambda scene: write("machine.toml", toml_text({"name": scene.name} | scene.to_tree()))
 
 
 SCENES = {"slider": loop, "pin": lambda: loop("pin"), "control": controlled}
@@ -30,34 +25,26 @@ SCENES = {"slider": loop, "pin": lambda: loop("pin"), "control": controlled}
 @pytest.mark.slow
 @pytest.mark.serial
 @pytest.mark.parametrize("kind", SCENES)
-def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path):
-    path, out = write_scene(SCENES[kind](), shared_tmp_path), shared_tmp_path / "out"
+def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path, write_scene):
+    path, out = write_scene(SCENES[kind]()), shared_tmp_path / "out"
     film = ["--animation"] if kind == "pin" else []
     run("simulate", path, *QUICK, "--out", out, *film)
-    WORLD.barrier()
     pictures = {"design.png", "machine.png", "drives.png", "stress.png"}
     pictures |= {"motion.gif"} if film else {"deviation.png"}
-    drawn = {one.name for one in out.iterdir() if one.suffix in (".png", ".gif")}
-    assert drawn == pictures
-    summary = json.loads((out / "summary.json").read_text())
+    assert {name for name in contents(out) if name.endswith(("png", "gif"))} == pictures
+    summary = summary_of(out)
     assert summary["converged"] and summary["ranks"] == WORLD.size
-    WORLD.barrier()
-    if WORLD.rank == 0:
-        (out / "drives.png").unlink()
-    WORLD.barrier()
+    by_root((out / "drives.png").unlink)
     run("plot", out)
-    WORLD.barrier()
     assert (out / "drives.png").stat().st_size > 5000
 
 
-def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys):
+def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scene):
     """Both files hold the same matrices, with names, whatever the ranks; refusals write nothing."""
-    path, out = write_scene(controlled(), shared_tmp_path), shared_tmp_path / "run"
+    path, out = write_scene(controlled()), shared_tmp_path / "run"
     run("simulate", path, *QUICK, "--out", out, "--no-plots")
-    WORLD.barrier()
     run("export", out, "--state-space", 3.0)
     run("export", path, *QUICK, "--state-space", 3.0, "--out", shared_tmp_path / "scene")
-    WORLD.barrier()
     folders = (out / "state-space", shared_tmp_path / "scene")
     first, second = (np.load(one / "state_space.npz") for one in folders)
     for key in first.files:  # numbers to rounding: where arrays lie in memory may tell
@@ -85,24 +72,19 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys):
     assert not (shared_tmp_path / "none").exists()
 
 
-def test_bodies_of_a_loop_are_exported(shared_tmp_path):
-    path = write_scene(loop("pin"), shared_tmp_path)
-    run("export", path, "--out", shared_tmp_path / "bodies")
-    WORLD.barrier()
-    written = {one.name for one in (shared_tmp_path / "bodies").iterdir()}
+def test_bodies_of_a_loop_are_exported(shared_tmp_path, write_scene):
+    run("export", write_scene(loop("pin")), "--out", shared_tmp_path / "bodies")
     arms, kinds = ("coupler", "rocker"), (".sid", ".sid.npz", ".fem")
-    assert written == {arm + kind for arm in arms for kind in kinds}
+    assert set(contents(shared_tmp_path / "bodies")) == {a + kind for a in arms for kind in kinds}
 
 
 @pytest.mark.slow
 @pytest.mark.serial
-def test_gradient_of_machines_is_checked(shared_tmp_path, capsys):
-    """Control's gradient: tests/responses/test_machine_gradients.py."""
-    path = write_scene(loop(), shared_tmp_path)
+def test_gradient_of_machines_is_checked(shared_tmp_path, capsys, write_scene):
+    """Control's gradient: tests/responses/test_gradients.py."""
     tight = ["--set", "simulation.tolerance=1e-4", "--set", "objective.kind=compliance"]
     out = shared_tmp_path / "gradient.npz"
-    run("gradient", path, *tight, "--kind", "exact", "--check", "--out", out)
-    WORLD.barrier()
+    run("gradient", write_scene(loop()), *tight, "--kind", "exact", "--check", "--out", out)
     if WORLD.rank == 0:
         table = [line for line in capsys.readouterr().out.splitlines() if "e-" in line]
         rates = [float(line.split()[-1]) for line in table if line.split()[-1][0].isdigit()]
@@ -110,13 +92,9 @@ def test_gradient_of_machines_is_checked(shared_tmp_path, capsys):
         np.testing.assert_allclose(rates, 2.0, atol=0.05)
 
 
-def test_a_table_without_a_column_leaves_no_folder(shared_tmp_path):
-    path = write_scene(controlled(), shared_tmp_path)
-    if WORLD.rank == 0:
-        (shared_tmp_path / "drive.csv").write_text("t,cart\n0,0\n1,1\n")
+def test_a_table_without_a_column_leaves_no_folder(shared_tmp_path, write, write_scene):
+    write("drive.csv", "t,cart\n0,0\n1,1")
+    line = ["simulate", write_scene(controlled()), "--set", "control.forces=drive.csv", "--out"]
+    refusal(lambda: run(*line, shared_tmp_path / "out"), "drive.csv: line 1", "column 'arm1'")
     WORLD.barrier()
-    out = shared_tmp_path / "out"
-    line = ["simulate", path, "--set", "control.forces=drive.csv", "--out", out]
-    refusal(lambda: run(*line), "drive.csv: line 1", "column 'arm1'")
-    WORLD.barrier()
-    assert not out.exists()
+    assert not (shared_tmp_path / "out").exists()

@@ -10,15 +10,10 @@ from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_
 from runs import run
 
 from dolfinopt.arms.arm import build_arms, uniform_design
+from dolfinopt.exchange.urdf import robot as urdf
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
-from dolfinopt.exchange.urdf.robot import (
-    MASSLESS,
-    Robot,
-    default_tool,
-    roll_pitch_yaw_of,
-    scene_bodies,
-)
+from dolfinopt.exchange.urdf.robot import roll_pitch_yaw_of, scene_bodies
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
@@ -38,21 +33,21 @@ pytestmark = pytest.mark.serial
 MOVED = 12  # random joint coordinates
 
 
-def rigid_machine(file, scene, links):
-    """Return robot, bodies, and the scene's mechanism with the solids as rigid as in the file."""
+@pytest.fixture
+def rigid(imported):
+    """The robot, its bodies, and the scene's mechanism with the solids as rigid as in the file."""
+    file, scene, links = imported
     robot = read_robot(file)
-    bodies = scene_bodies(robot, links, default_tool(robot, links))
+    bodies = scene_bodies(robot, links, urdf.default_tool(robot, links))
     names = scene_names(body.link for body in bodies)
     own = {names[body.link]: body.inertia for body in bodies if body.is_solid}
-    solids = {
-        name: (one.mass, one.centre, np.array([one.tensor[i] for i in INERTIA]))
-        for name, one in own.items()
-    }
+    solids = {name: (one.mass, one.centre, np.array([one.tensor[i] for i in INERTIA]))
+              for name, one in own.items()}  # fmt: skip
     assert [arm["name"] for arm in tree_of(scene)["arms"]] == list(names.values())
     return robot, bodies, mechanism_of(scene, solids)
 
 
-def random_joints(robot: Robot, rng):
+def random_joints(robot, rng):
     """Return joint coordinates (MOVED, joints) of which those that follow do so."""
     q = {joint.name: rng.normal(size=MOVED) for joint in robot.movable if joint.mimic is None}
     for joint in robot.movable:
@@ -67,13 +62,9 @@ def in_scene(robot, mechanism, q):
     return np.column_stack([by_name[mechanism.joints[i].name] for i in mechanism.movable])
 
 
-# -- kinematics and inertia ------------------------------------------------------------------
-
-
-def test_the_scene_moves_as_the_robot(imported):
+def test_the_scene_moves_as_the_robot(imported, rigid):
     """Frames of all bodies against yourdfpy's, the end-effector's the tool's."""
-    file, scene, links = imported
-    robot, bodies, mechanism = rigid_machine(file, scene, links)
+    file, (robot, bodies, mechanism) = imported[0], rigid
     q = random_joints(robot, np.random.default_rng(1))
     rows = in_scene(robot, mechanism, q)
     none = np.zeros_like(rows)
@@ -93,15 +84,14 @@ def test_the_scene_moves_as_the_robot(imported):
         assert np.abs(ends[k] - tool[:3, 3]).max() < 1e-12
 
 
-def test_mass_centre_and_inertia_in_the_world(imported):
+def test_mass_centre_and_inertia_in_the_world(rigid):
     """Every link's mass is somewhere; each body's as that of its links."""
-    file, scene, links = imported
-    robot, bodies, mechanism = rigid_machine(file, scene, links)
+    robot, bodies, mechanism = rigid
     q = random_joints(robot, np.random.default_rng(2))
     frames = frames_of(mechanism, in_scene(robot, mechanism, q)[0])
     poses = robot.poses({name: values[0] for name, values in q.items()})
     for body, frame, constants in zip(bodies, frames, mechanism.constants, strict=True):
-        expected = MASSLESS
+        expected = urdf.MASSLESS
         for name in body.links:
             expected = expected + robot.links[name].own.posed(poses[name])
         mass = constants.body.mass
@@ -119,11 +109,10 @@ def test_mass_centre_and_inertia_in_the_world(imported):
     assert sum(one.mass for one in mechanism.bodies) == pytest.approx(total, rel=1e-14)
 
 
-def test_drive_forces_against_pinocchio(imported):
+def test_drive_forces_against_pinocchio(imported, rigid):
     pin = pytest.importorskip("pinocchio")
-    file, scene, links = imported
-    robot, _, mechanism = rigid_machine(file, scene, links)
-    model = pin.buildModelFromUrdf(str(file))
+    robot, _, mechanism = rigid
+    model = pin.buildModelFromUrdf(str(imported[0]))
     assert np.array_equal(model.gravity.linear, mechanism.gravity)
     data = model.createData()
     order = [model.getJointId(joint.name) for joint in robot.movable]
@@ -157,9 +146,6 @@ def test_roll_pitch_yaw_comes_back():
     for R in (*some, *upright):
         R = some[0].T @ (some[0] @ R)  # to rounding, as products of poses are
         assert np.abs(roll_pitch_yaw(roll_pitch_yaw_of(R)) - R).max() < 1e-14
-
-
-# -- solids ----------------------------------------------------------------------------------
 
 
 def test_a_solid_lies_along_its_link():
@@ -240,17 +226,16 @@ def test_a_links_geometry_becomes_the_solid(tmp_path, capsys):
         assert re.search(words, said.out)
     assert "link 'wrist_1' becomes a box: its geometry is " in said.err
     scene = load_scene(tmp_path / "a" / "robot.toml")
-    names = [arm.name for arm in scene.arms]
-    fore, upper = (
-        arm_mesh(MPI.COMM_SELF, scene.arms[names.index(name)]) for name in ("forearm", "upper_arm")
-    )
+    arms = {arm.name: (k, arm) for k, arm in enumerate(scene.arms)}
+    fore, upper = (arm_mesh(MPI.COMM_SELF, arms[name][1]) for name in ("forearm", "upper_arm"))
     assert fore.area.sum() == pytest.approx(np.pi * 0.055**2 * 0.7287, rel=0.02)
     assert upper.area.sum() == pytest.approx(np.pi * 0.07**2 * (0.862 - 2 * 0.0569), rel=0.02)
     assert 5000 < fore.num_cells < 8000
     # The median edge, what the filter's radius is compared with: about a mean cube's side.
-    side = scene.arms[names.index("forearm")].cell_size or fore.cell_size
+    k, arm = arms["forearm"]
+    side = arm.cell_size or fore.cell_size
     assert side == pytest.approx((fore.area.sum() / fore.num_cells) ** (1 / 3), rel=0.05)
-    assert filter_warnings(scene, {names.index("forearm"): side}) == []
+    assert filter_warnings(scene, {k: side}) == []
     # One layer of cells stays solid at both ends.
     assert 0.01 < fore.area[fore.passive].sum() / fore.area.sum() < 0.05
 
@@ -270,8 +255,6 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
 
 
-# -- shapes ----------------------------------------------------------------------------------
-
 SIDES = (0.5, 0.1, 0.08)
 SPAN = SimpleNamespace(frame=np.eye(4), length=0.4)  # joints at x = 0 and 0.4 m
 BETWEEN = 0.4 * 0.1 * 0.08
@@ -283,26 +266,15 @@ def bar(sides=SIDES, at=(0.2, 0.0, 0.0)):
     return found
 
 
-def inside_out():
-    found = bar()
+def inverted(found):
     found.invert()
-    return [found]
+    return found
 
 
 def without_a_lid():
     found = bar()
     found.update_faces(found.face_normals[:, 2] < 0.5)
     return [found]
-
-
-def two_in_one_file():
-    return [trimesh.util.concatenate([bar(at=(0.15, 0, 0)), bar(at=(0.25, 0, 0))])]
-
-
-def hollow():
-    inner = bar((0.3, 0.06, 0.04))
-    inner.invert()
-    return [trimesh.util.concatenate([bar(), inner])]
 
 
 def in_shards():
@@ -314,26 +286,29 @@ def in_shards():
     return [trimesh.Trimesh(points, np.arange(len(points)).reshape(-1, 3), process=False)]
 
 
-def with_a_part_apart():
-    return [bar(), bar((0.5, 0.02, 0.02), (0.2, 0.0, 0.2))]
+def one_file(*pieces):
+    return [trimesh.util.concatenate(pieces)]
 
 
 @pytest.mark.parametrize(
     ("shapes", "volume", "done"),
     [
         (lambda: [bar()], BETWEEN, ()),
-        (inside_out, BETWEEN, ("1 piece inside out turned",)),
+        (lambda: [inverted(bar())], BETWEEN, ("1 piece inside out turned",)),
         (without_a_lid, BETWEEN, ("holes of 1 piece closed",)),
-        (two_in_one_file, BETWEEN, ("2 pieces united",)),
+        (lambda: one_file(bar(at=(0.15, 0, 0)), bar(at=(0.25, 0, 0))), BETWEEN,
+         ("2 pieces united",)),
         (lambda: [bar(at=(0.15, 0, 0)), bar(at=(0.25, 0, 0))], BETWEEN, ("2 pieces united",)),
-        (hollow, BETWEEN - 0.3 * 0.06 * 0.04, ()),
+        (lambda: one_file(bar(), inverted(bar((0.3, 0.06, 0.04)))),  # hollow
+         BETWEEN - 0.3 * 0.06 * 0.04, ()),
         (in_shards, BETWEEN, ("wide holes filled",)),
-        (with_a_part_apart, BETWEEN, ("2 pieces united", "the largest part kept, 9")),
+        (lambda: [bar(), bar((0.5, 0.02, 0.02), (0.2, 0.0, 0.2))], BETWEEN,
+         ("2 pieces united", "the largest part kept, 9")),
         (lambda: [bar(at=(0.2, 0.07, 0.0))], BETWEEN, ()),
         (lambda: [bar((0.45, 0.1, 0.08), (0.255, 0, 0))], 0.895 * BETWEEN, ("ends 0.042 m bef",)),
         (lambda: [bar((0.9, 0.1, 0.08))], None, ("not cut at the joints",)),
     ],
-)
+)  # fmt: skip
 def test_geometry_is_mended(shapes, volume, done):
     """Closed, open, turned inwards, in parts, off centre, too short, and an elbow."""
     found = cells_between_joints(shapes(), SPAN)

@@ -8,7 +8,7 @@ import pytest
 from mpi4py import MPI
 from pages import Reader
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
-from runs import ROOT, refusal, run
+from runs import ROOT, refusal, run, summary_of
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm
@@ -30,13 +30,12 @@ LINK = ROOT / "demos" / "robot_link.toml"
 
 def same_kinematics(one: Robot, other: Robot) -> bool:
     """Return whether all joints are alike, to the last bit."""
+    told = ("name", "kind", "parent", "child", "lower", "upper", "velocity", "effort")
     return all(
-        (a.name, a.kind, a.parent, a.child, a.lower, a.upper, a.velocity, a.effort)
-        == (b.name, b.kind, b.parent, b.child, b.lower, b.upper, b.velocity, b.effort)
-        and np.array_equal(a.pose, b.pose)
-        and np.array_equal(a.axis, b.axis)
+        all(getattr(a, key) == getattr(b, key) for key in told)
+        and np.array_equal(a.pose, b.pose) and np.array_equal(a.axis, b.axis)
         for a, b in zip(one.joints, other.joints, strict=True)
-    )
+    )  # fmt: skip
 
 
 def test_there_and_back(imported, tmp_path):
@@ -194,7 +193,7 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     assert len(page.all("tr")) == 1 + len(rows) + 2 and page.all("li") == []  # of one scene
     written = (tmp_path / "run" / "urdf" / "before_after.html").read_text()
     assert "The lightest tube wins." in written and "<td>round tube</td>" in written
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "run")
     check_limits(summary, tmp_path / "run" / "trajectory.csv")
     before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
     assert same_kinematics(before, after)
@@ -207,13 +206,10 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     assert fore.points.min(axis=0) == pytest.approx([-0.7287, -0.055, 0.005], abs=1e-3)
     assert implausible_inertias(after) == []
     run_import(tmp_path / "run" / "urdf" / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "b")
-    masses = [
-        {arm["name"]: arm.get("mass") for arm in tree_of(tmp_path / name / "robot.toml")["arms"]}
-        for name in "ab"
-    ]
+    trees = [tree_of(tmp_path / name / "robot.toml")["arms"] for name in "ab"]
+    masses = [[(arm["name"], arm.get("mass")) for arm in tree] for tree in trees]
     assert masses[0] == masses[1]
-    again = read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
-    total = sum(link.own.mass for link in again.links.values())
+    total = sum(link.own.mass for link in after.links.values())
     rest = sum(link.own.mass for name, link in before.links.items() if name != "forearm")
     assert total == pytest.approx(rest + summary["mass"]["forearm"], rel=1e-9)
 
@@ -235,10 +231,9 @@ def test_a_robot_is_never_replaced_by_the_new_one(tmp_path):
     mesh = source / "forearm.stl"
     trimesh.creation.box(extents=(0.1, 0.1, 0.8)).export(mesh)
     shape = '<geometry><cylinder radius="0.055" length="0.84"/></geometry>'
-    (tmp_path / "robot.urdf").write_text(
-        DEMO.read_text().replace(shape, '<geometry><mesh filename="robot/forearm.stl"/></geometry>')
-    )
+    own = '<geometry><mesh filename="robot/forearm.stl"/></geometry>'
     robot = tmp_path / "robot.urdf"
+    robot.write_text(DEMO.read_text().replace(shape, own))
     refusal(lambda: _check_robot(robot, source, ["forearm.stl"]), "forearm.stl")
 
 
@@ -262,9 +257,6 @@ def test_before_and_after():
     refusal(lambda: before_after(one, one | {"mass": {"link": 1.0}}), *words)
 
 
-# -- the demo --------------------------------------------------------------------------------
-
-
 def test_the_demo_is_what_the_import_writes(tmp_path):
     """But for what its head says is edited; its record leads to the robot."""
     run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a")
@@ -282,7 +274,7 @@ def test_the_demo_deflects_by_a_millimetre_and_a_half(tmp_path):
     """Pinned, in few cells: deflection, frequency and drives of the gray initial design."""
     coarse = ("--set", "arms.upper_arm.cells=[24,4,4]", "--no-plots")
     run("simulate", LINK, *coarse, "--out", tmp_path)
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = summary_of(tmp_path)
     assert summary["max_deviation"] == pytest.approx(1.4518e-3, rel=1e-3)
     assert summary["first_frequency"]["upper_arm"] == pytest.approx(77.14, rel=1e-3)
     assert summary["drive_peak"]["shoulder_lift"] == pytest.approx(608.9, rel=1e-3)

@@ -17,8 +17,6 @@ yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 
-# -- the command -----------------------------------------------------------------------------
-
 
 def test_import_says_what_it_made(tmp_path, capsys):
     run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a")
@@ -29,9 +27,8 @@ def test_import_says_what_it_made(tmp_path, capsys):
     assert [arm["name"] for arm in tree["arms"] if not arm.get("rigid")] == ["forearm"]
     assert tree["arms"][-1]["name"] == "tool" and tree["motion"]["file"] == "trajectory.csv"
     scene = load_scene(tmp_path / "a" / "robot.toml")
-    assert scene.is_spatial and scene.driven == tuple(
-        DEMO_MOTION.read_text().splitlines()[1].replace(" ", "").split(",")[1:]
-    )
+    columns = DEMO_MOTION.read_text().splitlines()[1].replace(" ", "").split(",")
+    assert scene.is_spatial and scene.driven == tuple(columns[1:])
     assert "7.879 kg" in (tmp_path / "a" / "robot.toml").read_text()
     before = (tmp_path / "a" / "robot.toml").read_bytes()
     refusal(lambda: run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a"), "exists already")
@@ -190,12 +187,9 @@ def test_files_that_are_no_robots(tmp_path, name, text, words):
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
+    """The launcher installs it: whatever it sets up has an extra with yourdfpy."""
     monkeypatch.setitem(sys.modules, "yourdfpy", None)
     refusal(lambda: read_robot(DEMO), "yourdfpy", f"{sys.executable} -m pip install yourdfpy")
-
-
-def test_the_launcher_installs_what_import_needs():
-    """Whatever it sets up has an extra with yourdfpy."""
     projects = re.findall(r'ensure ready\S* "(.*)"', (ROOT / "dolfinopt.sh").read_text())
     extras = tree_of(ROOT / "pyproject.toml")["project"]["optional-dependencies"]
     assert len(projects) == 4 and any("yourdfpy" in one for one in extras["robots"])
@@ -211,6 +205,8 @@ def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
     assert list(read_robot(file).links) == ["b"]
     file.write_text('<robot><link name="b"/></robot>')
     assert read_robot(file).name == "r"  # its file's, where it has none
+    line = ["import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION]
+    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
 
 
 @pytest.mark.parametrize(
@@ -246,11 +242,6 @@ def test_meshes_are_found_in_their_package(tmp_path, monkeypatch, how):
         assert read_robot(file).links["b"].missing == ("package://arm/meshes/a.stl",)
 
 
-def test_a_package_path_that_is_none(tmp_path):
-    line = ["import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION]
-    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
-
-
 def test_limits_and_friction_come_into_the_scene(tmp_path):
     """No limit where the file says none, or zero."""
     text = DEMO.read_text()
@@ -272,9 +263,6 @@ def test_limits_and_friction_come_into_the_scene(tmp_path):
         else:
             assert (one.velocity_limit, one.effort_limit) == (joint.velocity, joint.effort)
             assert one.friction is None
-
-
-# -- inertias --------------------------------------------------------------------------------
 
 
 TENSOR = 'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.7533"'

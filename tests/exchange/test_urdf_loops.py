@@ -56,19 +56,24 @@ axis = [0, 0, 1]
 MOTION = "t,turn,knee,rock\n0,0.5,0.5,-2.0\n1,1.5,0,0\n"
 
 
-def write(folder: Path, table: str, motion: str = MOTION) -> tuple[Path, Path, Path]:
+def linkage(folder: Path, table: str, motion: str = MOTION) -> tuple[Path, Path, Path]:
     files = tuple(folder / name for name in ("linkage.urdf", "loops.toml", "motion.csv"))
     for file, text in zip(files, (LINKAGE, table, motion), strict=True):
         file.write_text(text)
     return files
 
 
+def imported_to(folder: Path, table: str, motion: str = MOTION) -> Path:
+    """Import the linkage; return the scene's file."""
+    robot, loops, file = linkage(folder, table, motion)
+    words = ("--links", "tool", "--trajectory", file, "--boxes", "--out", folder / "scene")
+    run("import", robot, *words, "--closures", loops)
+    return folder / "scene" / "linkage.toml"
+
+
 def test_a_linkage_is_closed(tmp_path) -> None:
     """Passive joints, the rocker's interface, the assembly by the table's first row."""
-    robot, loops, motion = write(tmp_path, TABLE.format(kind="pin", link="rocker"))
-    words = ("--links", "tool", "--trajectory", motion, "--boxes", "--out", tmp_path / "scene")
-    run("import", robot, *words, "--closures", loops)
-    path = tmp_path / "scene" / "linkage.toml"
+    path = imported_to(tmp_path, TABLE.format(kind="pin", link="rocker"))
     tree, scene = tree_of(path), load_scene(path)
     assert scene.driven == ("turn",)
     assert [one["name"] for one in tree["joints"] if one.get("passive")] == ["knee", "rock"]
@@ -85,10 +90,7 @@ def test_a_driven_rod_is_a_column(tmp_path) -> None:
     table = TABLE.replace("axis = [0, 0, 1]\n", "").replace("[[0.25, 0, 0],", "[[0, 0, 0],")
     table = table.replace('["knee", "rock"]', '["rock"]')
     motion = "t,turn,knee,ankle\n0,0.5,0.5,0.2\n1,0.6,0.5,0.25\n"
-    robot, loops, file = write(tmp_path, table.format(kind="rod", link="foot"), motion)
-    words = ("--links", "tool", "--trajectory", file, "--boxes", "--out", tmp_path / "scene")
-    run("import", robot, *words, "--closures", loops)
-    scene = load_scene(tmp_path / "scene" / "linkage.toml")
+    scene = load_scene(imported_to(tmp_path, table.format(kind="rod", link="foot"), motion))
     assert scene.driven == ("turn", "knee", "ankle")
     assert scene.arms[2].interfaces[0].point == pytest.approx((0.2, 0.0, 0.0))
 
@@ -107,8 +109,7 @@ def test_a_driven_rod_is_a_column(tmp_path) -> None:
     ],
 )
 def test_refused(tmp_path, table: str, words: tuple[str, ...]) -> None:
-    robot, loops, motion = write(
-        tmp_path, table.replace("{kind}", "pin").replace("{link}", "rocker")
-    )
+    table = table.replace("{kind}", "pin").replace("{link}", "rocker")
+    robot, loops, motion = linkage(tmp_path, table)
     with refused("loops.toml", *words):
         scene_of_robot(read_robot(robot), ("tool",), None, str(motion), loops, None, warn=print)

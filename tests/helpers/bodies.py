@@ -125,14 +125,10 @@ def beam(
 class Chain:
     """Clouds on a cart by Lagrange's equations; y = (x_cart, angles, elastic coordinates).
 
-    Positions are written out with rotation matrices in real numbers, so that a complex step
-    differentiates them to rounding. With K0 bodies deform in the second order: first moment s,
-    inertia J, angular momentum h of the relative motion and the outboard interface lose 1/2 q'K0 q
-    by the load that works on them, and so does the displacement q along the modes; the kinetic
-    energy is built of them: what geometric stiffness is in the theory.
-
-    Attributes:
-        K0: of every cloud, (7 + q, q, q): by the seven loads, and L of its modes; or none.
+    Positions are those of real rotation matrices, so that a complex step differentiates them to
+    rounding. With K0 (7 + q, q, q), by the seven loads and L of the modes, bodies deform in the
+    second order: first moment s, inertia J, angular momentum h of the relative motion, outboard
+    interface and the displacement q along the modes lose 1/2 q'K0 q by the load that works on them.
     """
 
     clouds: tuple[Cloud, ...]
@@ -376,11 +372,7 @@ def _polynomial(*coefficients: np.ndarray) -> np.ndarray:
 
 
 def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
-    """Return two branches with every kind of joint, rigid and flexible bodies, and loads.
-
-    With two interfaces the branches leave a flexible body at both of them, and others are held at
-    the second one.
-    """
+    """Return two branches with every kind of joint, rigid and flexible bodies, and loads."""
     last = interfaces - 1
     rigid, fork = (random_cloud(rng, q, 3, interfaces) for q in (0, 3))
     outer = random_cloud(rng, 2, 3), random_cloud(rng, 3, 3, interfaces)
@@ -424,14 +416,14 @@ def posed_motion(motion: RigidMotion) -> RigidMotion:
 # -- changes and derivatives -----------------------------------------------------------------
 
 
-def stiffened(rng: np.random.Generator, body: ShapeIntegrals, along: float = 0.1) -> ShapeIntegrals:
+def stiffened(rng: np.random.Generator, body: ShapeIntegrals) -> ShapeIntegrals:
     """Return a body with some geometric stiffness by all 7 or 18 loads and more."""
     q, b, frame = body.num_modes, len(body.outboard), len(body.w) + len(body.W)
     K0 = rng.normal(scale=0.2, size=(frame + b + q, q, q))
     K0 = K0 + K0.swapaxes(1, 2)
     # The modes of light clouds move little mass.
     parts = {"K0": K0[:frame], "K0_outboard": K0[frame : frame + b]}
-    return replace(body, **parts, along_modes=along * K0[frame + b :])
+    return replace(body, **parts, along_modes=0.1 * K0[frame + b :])
 
 
 def change_of(rng: np.random.Generator, body: ShapeIntegrals, name: str) -> np.ndarray:
@@ -455,11 +447,7 @@ def changed(model: Any, arm: int, name: str, change: np.ndarray) -> Any:
 
 
 def derivative(function: Callable[[float], ArrayLike], step: float = 5e-3) -> np.ndarray:
-    """Return the derivative at zero by central differences of sixth order.
-
-    For functions of size and scale one the truncation, step^6 / 140, and the rounding,
-    1e-16 / step, both stay below 1e-13.
-    """
+    """Return the derivative at zero, of size and scale one to 1e-13, by sixth-order differences."""
     total: np.ndarray | float = 0.0
     for k, weight in ((1, 45.0 / 60.0), (2, -9.0 / 60.0), (3, 1.0 / 60.0)):
         there, back = np.asarray(function(k * step)), np.asarray(function(-k * step))
@@ -475,10 +463,7 @@ def complex_derivative(function: Callable[[complex], np.ndarray]) -> np.ndarray:
 def assert_close(
     found: ArrayLike, expected: ArrayLike, relative: float, size: float | None = None
 ) -> None:
-    """Assert equality to `relative` times `size`, by default the largest expected value.
-
-    Components that happen to be near zero are measured beside the others.
-    """
+    """Assert equality to `relative` times `size`, by default the largest expected value."""
     size = float(np.abs(expected).max()) if size is None else size
     here, there = np.asarray(found), np.asarray(expected)
     np.testing.assert_allclose(here, there, rtol=0.0, atol=relative * size)

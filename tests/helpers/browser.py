@@ -26,11 +26,7 @@ def browser() -> str | None:
 
 
 class Page:
-    """One page; owns the browser's process and what it said.
-
-    Attributes:
-        events: everything that came without being asked.
-    """
+    """One page; owns the browser's process and what it said, the events unasked for."""
 
     def __init__(self, process: subprocess.Popen[bytes], to: int, back: int) -> None:
         self.process, self.to, self.back = process, to, back
@@ -105,11 +101,7 @@ class Page:
 
 @contextmanager
 def open_browser(profile: Path) -> Iterator[Page]:
-    """Yield an empty page of a new browser.
-
-    Args:
-        profile: folder for what the browser keeps.
-    """
+    """Yield an empty page of a new browser, which keeps its things in a folder."""
     path = browser()
     assert path is not None
     theirs_in, to = os.pipe()

@@ -6,13 +6,7 @@ from scipy.ndimage import distance_transform_edt, label
 
 
 def deepest_left(shape, radius, size):
-    """Return how deep, m, the corners and gaps are that a disc does not reach from without.
-
-    Args:
-        shape: of the part.
-        radius: of the disc, m.
-        size: of the raster's squares, m; what is found is right to about one and a half of them.
-    """
+    """Return how deep, m, corners and gaps are that a disc does not reach, to 1.5 raster sizes."""
     outer, *holes = shape.polygons(0.02 * size)
     polygon = shapely.Polygon(outer, holes)
     x0, y0, x1, y1 = polygon.bounds

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from machines import with_keys
-from mpi4py import MPI
+from runs import by_root
 
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.machine_system import MachineSystem
@@ -51,9 +51,7 @@ def hinge(name: str, parent: str, child: str, **keys: Any) -> Tree:
 def closed(folder: Path, table: str, tree: Tree, **changes: Any) -> Scene:
     """Return a scene whose motion is a table of joints (collective)."""
     name = f"{tree['name'].replace(' ', '_')}.csv"
-    if MPI.COMM_WORLD.rank == 0:
-        (folder / name).write_text(table)
-    MPI.COMM_WORLD.barrier()
+    by_root(lambda: (folder / name).write_text(table))
     base = {"material": STEEL, "payload": {"mass": 0.0}, "simulation": {"sample": 0.01}}
     motion = {"path": "joints", "file": name, "horizon": 1.0}
     whole = with_keys(base | {"motion": motion}, tree)
@@ -227,12 +225,11 @@ def delta() -> Tree:
     }  # fmt: skip
 
 
-def flexible_slider_crank(folder: Path, torque: float = 0.5) -> Scene:
-    """Return the machine of `flexible_slider_crank_in_space.csv`: torque, N m, on a free crank."""
+def flexible_slider_crank(folder: Path) -> Scene:
+    """Return the machine of `flexible_slider_crank_in_space.csv`: 0.5 N m on a free crank."""
     wide, last = 0.01, 0.02  # m, s
-    if MPI.COMM_WORLD.rank == 0:
-        (folder / "torque.csv").write_text(f"t,turn\n0,{torque}\n{last},{torque}\n")
-    MPI.COMM_WORLD.barrier()
+    text = f"t,turn\n0,0.5\n{last},0.5\n"
+    by_root(lambda: (folder / "torque.csv").write_text(text))
     slide = {"name": "slide", "type": "prismatic", "parent": "ground", "child": "piston",
              "origin": [0, 0.11, -wide], "axis": [0, 1, 0], "passive": True}  # fmt: skip
     tree = {

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
-from runs import ROOT, TWO_ARM, scene
+from runs import ROOT, TWO_ARM, by_root, scene
 
 import dolfinopt as do
 from dolfinopt.dynamics.collocation import Solution
@@ -169,11 +168,7 @@ def apart(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def imbalance(result: SimulationResult) -> float:
-    """Return how much of the drives' work is not energy, of the largest energy that is stored.
-
-    Work less what damping took, and less kinetic and strain energy and gravity's potential, at the
-    steps' ends; of a prescribed motion, a machine or a closed loop.
-    """
+    """Return how much of the drives' work is not energy, of the largest energy that is stored."""
     trajectory = result.trajectory
     assert trajectory is not None
     grid = trajectory.solution.time_grid
@@ -252,11 +247,7 @@ def drive_trains(trajectory: Trajectory, t: np.ndarray) -> DriveTrains:
 
 
 def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return kinetic and strain energy and gravity's potential, (n,) each, J.
-
-    The first by the mass matrix; the last by where masses are, arms that shorten as they bend
-    included.
-    """
+    """Return kinetic energy by the mass matrix, strain energy, gravity's potential, (n,) J."""
     motion, q, qd, qdd, _ = states(trajectory, t)
     mechanism = trajectory.mechanism
     rigid = np.arange(mechanism.num_rigid)
@@ -334,15 +325,10 @@ def fork() -> dict:
 
 
 def demo_machine(name: str, changes: Sequence[str], folder: Path, *, one_arm: bool) -> Scene:
-    """Return a demo with keys changed, FOLDER standing for the files' one, or with one arm alone.
-
-    Without a name the fork, whose table it writes (collective).
-    """
+    """Return a demo with keys changed, or one arm alone; without a name the fork (collective)."""
     told = [change.replace("FOLDER", str(folder)) for change in changes]
     if not name:
-        if MPI.COMM_WORLD.rank == 0:
-            (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
-        MPI.COMM_WORLD.barrier()
+        by_root(lambda: (folder / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n"))
         return scene_from_dict(fork(), str(folder / "fork.toml"), told)
     path = ROOT / "demos" / f"{name}.toml"
     if not one_arm:

@@ -54,13 +54,9 @@ def built_with(
     cut: bool = False,
     regular: dict[str, np.ndarray] | None = None,
 ) -> Built:
-    """Build a scene's arms, their nodes moved; boxes `cut` into tetrahedra (collective).
+    """Build a scene's arms, nodes moved by place, boxes `cut` into tetrahedra (collective).
 
-    Args:
-        scene: with the arms.
-        moves: by the nodes' places.
-        cut: whether boxes are.
-        regular: gets the places (n, d) of every arm's nodes before.
+    `regular` gets the places (n, d) of every arm's nodes before.
     """
 
     def meshed(comm: MPI.Comm, arm: Arm, pattern: Arm | None = None) -> ArmMesh:
@@ -77,13 +73,7 @@ def built_with(
 
 @dataclass(frozen=True)
 class NodeTest:
-    """Taylor's test by the places of nodes along one random direction.
-
-    Attributes:
-        slope: of the objective along it, by the gradient.
-        remainders: |J(h) - J(0) - h slope| of every step.
-        rate: order in h of the last two.
-    """
+    """Taylor's test by the places of nodes: slope, remainders |J(h) - J(0) - h slope|, rate."""
 
     slope: float
     remainders: tuple[float, ...]
@@ -106,16 +96,10 @@ def node_test(
     moves: Moves = noise,
     response: Response | None = None,
 ) -> NodeTest:
-    """Test the gradient of a response by nodes; instants and time steps are held.
+    """Test a response's gradient by nodes, by default the objective's; instants, steps are held.
 
-    Args:
-        scene: with objective.gradient = "exact".
-        design: densities by the cells' places, see `Built.fields`.
-        size: of the largest move at a step of 1, m.
-        steps: of which the last two tell the rate.
-        cut: whether boxes are cut into tetrahedra.
-        moves: a direction of largest entry 1; by default `noise` of all nodes.
-        response: by default the scene's objective.
+    The largest move at a step of 1 is `size`, m, along `moves`, by default `noise` of all nodes;
+    the last two steps tell the rate; boxes may be `cut` into tetrahedra.
     """
     response = response or objective_of(scene)
 

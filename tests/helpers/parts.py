@@ -15,6 +15,11 @@ def frame(x, y):
     return (np.abs(y) > 0.0149) | (np.abs((x + 0.125) % 0.25 - 0.125) < 0.0124)
 
 
+def windows(x, y, z):
+    """Return the same of a link in space, holes along z; crisp."""
+    return 1.0 * ((np.abs(y) > 0.0131) | (np.abs((x + 0.05) % 0.1 - 0.05) < 0.0255))
+
+
 CHANGES = ["arms.1.rigid=true", "design.projection=robust", "arms.0.passive=0.01",
            "optimizer.max_iterations=1"]  # fmt: skip
 

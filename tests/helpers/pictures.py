@@ -10,10 +10,7 @@ TOLERANCE = 3.0  # RMS of 255: antialiasing differs; a curve that is 1 % off is 
 
 
 def bare(figure: Figure, path: Path) -> Path:
-    """Write a figure without its words, 50 px per inch; return its path.
-
-    Words, and the layout that makes room for them, depend on fonts and on Matplotlib's version.
-    """
+    """Write a figure without its words, which depend on fonts, 50 px per inch; return its path."""
     remove_ticks_and_titles(figure)
     figure.set_layout_engine("none")
     for axes in figure.axes:
@@ -25,10 +22,7 @@ def bare(figure: Figure, path: Path) -> Path:
 
 
 def difference(expected: Path, figure: Figure, folder: Path) -> float:
-    """Return the RMS by which a figure differs from a picture, 0 below the tolerance.
-
-    Where it does, both and their difference stay in the folder.
-    """
+    """Return the RMS by which a figure differs from a picture, 0 below the tolerance."""
     drawn = bare(figure, folder / expected.name)
     found = compare_images(str(expected), str(drawn), TOLERANCE, in_decorator=True)
     return float(found["rms"]) if found else 0.0

@@ -28,10 +28,7 @@ SERIAL_FILE = re.compile(r"^pytestmark = pytest\.mark\.serial\b", re.MULTILINE)
 
 
 def rest_while_the_root_works() -> None:
-    """Let `parallel.on_root` begin with a wait of all other ranks, asleep.
-
-    To be called before other modules of dolfinopt import it.
-    """
+    """Let `parallel.on_root` begin with a wait of all other ranks, asleep."""
     at_once = parallel.on_root
 
     def on_root(world: MPI.Comm, action: Any, *arguments: Any) -> Any:
@@ -76,10 +73,7 @@ class Ranks:
             reporter._tw._file = open(os.devnull, "w")  # for the life of the process
 
     def pytest_ignore_collect(self, collection_path: Path) -> bool | None:
-        """Do not even import files whose tests are all marked `serial` when there are more ranks.
-
-        A file that is named on the command line is read all the same.
-        """
+        """On several ranks import no file whose tests are all `serial`, unless it is named."""
         if self.comm.size == 1 or not collection_path.match("test_*.py"):
             return None
         if not SERIAL_FILE.search(collection_path.read_text(encoding="utf-8")):
@@ -109,10 +103,7 @@ class Ranks:
             self.unread.append(report.longreprtext)
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Stop unless all ranks run the same tests: else they would wait for one another.
-
-        What is there now stays to the end: the garbage collector need not look at it again.
-        """
+        """Stop unless all ranks run the same tests: else they would wait for one another."""
         plan = [item.nodeid for item in session.items], len(self.unread)
         plans = self.comm.allgather(plan)
         if any(other != plans[0] for other in plans):

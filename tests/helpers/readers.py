@@ -23,20 +23,13 @@ class State:
     qdd: np.ndarray
 
 
-def random_state(rng: np.random.Generator, q: int, plane: bool = False) -> State:
-    """Return any state, or one of motion in x-y."""
-    a, w, g = rng.normal(size=(3, 3))
-    if plane:
-        a[2] = w[0] = w[1] = g[0] = g[1] = 0.0
-    return State(a, w, g, *rng.normal(scale=0.5, size=(3, q)))
+def random_state(rng: np.random.Generator, q: int) -> State:
+    """Return any state."""
+    return State(*rng.normal(size=(3, 3)), *rng.normal(scale=0.5, size=(3, q)))
 
 
 def forces_of_sid(data: StandardInputData, s: State) -> Forces:
-    """Return force, moment about the origin and elastic rows, by the floating frame's equations.
-
-    What the format lacks follows from what it has: half of the first order of Gr is the inertia's
-    second order, and geometric stiffness in Ct and Cr is the motion of the second order.
-    """
+    """Return force, moment about the origin and elastic rows, by the floating frame's equations."""
     q, w = len(s.q), s.w
     Gr, Ge = data.Gr.at(s.q).reshape(3, q, 3), data.Ge.at(s.q).reshape(q, q, 3)
     Ct, Cr, Oe = data.Ct.at(s.q), data.Cr.at(s.q), data.Oe.at(s.q)
@@ -74,11 +67,7 @@ def forces_of_sid(data: StandardInputData, s: State) -> Forces:
 
 
 def read_as_mbdyn_does(text: str) -> dict[int, Any]:
-    """Return the numbers of every record group, by the steps of MBDyn's reader.
-
-    It takes a line when it looks for a group, then as many words as it needs wherever line ends
-    are, then the rest of the line; mode shapes begin with a line that begins with two stars.
-    """
+    """Return the numbers of every record group, by the steps of MBDyn's reader."""
     position = 0
 
     def line():
@@ -140,10 +129,8 @@ def read_as_mbdyn_does(text: str) -> dict[int, Any]:
 def mbdyn_stiffening(groups, a, w, wd, force, moment):
     """Return what MBDyn adds to the modal stiffness (left-hand side), by the steps of modalad.cc.
 
-    Args:
-        groups: as read.
-        a, w, wd: (3,) acceleration less gravity, angular velocity and acceleration, body frame.
-        force, moment: (3,) that the joint exerts on its first interface node.
+    By acceleration less gravity, angular velocity and acceleration, body frame, and the joint's
+    force and moment on its first interface node, (3,) each.
     """
     products = [w[0] ** 2, w[1] ** 2, w[2] ** 2, w[0] * w[1], w[1] * w[2], w[2] * w[0]]
     factors = np.concatenate([products, wd, a, -force, -moment])
@@ -151,11 +138,7 @@ def mbdyn_stiffening(groups, a, w, wd, force, moment):
 
 
 def mbdyn_forces(groups: dict[int, Any], s: State) -> Forces:
-    """Return force, moment and rows of a body without lumped masses, its interfaces not loaded.
-
-    Those of MBDyn's residual with the opposite sign, in the frame of the modal node; gravity is
-    part of the frame's acceleration.
-    """
+    """Return force, moment and rows of a body without lumped masses: MBDyn's residual, negative."""
     mass, centre, about_centre = groups[12][0], groups[12][1:4], groups[12][4:].reshape(3, 3)
     K, D = groups[10], groups[13]
     inv3, inv4, inv8, inv5, inv9 = (groups[k] for k in (14, 15, 16, 17, 18))

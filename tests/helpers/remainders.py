@@ -118,10 +118,7 @@ def bulge(points: np.ndarray, length: float, height: float) -> np.ndarray:
 
 
 def dense_matrices(elastic, young, density) -> tuple[np.ndarray, np.ndarray]:
-    """Return T'KT and T'MT (n, n) of a plane arm, put together from the elements' matrices.
-
-    T clamps the inboard edge and holds the outboard one rigid, its three coordinates last.
-    """
+    """Return T'KT and T'MT (n, n) of a plane arm, T the outboard edge's three coordinates last."""
     operators = elastic.operators
     points, size = operators.points, len(operators.points)
     K, M = np.zeros((2, 2 * size, 2 * size))
@@ -189,10 +186,7 @@ def rates(
 
 
 def hold_instants(patch: pytest.MonkeyPatch) -> None:
-    """Let buckling look at the same instants whatever the design.
-
-    Peaks over time lie at samples: where they go on to the next one the slope makes a small step.
-    """
+    """Let buckling look at the same instants: where a peak goes on to the next its slope steps."""
 
     def held(values: np.ndarray, share: float = 0.0) -> list[int]:
         return [len(values) // 5, len(values) // 2, 4 * len(values) // 5]

@@ -115,19 +115,13 @@ def tree_of(scene: Path) -> dict[str, Any]:
 
 
 def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> Mechanism:
-    """Return the rigid mechanism of a scene.
-
-    Args:
-        file: of the scene.
-        solids: mass, centre and inertia (6,) of the arms that are not rigid.
-    """
+    """Return a scene's rigid mechanism, by mass, centre and inertia (6,) of arms that are not."""
     scene = load_scene(file)
-    bodies = []
-    for arm in scene.arms:
-        if arm.rigid:
-            bodies.append(rigid_link(arm, 0.0))
-        else:
-            bodies.append(rigid_spatial_body(*solids[arm.name], (arm.length, 0.0, 0.0)))
+    bodies = [
+        rigid_link(arm, 0.0) if arm.rigid
+        else rigid_spatial_body(*solids[arm.name], (arm.length, 0.0, 0.0))
+        for arm in scene.arms
+    ]  # fmt: skip
     return build_spatial_mechanism(scene, bodies)
 
 

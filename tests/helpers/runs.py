@@ -1,6 +1,7 @@
 """Scenes, and commands run in this process or in processes of their own."""
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
@@ -65,8 +66,27 @@ def refusal(make: Callable[[], object], *words: str) -> str:
 
 
 def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:
-    """Run a command in this process, on all ranks of `world`; errors of dolfinopt are raised."""
+    """Run a command here until all ranks of `world` have done; errors of dolfinopt are raised."""
     commands.main([str(word) for word in words], standalone_mode=False, obj=world)
+    world.barrier()
+
+
+def by_root(act: Callable[[], object]) -> None:
+    """Let the root alone change files that all ranks read before and after."""
+    MPI.COMM_WORLD.barrier()
+    if MPI.COMM_WORLD.rank == 0:
+        act()
+    MPI.COMM_WORLD.barrier()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return what all files of a folder hold, by name."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def summary_of(folder: Path) -> dict:
+    """Return a run's summary."""
+    return json.loads((folder / "summary.json").read_text())
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import numpy as np
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from runs import ROOT
+from scipy.sparse import csr_matrix, lil_matrix
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
@@ -83,6 +84,30 @@ def link_mesh(shape: str, cells: tuple[int, int, int]) -> ArmMesh:
     return ArmMesh("a", comm, mesh, centroid, volume, none, none, *ends, point)
 
 
+def rigid_tip(basis: Any, length: float) -> csr_matrix:
+    """Return what takes free degrees of freedom of scikit-fem, and a rigid tip's, to all of them.
+
+    At x = 0 the body is held; at the length it moves along x, y (and z), then turns, 3 or 6 ways.
+    """
+    d, x = basis.mesh.dim(), basis.doflocs[0]
+    axis = np.zeros(basis.N, dtype=int)  # of every degree of freedom
+    for dofs in (basis.nodal_dofs, basis.edge_dofs, basis.facet_dofs, basis.interior_dofs):
+        if dofs is not None:
+            axis[dofs] = np.arange(len(dofs))[:, None] % d
+    ends = np.flatnonzero(np.abs(x - length) < 1e-7)
+    free = np.flatnonzero((np.abs(x - length) >= 1e-7) & (np.abs(x) >= 1e-7))
+    lever = np.zeros((3, len(ends)))
+    lever[:d] = basis.doflocs[:, ends]
+    lever[0] -= length
+    moves = [np.eye(d)[a][axis[ends]] for a in range(d)]
+    turns = np.eye(3)[2:] if d == 2 else np.eye(3)
+    moves += [np.cross(turn, lever.T)[np.arange(len(ends)), axis[ends]] for turn in turns]
+    T = lil_matrix((basis.N, len(free) + len(moves)))
+    T[free, np.arange(len(free))] = 1.0
+    T[ends, len(free) :] = np.column_stack(moves)
+    return T.tocsr()
+
+
 def elastic_link(name: str, mesh: ArmMesh) -> ElasticArm:
     """Return the solid link made of an element."""
     substructure = Substructure(mesh, ELEMENTS[name].operators(mesh, 1.0, POISSON), Profile())
@@ -90,22 +115,16 @@ def elastic_link(name: str, mesh: ArmMesh) -> ElasticArm:
     return substructure.at(YOUNG * ones, DENSITY * ones)
 
 
-def rasterised(surface: Surface, h: float, margin: int) -> np.ndarray:
-    """Return which voxels (nx, ny, nz) of side h have their centres in a closed surface.
-
-    Args:
-        surface: m.
-        h: m.
-        margin: number of void voxels around it.
-    """
+def rasterised(surface: Surface, h: float) -> np.ndarray:
+    """Return which voxels (nx, ny, nz) of side h, m, have their centres in a closed surface."""
     import pyvista
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
     low, high = surface.points.min(axis=0), surface.points.max(axis=0)
     inner = np.maximum(np.ceil((high - low) / h - 1e-9), 1.0)
-    first = 0.5 * (low + high) - 0.5 * h * (inner - 1.0) - margin * h
-    counts = inner.astype(int) + 2 * margin
+    first = 0.5 * (low + high) - 0.5 * h * (inner - 1.0)
+    counts = inner.astype(int)
     stencil: Any = vtkPolyDataToImageStencil()
     stencil.SetInputData(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
     stencil.SetOutputOrigin(*first)

@@ -25,16 +25,11 @@ HEIGHT, THICKNESS = 0.04, 0.02  # m
 TORSION = 0.22868
 START, END = np.array([0.0, 0.3, -1.9]), np.array([1.6, 1.1, -0.5])  # rad
 DURATION = 0.6  # s
+ELEMENTS = 40  # of a link
 
 
-def beam_link(
-    length: float, normal_modes: int = 6, elements: int = 40, damping: float = 1e-4
-) -> ShapeIntegrals:
-    """Return a link by linear Timoshenko elements and Craig-Bampton modes.
-
-    A point of the section moves by u + theta x (0, y, z): inertia integrals are sums over Gauss
-    points along the axis and in the section, which are exact for it.
-    """
+def beam_link(length: float, normal_modes: int = 6) -> ShapeIntegrals:
+    """Return a link by linear Timoshenko elements, Craig-Bampton modes, sums over Gauss points."""
     area = HEIGHT * THICKNESS
     shear = YOUNG / (2.0 * (1.0 + POISSON))
     sections = np.array([
@@ -42,11 +37,10 @@ def beam_link(
         shear * TORSION * HEIGHT * THICKNESS**3,
         YOUNG * HEIGHT * THICKNESS**3 / 12.0, YOUNG * THICKNESS * HEIGHT**3 / 12.0,
     ])  # fmt: skip
-    h = length / elements
-    size = 6 * (elements + 1)
+    h, size = length / ELEMENTS, 6 * (ELEMENTS + 1)
     K, points, masses, fields = np.zeros((size, size)), [], [], []
     gauss = 0.5 / np.sqrt(3.0)
-    for e in range(elements):
+    for e in range(ELEMENTS):
         dofs = slice(6 * e, 6 * e + 12)
         B = np.zeros((6, 12))  # strains at the middle: no locking
         B[:, :6], B[:, 6:] = -np.eye(6) / h, np.eye(6) / h
@@ -82,7 +76,7 @@ def beam_link(
         w=np.einsum("n,nak->ak", m, Phi),
         W=np.einsum("n,nak,nbl->abkl", m, Phi, Phi, optimize=True).reshape(9, 1 + q, 1 + q),
         K=reduced,
-        D=damping * reduced,
+        D=1e-4 * reduced,
         outboard=V[tip],
         outboard_point=np.array([length, 0.0, 0.0]),
         K0=np.zeros((0, q, q)),
@@ -90,7 +84,7 @@ def beam_link(
     )
 
 
-def reference_chain(normal_modes: int = 6, payload: float = 4.0) -> Mechanism:
+def reference_chain(normal_modes: int = 6) -> Mechanism:
     """Return the chain of the module."""
     z = np.array([0.0, 0.0, 1.0])
     column = rigid_spatial_body(0.0, (0.0,) * 3, (0.0,) * 6)
@@ -100,7 +94,7 @@ def reference_chain(normal_modes: int = 6, payload: float = 4.0) -> Mechanism:
         Joint("shoulder", "revolute", 0, 1, z, rotation=tilt),
         Joint("elbow", "revolute", 1, 2, z),
     )
-    load = rigid_spatial_body(payload, (0.0,) * 3, (0.0,) * 6)
+    load = rigid_spatial_body(4.0, (0.0,) * 3, (0.0,) * 6)
     bodies = (column, beam_link(0.5, normal_modes), beam_link(0.45, normal_modes))
     return spatial_mechanism(bodies, joints, {(2, 0): load}, (0.0, 0.0, -9.81), (2, 0))
 

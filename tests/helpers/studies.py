@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
+from runs import by_root
 
 from dolfinopt.study.tables import Table
 
@@ -30,18 +30,11 @@ def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
 
 
 def write_uniform(path: Path, cells: tuple[int, int], density: float) -> Path:
-    """Write a design of the two arms with one density (collective); return its path.
-
-    Args:
-        path: design.npz.
-        cells: of arms 1 m long and 0.06 m high, along and across.
-        density: of all.
-    """
-    if MPI.COMM_WORLD.rank == 0:
-        along, across = ((np.arange(n) + 0.5) / n for n in cells)
-        x, y = np.meshgrid(along, 0.06 * (across - 0.5))
-        centroid = np.stack([x.ravel(), y.ravel()], axis=1)
-        arms = {f"arm{k}/centroid": centroid for k in (1, 2)}
-        np.savez(path, **arms, **{f"arm{k}/density": np.full(x.size, density) for k in (1, 2)})
-    MPI.COMM_WORLD.barrier()
+    """Write a design.npz of two arms, 1 x 0.06 m, with one density (collective)."""
+    along, across = ((np.arange(n) + 0.5) / n for n in cells)
+    x, y = np.meshgrid(along, 0.06 * (across - 0.5))
+    centroid = np.stack([x.ravel(), y.ravel()], axis=1)
+    arms = {f"arm{k}/centroid": centroid for k in (1, 2)}
+    arms |= {f"arm{k}/density": np.full(x.size, density) for k in (1, 2)}
+    by_root(lambda: np.savez(path, **arms))
     return path

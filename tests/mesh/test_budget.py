@@ -65,10 +65,7 @@ def test_estimate_is_what_was_measured(monkeypatch, make, low, high, words):
     [("auto", "quadratic", 1.74), (False, "quadratic", 1.26), (True, "linear", 0.46)],
 )
 def test_cells_of_files_count_as_measured(monkeypatch, tmp_path, stiffening, element, gigabytes):
-    """All different: tetrahedra of a bar with sides of 5 mm; the estimate is on the safe side.
-
-    Cells of 2 mm, 15.6 times as many: few enough of none.
-    """
+    """Tetrahedra of a bar, all different; 15.6 times as many, few enough of none."""
     (tmp_path / "bar.step").write_text("")
     mesh = {"mesh": str(tmp_path / "bar.step"), "mesh_size": 2e-3, "cell_shape": "tetrahedron"}
     scene = solid_scene(cells=None, stiffening=stiffening, element=element, **mesh)

@@ -25,9 +25,8 @@ TOUCH = 'SystemCall "touch HIT";'
 
 
 def mesh_of(path):
-    return arm_mesh(
-        MPI.COMM_SELF, Arm(name="a", mesh=str(path), length=0.5, height=0.06, thickness=0.01)
-    )
+    arm = Arm(name="a", mesh=str(path), length=0.5, height=0.06, thickness=0.01)
+    return arm_mesh(MPI.COMM_SELF, arm)
 
 
 def refused(path, text, *words):

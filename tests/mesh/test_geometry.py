@@ -81,8 +81,7 @@ def test_scara_arm_is_tapered_and_its_interfaces_are_its_bores(shape):
     sectors = (0.5 * np.pi - lean) * outer[1] ** 2 + (0.5 * np.pi + lean) * outer[0] ** 2
     area = sectors + sum(outer) * 0.325 * np.cos(lean) - np.pi * bore**2 * np.square(outer).sum()
     assert collect(mesh.area).sum() == pytest.approx(area, rel=2e-3)  # arcs in chords
-    centroid = collect(mesh.centroid)
-    solid = centroid[collect(mesh.passive)]
+    solid = collect(mesh.centroid)[collect(mesh.passive)]
     inboard = np.linalg.norm(solid[solid[:, 0] < 0.16], axis=1)
     assert inboard.max() < bore * outer[0] + 0.1 / 16.0  # the file's own ring, a little wider
 
@@ -127,13 +126,6 @@ def test_meshes_of_the_arm_with_bores(shape):
     assert np.array_equal(pair[pair], np.arange(len(pair)))
 
 
-def test_bores_that_do_not_fit():
-    refused(BORES, "half the height, 0.03 m", passive=0.02)
-    refused(BORES, "overlap", "length 0.05 m", length=0.05)
-
-
-# --- a user's own files ----------------------------------------------------------------------
-
 PLAIN = """
 Point(1) = {0, -0.03, 0, 0.02}; Point(2) = {0.5, -0.03, 0, 0.02};
 Point(3) = {0.5, 0.03, 0, 0.02}; Point(4) = {0, 0.03, 0, 0.02};
@@ -147,20 +139,6 @@ Curve Loop(2) = {5, 6, 7, -2}; Plane Surface(2) = {2};
 """
 MILLIMETRES = re.sub(r"\b0\.\d+", lambda m: str(1e3 * float(m[0])), PLAIN)
 ENDS = 'Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};\n'
-
-
-@pytest.fixture
-def write(shared_tmp_path):
-    """Return a function that writes a text file on the root and returns its path on all ranks."""
-
-    def write(name, text):
-        path = shared_tmp_path / name
-        if COMM.rank == 0:
-            path.write_text(text + "\n")  # Gmsh ignores a last statement without it
-        COMM.barrier()
-        return path
-
-    return write
 
 
 def gmsh_writes(path, make):
@@ -213,7 +191,6 @@ def test_own_geometry_without_parameters(write, groups, area, solid, noted):
 @pytest.mark.serial  # Gmsh runs on one rank
 def test_products_that_open_cascade_has_numbered_have_no_names(shared_tmp_path):
     """Every file that it writes has them: "Open CASCADE STEP translator 7.6 1.1"."""
-    path = shared_tmp_path / "two.step"
 
     def halves(gmsh):
         # Open CASCADE keeps the unit of what the process read before.
@@ -222,7 +199,7 @@ def test_products_that_open_cascade_has_numbered_have_no_names(shared_tmp_path):
             gmsh.model.occ.addRectangle(x, -0.5 * HEIGHT, 0.0, 0.5 * LENGTH, HEIGHT)
         gmsh.model.occ.synchronize()
 
-    gmsh_writes(path, halves)
+    path = gmsh_writes(shared_tmp_path / "two.step", halves)
     assert path.read_text().count("PRODUCT('Open CASCADE STEP translator") == 3
     assert arm_mesh(COMM, entry(path)).notes == ()
 
@@ -258,38 +235,33 @@ def plate(occ):
     bar = occ.addRectangle(-half, -half, 0.0, LENGTH + HEIGHT, HEIGHT)
     tools = [(2, occ.addDisk(x, 0.0, 0.0, r, r)) for x, r in ((0.0, 0.013), (LENGTH, BORE))]
     occ.cut([(2, bar)], tools)
-    occ.synchronize()
 
 
 def ring(occ):
     """Make the ring between a bore of 10 mm and that of the plate."""
     occ.cut([(2, occ.addDisk(0, 0, 0, 0.013, 0.013))], [(2, occ.addDisk(0, 0, 0, BORE, BORE))])
-    occ.synchronize()
 
 
 def bar_with_straight_ends(occ):
     occ.addRectangle(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT)
-    occ.synchronize()
 
 
 def step_file(path, **products):
     """Write a STEP file in millimetres with one product for each `name=make(occ)`."""
 
-    def write(gmsh, make):
+    def write(gmsh, name, make):
         gmsh.clear()
         make(gmsh.model.occ)
+        gmsh.model.occ.synchronize()
         gmsh.option.setString("Geometry.OCCTargetUnit", "M")
         gmsh.write(str(path))
-        return path.read_text()
+        return re.sub(r"'Open CASCADE STEP translator[^']*'", f"'{name}'", path.read_text())
 
     with gmsh_on_root(COMM) as gmsh:
         if COMM.rank == 0:
             data = ""
             for k, (name, make) in enumerate(products.items()):
-                text = re.sub(
-                    r"'Open CASCADE STEP translator[^']*'", f"'{name}'", write(gmsh, make)
-                )
-                head, rest = text.split("DATA;")
+                head, rest = write(gmsh, name, make).split("DATA;")
                 body, tail = rest.split("ENDSEC;", 1)
                 data += re.sub(r"#(\d+)", lambda m, k=k: f"#{k * 10000 + int(m[1])}", body)
             assert "MILLI" in data
@@ -307,7 +279,6 @@ def lifted(make, z, thickness):
         occ.translate(faces, 0.0, 0.0, z)
         occ.extrude(faces, 0.0, 0.0, thickness)
         occ.remove(occ.getEntities(2), recursive=False)
-        occ.synchronize()
 
     return solid
 
@@ -370,9 +341,8 @@ def test_step_names_edges_and_faces(shared_tmp_path):
 def two_faces(occ):
     """Make plate and ring in one, with a common curve."""
     plate(occ)
-    occ.cut([(2, occ.addDisk(0, 0, 0, 0.013, 0.013))], [(2, occ.addDisk(0, 0, 0, BORE, BORE))])
+    ring(occ)
     occ.fragment(occ.getEntities(2), [])
-    occ.synchronize()
 
 
 def named(text, kind, fits):
@@ -383,9 +353,6 @@ def named(text, kind, fits):
             if fits(vertices):
                 marked = marked.replace(f"{kind}('{number}'", f"{kind}('x'")
     return re.sub(rf"{kind}\('\d+'", f"{kind}(''", marked)
-
-
-# --- what cannot be an arm -------------------------------------------------------------------
 
 
 BOTH = 'Physical Surface("design") = {1}; Physical Surface("passive") = {1};'
@@ -455,6 +422,8 @@ def test_meshes_that_cannot_be_an_arm(shared_tmp_path, write):
         message = refused(remade(shared_tmp_path / "arm.msh", text, change), *words)
         assert change is not push or "overlap" in message or "folded" in message
     refused(write("none.msh", "hello\n"), "not a mesh of Gmsh")
+    refused(BORES, "half the height, 0.03 m", passive=0.02)
+    refused(BORES, "overlap", "length 0.05 m", length=0.05)
 
 
 solid_box = lifted(bar_with_straight_ends, 0.0, 0.01)
@@ -466,14 +435,12 @@ def chamfered(occ):
     edge = occ.getEntitiesInBoundingBox(-1.0, 0.029, 0.009, 1.0, 0.031, 0.011, 1)[0][1]
     face = occ.getEntitiesInBoundingBox(-1.0, -1.0, 0.009, 1.0, 1.0, 0.011, 2)[0][1]
     occ.chamfer([box], [edge], [face], [0.002])
-    occ.synchronize()
 
 
 def stepped(occ):
     low = occ.addBox(0.0, -0.5 * HEIGHT, 0.0, LENGTH, HEIGHT, 0.01)
     boss = occ.addBox(0.2, -0.01, 0.0, 0.02, 0.02, 0.02)
     occ.fuse([(3, low)], [(3, boss)])
-    occ.synchronize()
 
 
 @pytest.mark.parametrize(
@@ -511,7 +478,6 @@ def test_bores_of_any_radius_are_interfaces(x):
 
 def outline(occ):
     occ.addCircle(0.0, 0.0, 0.0, BORE)
-    occ.synchronize()
 
 
 def test_step_files_that_cannot_be_an_arm(shared_tmp_path, write):
@@ -530,11 +496,6 @@ def two_squares(**changes):
 
 
 SQUARES = Arm(name="a", length=2.0, height=1.0, thickness=1.0, mesh="a.msh")
-
-
-def test_check_accepts():
-    check_mesh(two_squares(), SQUARES)
-    check_mesh(two_squares(cells=np.array([[0, 3, 4, 1], [1, 2, 5, 4]])), SQUARES)  # clockwise
 
 
 @pytest.mark.parametrize(
@@ -566,11 +527,11 @@ def test_options_of_one_file_do_not_reach_the_next(write):
     assert np.array_equal(figures(arm_mesh(COMM, entry(path))), alone)
 
 
-def fan(turns, count=12):
+def fan(turns):
     """Return triangles about the origin through so many turns, neighbours sharing a side."""
-    angle = np.linspace(0.0, 2.0 * np.pi * turns, count + 1)
-    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(count + 1)], axis=1)
-    cells = np.array([[0, k, k + 1] for k in range(1, count + 1)])
+    angle = np.linspace(0.0, 2.0 * np.pi * turns, 13)
+    rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(13)], axis=1)
+    cells = np.array([[0, k, k + 1] for k in range(1, 13)])
     return np.concatenate([np.zeros((1, 3)), rim]), cells
 
 
@@ -624,9 +585,11 @@ def doubled():
     return points, np.concatenate([cells, [new]])
 
 
-@pytest.mark.parametrize("made", [grid(), fan(0.9), horseshoe(0.95)], ids=range(3))
-def test_cells_side_by_side_are_accepted(made):
-    check_cells(*made)
+def test_cells_side_by_side_are_accepted():
+    check_mesh(two_squares(), SQUARES)
+    check_mesh(two_squares(cells=np.array([[0, 3, 4, 1], [1, 2, 5, 4]])), SQUARES)  # clockwise
+    for made in (grid(), fan(0.9), horseshoe(0.95)):
+        check_cells(*made)
 
 
 @pytest.mark.parametrize(
@@ -658,15 +621,13 @@ def test_truncated_step_file_leaves_the_terminal_alone(shared_tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_gmsh_may_end_its_own_process_alone():
+def test_gmsh_may_end_its_own_process_alone_and_ctrl_c_ends_it(monkeypatch):
     with pytest.raises(InputError, match="gave up"):
         in_child(os._exit, 1)
     assert in_child(abs, -1) == 1
     with pytest.raises(ZeroDivisionError):
         in_child(divmod, 1, 0)
 
-
-def test_ctrl_c_ends_the_process_of_gmsh(monkeypatch):
     def interrupted(_):
         raise KeyboardInterrupt
 

@@ -39,23 +39,19 @@ def write_link(path: Path, order: int = 1) -> None:
     with gmsh_on_root(COMM) as gmsh:
         model = gmsh.model
         model.add("link")
-        box = model.occ.addBox(
-            -0.5 * HEIGHT, -0.5 * HEIGHT, -0.5 * THICKNESS, LENGTH + HEIGHT, HEIGHT, THICKNESS
-        )
-        bores = [
-            model.occ.addCylinder(x, 0.0, -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, RADIUS)
-            for x in (0.0, LENGTH)
-        ]
-        ((solid, *_), _) = model.occ.cut([(3, box)], [(3, one) for one in bores])
-        model.occ.synchronize()
+        occ, low = gmsh.model.occ, (-0.5 * HEIGHT, -0.5 * HEIGHT, -0.5 * THICKNESS)
+        box = occ.addBox(*low, LENGTH + HEIGHT, HEIGHT, THICKNESS)
+        bores = [(3, occ.addCylinder(x, 0.0, -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, RADIUS))
+                 for x in (0.0, LENGTH)]  # fmt: skip
+        ((solid, *_), _) = occ.cut([(3, box)], bores)
+        occ.synchronize()
+        wide = {
+            face: np.ptp(np.reshape(model.getBoundingBox(2, face), (2, 3)), axis=0)[0]
+            for _, face in model.getEntities(2)
+        }
         for name, x in (("inboard", 0.0), ("outboard", LENGTH)):
-            own = [
-                face
-                for _, face in model.getEntities(2)
-                if np.ptp(np.reshape(model.getBoundingBox(2, face), (2, 3)), axis=0)[0]
-                == pytest.approx(2.0 * RADIUS, abs=1e-4)
-                and abs(model.occ.getCenterOfMass(2, face)[0] - x) < RADIUS
-            ]
+            own = [face for face, size in wide.items() if abs(size - 2.0 * RADIUS) < 1e-4
+                   and abs(occ.getCenterOfMass(2, face)[0] - x) < RADIUS]  # fmt: skip
             model.setPhysicalName(2, model.addPhysicalGroup(2, own), name)
         model.setPhysicalName(3, model.addPhysicalGroup(3, [solid[1]]), "part")
         gmsh.option.setNumber("Mesh.MeshSizeMax", 0.012)
@@ -95,10 +91,8 @@ def same(mesh: ArmMesh, other: ArmMesh) -> bool:
     """Return whether cells lie at the same places, and interfaces have as many facets."""
     order = [np.lexsort(np.round(one.centroid, 9).T) for one in (mesh, other)]
     apart = mesh.centroid[order[0]] - other.centroid[order[1]]
-    counts = [
-        (len(one.inboard_facets), len(one.outboard_facets), one.num_cells) for one in (mesh, other)
-    ]
-    return bool(counts[0] == counts[1] and np.abs(apart).max() < 1e-9)
+    one, two = ((len(m.inboard_facets), len(m.outboard_facets), m.num_cells) for m in (mesh, other))
+    return bool(one == two and np.abs(apart).max() < 1e-9)
 
 
 def test_file_of_abaqus_is_that_of_gmsh(folder) -> None:
@@ -106,9 +100,8 @@ def test_file_of_abaqus_is_that_of_gmsh(folder) -> None:
     plain = link(folder, "link.msh")
     assert same(link(folder, "link.inp"), plain)
     assert same(link(folder, "faces.inp"), plain)
-    assert plain.area.sum() == pytest.approx(
-        THICKNESS * ((LENGTH + HEIGHT) * HEIGHT - 2.0 * np.pi * RADIUS**2), rel=0.01
-    )
+    area = (LENGTH + HEIGHT) * HEIGHT - 2.0 * np.pi * RADIUS**2
+    assert plain.area.sum() == pytest.approx(THICKNESS * area, rel=0.01)
 
 
 def test_link_is_found_by_its_bores_wherever_it_lies(folder) -> None:
@@ -140,14 +133,10 @@ def write_blocks(path: Path, surfaces: bool) -> None:
     rows = zip(number.ravel(), x.ravel(), y.ravel(), z.ravel(), strict=True)
     lines += [f"{k}, {a:.9g}, {b:.9g}, {c:.9g}" for k, a, b, c in rows]
     lines.append("*ELEMENT, TYPE=C3D8R, ELSET=ALL")
-    cell = 0
-    for i in range(nx):
-        for j in range(n):
-            for k in range(n):
-                cell += 1
-                low, high = number[i : i + 2, j : j + 2, k], number[i : i + 2, j : j + 2, k + 1]
-                around = [one[a] for one in (low, high) for a in ((0, 0), (1, 0), (1, 1), (0, 1))]
-                lines.append(", ".join(map(str, [cell, *around])))
+    for cell, (i, j, k) in enumerate(np.ndindex(nx, n, n), 1):
+        low, high = number[i : i + 2, j : j + 2, k], number[i : i + 2, j : j + 2, k + 1]
+        around = [one[a] for one in (low, high) for a in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        lines.append(", ".join(map(str, [cell, *around])))
     for name, plane in (("INBOARD", number[0]), ("OUTBOARD-1", number[-1])):
         lines += [f"*NSET, NSET={name}", ", ".join(map(str, plane.ravel()))]
     side = number[2:4, 2, :]

@@ -169,13 +169,10 @@ CURVE, SURFACE = ["Line 2"], ["Quadrilateral 4"]
     ("arguments", "length", "surfaces"),
     [
         ("", 1.0, [[2, DESIGN, "design", SURFACE, 2400]]),
-        (
-            "-setnumber length 2 -setnumber passive 0.05",
-            2.0,
-            [[2, DESIGN, "design", SURFACE, 2280], [2, PASSIVE, "passive", SURFACE, 120]],
-        ),
+        ("-setnumber length 2 -setnumber passive 0.05", 2.0,
+         [[2, DESIGN, "design", SURFACE, 2280], [2, PASSIVE, "passive", SURFACE, 120]]),
     ],
-)
+)  # fmt: skip
 def test_geometry_opens_by_itself(arguments, length, surfaces):
     """Gmsh alone meshes the file, with its defaults or with -setnumber."""
     command = [sys.executable, "-c", GMSH_ALONE, str(mesh_folder() / "arm.geo")]
@@ -191,10 +188,7 @@ SHAPED = ["quadrilateral", "triangle"]
 
 
 def solid(size, shape):
-    """Return first frequency, Hz, flexibility (3, 3) and body of the solid arm with bores.
-
-    Of linear elements: their error, not that of the bores' straight sides, is what falls.
-    """
+    """Return frequency, Hz, flexibility (3, 3) and body of the solid arm with bores."""
     entry = {"name": "a", "length": 0.5, "height": 0.06, "thickness": 0.01, "mesh": BORES}
     entry |= {"mesh_size": size, "cell_shape": shape, "element": "linear"}
     material = {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0}
@@ -238,3 +232,12 @@ def test_limits_that_only_the_mesh_can_tell(override, words):
     scene = do.load_scene(file, ["arms.mesh_size=0.015", override])
     partition = do.partition_arms(COMM, scene.cell_counts)
     refusal(lambda: do.build_arms(scene, partition, do.Profile()), str(file), *words)
+
+
+@pytest.mark.serial
+def test_import_keeps_compilers_quiet():
+    """The first record of a library must not set up logging to the terminal behind our back."""
+    script = "import logging, dolfinopt.mesh.compat; logging.info('compiled'); "
+    script += "logging.getLogger('FFCx').warning('compiled')"
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert (run.stdout, run.stderr) == ("", "")

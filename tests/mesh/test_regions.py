@@ -91,14 +91,6 @@ def test_regions_are_drawn():
 
 
 @pytest.mark.serial
-def test_the_volume_knows_regions():
-    """Void that stays makes room: what is left at the minimum counts without it."""
-    most = regions('{kind = "solid", box = [0.1, -0.03, 0.75, 0.03]}')
-    refused(["arms.0.regions (arm1)", "volume_fraction"], most)
-    do.load_scene(TWO_ARM, (*SMALL, most, "design.volume_fraction=0.8"))
-
-
-@pytest.mark.serial
 @pytest.mark.parametrize(
     ("region", "place", "allowed"),
     [
@@ -128,14 +120,15 @@ def test_bad_regions(region, place, allowed):
 
 @pytest.mark.serial
 def test_regions_belong_to_an_arm_with_cells_and_are_set_as_a_whole():
+    """They are taken over from the arm before; void that stays makes room in the volume."""
+    most = regions('{kind = "solid", box = [0.1, -0.03, 0.75, 0.03]}')
+    refused(["arms.0.regions (arm1)", "volume_fraction"], most)
+    do.load_scene(TWO_ARM, (*SMALL, most, "design.volume_fraction=0.8"))
     refused(["none with rigid"], f"arms.arm2.regions=[{HOLE}]")
     data = do.load_scene(TWO_ARM, (*SMALL, regions(HOLE))).to_tree()
     assert do.scene_from_dict(data).arms[1].regions == ()
     words = "unknown key arms.0.regions.0.kind (arm1)", "as a whole", "an array of tables"
     refused(words, "arms.arm1.regions.0.kind=void")
-
-
-def test_an_arm_takes_the_regions_of_the_arm_before():
     one = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}
     one |= {"regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
     data = {"material": "POM", "arms": [one, {"name": "arm2"}, {"name": "arm3", "regions": []}]}
@@ -146,27 +139,22 @@ def test_an_arm_takes_the_regions_of_the_arm_before():
 
 
 BORES = (f"arms.arm1.mesh={ROOT / 'meshes' / 'arm_bores.geo'}", "arms.arm2.rigid=true")
+BORES += ("arms.passive=0.0",)
 
 
 def test_regions_of_a_mesh_file():
-    scene, _, arms = built(*BORES, "arms.passive=0.0", regions(HOLE, LUG))
+    scene, _, arms = built(*BORES, regions(HOLE, LUG))
     for arm in arms.values():
         x, y = arm.mesh.centroid.T
         assert np.array_equal(arm.mesh.void, (x - 0.5) ** 2 + y**2 <= 0.021**2)
         assert arm.mesh.passive[(x > 0.2) & (x < 0.3) & (y > 0.01)].all()
     assert scene.arms[0].fixed_shares == (0.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("region", "words"),
-    [
+    for region, words in (
         ('{kind="void", box=[0.4,-0.05,0.5,0.05]}', ["region 0 of arms.regions", "not cut"]),
         ('{kind="void", circle=[5.0,0,0.1]}', ["region 0 of arms.regions", "of no cell"]),
         ('{kind="solid", box=[0.05,-0.05,0.9,0.05]}', ["volume_fraction = 0.5", "solid cells"]),
-    ],
-)
-def test_regions_that_a_mesh_file_cannot_have(region, words):
-    refusal(lambda: built(*BORES, "arms.passive=0.0", regions(region)), *words)
+    ):
+        refusal(lambda: built(*BORES, regions(region)), *words)  # noqa: B023
 
 
 SPACE = ROOT / "demos" / "spatial_arm.toml"

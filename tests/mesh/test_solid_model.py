@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import refusal
-from solids import HEIGHT, LENGTH, THICKNESS
+from solids import HEIGHT, LENGTH, THICKNESS, solid_scene
 
 from dolfinopt.arms.arm import Arm as Flexible
 from dolfinopt.errors import InputError
@@ -54,11 +54,9 @@ def written(folder: Path, name: str, bored: bool, *more: float) -> Path:
             low = -reach, -0.5 * HEIGHT, -0.5 * THICKNESS
             bar = [(3, occ.addBox(*low, LENGTH + 2.0 * reach, HEIGHT, THICKNESS))]
             if bored:
-                holes = [
-                    (3, occ.addCylinder(x, 0.0, -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, 0.01))
-                    for x in (0.0, LENGTH, *more)
-                ]
-                occ.cut(bar, holes)
+                hole = -THICKNESS, 0.0, 0.0, 2.0 * THICKNESS, 0.01
+                places = (0.0, LENGTH, *more)
+                occ.cut(bar, [(3, occ.addCylinder(x, 0.0, *hole)) for x in places])
             occ.dilate(occ.getEntities(3), 0.0, 0.0, 0.0, 1e3, 1e3, 1e3)  # files are in mm
             occ.synchronize()
             gmsh.write(str(path))
@@ -66,11 +64,8 @@ def written(folder: Path, name: str, bored: bool, *more: float) -> Path:
     return path
 
 
-def test_geo_with_groups(shared_tmp_path):
-    path = shared_tmp_path / "box.geo"
-    if COMM.rank == 0:
-        path.write_text(BOX)
-    COMM.barrier()
+def test_geo_with_groups(write):
+    path = write("box.geo", BOX)
     mesh = mesh_of(path, mesh_size=0.02)
     volume = LENGTH * HEIGHT * THICKNESS
     assert np.allclose(sums(mesh), [volume, 0.2 * volume], rtol=1e-9)
@@ -87,17 +82,12 @@ def facets_at(mesh: ArmMesh, facets: np.ndarray) -> np.ndarray:
     return np.concatenate(COMM.allgather(found))
 
 
-def test_further_interfaces(shared_tmp_path):
+def test_further_interfaces(shared_tmp_path, write):
     """Faces by name, in capitals or not, also where it begins like another's; a bore by place."""
     lug = Interface(name="outboard lug", point=(0.05, 0.5 * HEIGHT, 0.0))
-    path = shared_tmp_path / "lug.geo"
-    if COMM.rank == 0:
-        box = f"{{-1, {0.5 * HEIGHT - 1e-6}, -1, 0.100001, 1, 1}}"
-        path.write_text(
-            BOX + f'Physical Surface("Outboard lug") = {{Surface In BoundingBox {box}}};'
-        )
-    COMM.barrier()
-    mesh = mesh_of(path, mesh_size=0.02, interfaces=(lug,))
+    box = f"{{-1, {0.5 * HEIGHT - 1e-6}, -1, 0.100001, 1, 1}}"
+    named = f'Physical Surface("Outboard lug") = {{Surface In BoundingBox {box}}};'
+    mesh = mesh_of(write("lug.geo", BOX + named), mesh_size=0.02, interfaces=(lug,))
     middles = facets_at(mesh, mesh.further[0].facets)
     assert len(middles) and np.abs(middles[:, 1] - 0.5 * HEIGHT).max() < 1e-12
     assert middles[:, 0].max() < 0.1
@@ -126,10 +116,8 @@ def test_step_without_names(shared_tmp_path, bored):
     assert COMM.allreduce(np.array(ends)).min() >= 8
 
 
-def test_body_of_a_step_file(shared_tmp_path, monkeypatch):
+def test_body_of_a_step_file(shared_tmp_path):
     """Quadratic tetrahedra, from file to floating body: six coordinates, the solid's inertia."""
-    from solids import solid_scene
-
     path = written(shared_tmp_path, "bar.step", bored=False)
     keys = {"cells": None, "mesh": str(path), "mesh_size": 0.015, "cell_shape": "tetrahedron"}
     scene = solid_scene(**keys, filter_radius=0.02)
@@ -144,12 +132,9 @@ def test_body_of_a_step_file(shared_tmp_path, monkeypatch):
 
 def row_of_cubes(path: Path) -> Path:
     """Write one layer of hexahedra along the arm as Gmsh's file."""
-    points = [
-        (x, y * HEIGHT, z * THICKNESS)
-        for x in np.linspace(0.0, LENGTH, 3)
-        for y in (-0.5, 0.5)
-        for z in (-0.5, 0.5)
-    ]
+    places = [(x, y, z) for x in np.linspace(0.0, LENGTH, 3) for y in (-0.5, 0.5)
+              for z in (-0.5, 0.5)]  # fmt: skip
+    points = [(x, y * HEIGHT, z * THICKNESS) for x, y, z in places]
     ring = (1, 3, 4, 2)  # around a cross-section, in Gmsh's order
     elements = [(3, k, [4 * x + i for i in ring]) for k, x in ((1, 0), (2, 2))]
     elements += [(5, 3, [4 * x + i for x in (k, k + 1) for i in ring]) for k in (0, 1)]
@@ -188,12 +173,10 @@ def test_names_of_faces(shared_tmp_path):
     text = written(shared_tmp_path, "bar.step", bored=False).read_text(encoding="latin-1")
     pieces = text.split("ADVANCED_FACE('',")
     assert len(pieces) == 7
-    found = []
+    found, join = [], "ADVANCED_FACE('',".join
     for k in range(1, 7):
         path = shared_tmp_path / f"named{k}.step"
-        named = "ADVANCED_FACE('Outboard',".join(
-            ["ADVANCED_FACE('',".join(pieces[:k]), "ADVANCED_FACE('',".join(pieces[k:])]
-        )
+        named = f"{join(pieces[:k])}ADVANCED_FACE('Outboard',{join(pieces[k:])}"
         path.write_text(named, encoding="latin-1")
         try:
             found.append(mesh_of(path, mesh_size=0.04))

@@ -8,15 +8,9 @@ from mpi4py import MPI
 from runs import ROOT
 
 import dolfinopt as do
+from dolfinopt.mesh import sections
 from dolfinopt.mesh.checks import cell_volumes, check_cells
-from dolfinopt.mesh.sections import (
-    FLAT_BAR,
-    I_SECTION,
-    RECTANGULAR_TUBE,
-    ROUND_TUBE,
-    SOLID_BAR,
-    member,
-)
+from dolfinopt.mesh.sections import FLAT_BAR, SOLID_BAR, member
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.profiling import Profile
@@ -25,12 +19,8 @@ from dolfinopt.study.sections import Members
 LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
 E, NU = 70e9, 0.33
 G = 0.5 * E / (1.0 + NU)
-MESHED = {
-    "rectangular tube": RECTANGULAR_TUBE,
-    "round tube": ROUND_TUBE,
-    "I section": I_SECTION,
-}
-alone = pytest.mark.serial
+MESHED = {"rectangular tube": sections.RECTANGULAR_TUBE, "round tube": sections.ROUND_TUBE,
+          "I section": sections.I_SECTION}  # fmt: skip
 
 
 def moments(kind, share):
@@ -89,19 +79,15 @@ def test_areas_of_bars():
     assert FLAT_BAR.measures(0.06, 0.01, 0.5) == (0.03, 0.01)
 
 
-@alone
+@pytest.mark.serial
 @pytest.mark.parametrize("share", [0.02, 0.2])
 @pytest.mark.parametrize("kind", [*MESHED, "solid bar"])
 def test_cantilever(kind, share, tmp_path):
-    """Bending both ways and twist of the clamped member: 1 % as the issue asks.
-
-    Bredt's formula and Vlasov's are of thin walls: twist of these is compared there alone.
-    """
+    """Bending both ways and twist of the clamped member; twist where the walls are thin."""
     own = [f"arms.link1.{key}={value}" for key, value in
            (("length", LENGTH), ("height", HEIGHT), ("thickness", THICKNESS))]  # fmt: skip
-    scene = do.load_scene(
-        ROOT / "demos" / "spatial_arm.toml", [*own, "simulation.stiffening=false"]
-    )
+    keys = [*own, "simulation.stiffening=false"]
+    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", keys)
     members = Members(scene, kind, MESHED.get(kind, SOLID_BAR), tmp_path)
     made = members.case((share, share)).scene
     _, arms, x_phys = arms_with_design(MPI.COMM_SELF, made, None, Profile())

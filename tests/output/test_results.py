@@ -1,13 +1,11 @@
 """What a run leaves: the same files from both ways, the summary last."""
 
-import json
-
 import meshio
 import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import built_of
-from runs import TWO_ARM
+from runs import TWO_ARM, by_root, contents, summary_of
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
@@ -35,10 +33,7 @@ def simulated(result):
 @pytest.mark.parametrize("paraview", [True, False])
 def test_files(result, shared_tmp_path, paraview):
     one, other = shared_tmp_path / "one", shared_tmp_path / "other"
-    if WORLD.rank == 0:
-        one.mkdir()
-        other.mkdir()
-    WORLD.barrier()
+    by_root(lambda: (one.mkdir(), other.mkdir()))
     scene = do.load_scene(TWO_ARM, SMALL)
     written = write_result(scene, one, result, 12.5, paraview=paraview)
     again = write_simulation(other, simulated(result), 2.5, paraview=paraview)
@@ -47,8 +42,8 @@ def test_files(result, shared_tmp_path, paraview):
         return
     expected = FILES | PARAVIEW if paraview else FILES
     for folder, wall, iterations in ((one, 12.5, 1), (other, 2.5, 0)):
-        assert {path.name for path in folder.iterdir()} == expected
-        summary = json.loads((folder / "summary.json").read_text())
+        assert set(contents(folder)) == expected
+        summary = summary_of(folder)
         assert wall <= summary["seconds"]["total"] < wall + 60.0
         assert summary["iterations"] == iterations
     assert [view.name for view in written.views] == ["arm1", "arm2"]
@@ -94,10 +89,7 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("element", [*ELEMENTS])
 def test_views_of_arms_without_a_current_design(element):
-    """Studies and the paper's page draw designs that they have read but never assembled.
-
-    Nodes between corners are not drawn.
-    """
+    """Designs that studies read but never assembled; nodes between corners are not drawn."""
     built = built_of(do.load_scene(TWO_ARM, [*SMALL, f"arms.element={element}"]))
     views = gather_views(built.scene, built.partition, built.arms, built.uniform())
     if WORLD.rank == 0:

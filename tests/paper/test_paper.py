@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from runs import refusal, run
+from runs import TWO_ARM
 
 from dolfinopt.data import paper_scene
 from dolfinopt.output.summary import filter_warnings
@@ -16,15 +16,9 @@ from dolfinopt.study.cases import Case
 
 pytestmark = pytest.mark.serial  # cases are dealt out to ranks in tests/study
 
-ROOT = Path(__file__).parents[2]
-
 
 def made_up():
-    """Round results that meet every demand of `--check`.
-
-    They are made up so that each demand can be broken alone: what the program computes is for the
-    demands themselves to judge, in `dolfinopt reproduce --check`.
-    """
+    """Round results that meet every demand of `--check`, made up so that each breaks alone."""
     columns = ["table", "label", "kind", "x", "made_for", "compliance", "deviation"]
     nan, (before, after, solid) = math.nan, (paper.INITIAL, paper.OPTIMUM, paper.SOLID)
     cms, modal = paper.METHODS
@@ -60,14 +54,12 @@ def made_up():
 RESULTS = made_up()
 
 
-# -- checks on made-up results ---------------------------------------------------------------
-
-
 def test_made_up_results_meet_all_demands():
-    """All that `reproduce --check` demands."""
+    """All that `reproduce --check` demands, each of which can fail, see FLAWS."""
     checks = check_paper(RESULTS)
     assert failed_checks(checks) == []
     assert all(check.statement and check.found and check.criterion for check in checks)
+    assert {check.name for check in checks if check.demand} == set(FLAWS)
 
 
 def altered(where, **factors):
@@ -104,10 +96,6 @@ def test_check_finds(name):
     assert any(line.startswith(f"{name}: expected") for line in failed)
 
 
-def test_every_demand_can_fail():
-    assert {check.name for check in check_paper(RESULTS) if check.demand} == set(FLAWS)
-
-
 def test_sentences_follow_from_the_results():
     """A check that holds says so, with the figure; one that does not gives the reason."""
     for check in check_paper(RESULTS):
@@ -121,13 +109,10 @@ def test_sentences_follow_from_the_results():
 
 
 def test_coarse_cells_get_a_filter_of_two():
-    """Below, designs hang together by corners of cells."""
+    """Below, designs hang together by corners of cells; a filter that is asked for stays."""
     scene = paper.load_paper(True)
     assert scene.design.radius == pytest.approx(2.0 * max(paper.cell_sizes(scene).values()))
     assert filter_warnings(scene, paper.cell_sizes(scene)) == []
-
-
-def test_filter_that_is_asked_for_stays():
     scene = paper.load_paper(True, ["design.filter_radius=0.01"])
     assert scene.design.radius == 0.01
     [warning] = filter_warnings(scene, paper.cell_sizes(scene))
@@ -136,20 +121,14 @@ def test_filter_that_is_asked_for_stays():
     assert full.design.radius == 0.0075 and len(filter_warnings(full, paper.cell_sizes(full))) == 1
 
 
-# -- measures --------------------------------------------------------------------------------
-
-
-def test_measures():
+def test_measures_and_losses():
+    """Losses against the best of each column, by hand."""
     x = np.linspace(4.0, 8.0, 9)
     assert span([2.0, 4.0]) == 0.5
     assert bend(x, 3.0 + 2.0 * x) < 1e-12
     assert bend([-1.0, 0.0, 1.0], [3.0, 0.0, 3.0]) == pytest.approx(1.0)
     assert power(x, 0.1 * x**1.9) == pytest.approx(1.9)
     assert [percent(s) for s in (0.0125, 0.136, 15.6)] == ["1.25 %", "13.6 %", "16 times"]
-
-
-def test_losses():
-    """Against the best of each column, by hand."""
     rows = pd.DataFrame(
         [(math.nan, 9.0, 9.0, 9.0), (0.0, 1.0, 7.0, 5.0), (1.0, 1.5, 7.0, 4.0)],
         columns=["made_for", 0.0, 0.5, 1.0],
@@ -157,17 +136,10 @@ def test_losses():
     np.testing.assert_allclose(paper.loss(rows, "compliance"), [[0.0, 0.25], [0.5, 0.0]])
 
 
-# -- what is planned -------------------------------------------------------------------------
-
-
-def test_scene_comes_with_the_package():
-    demo = ROOT / "demos" / "two_arm.toml"
-    assert paper_scene().read_bytes() == demo.read_bytes()
-    assert paper_scene().is_relative_to(Path(paper.__file__).parent)
-
-
 def test_plan_is_complete():
-    """All that the paper varies, and nothing twice."""
+    """All that the paper varies, and nothing twice; its scene comes with the package."""
+    assert paper_scene().read_bytes() == TWO_ARM.read_bytes()
+    assert paper_scene().is_relative_to(Path(paper.__file__).parent)
     table = paper.Plan(paper.load_paper()).table
     scenes = [case.scene for case in table.case]
     assert {s.payload.mass for s in scenes} >= {4.0, 5.0, 6.0, 7.0, 8.0}
@@ -188,10 +160,3 @@ def test_plan_is_complete():
     assert kinds.count("static") == 2 and kinds.count("eigenfrequency") == 2
     # The nominal design stands for six reasons and is optimised once.
     assert len(made) == len(kinds) - 1 + 3 + 2 + 4
-
-
-def test_bad_input_is_one_line(shared_tmp_path):
-    out = shared_tmp_path / "o"
-    for words, key in (("payload.mas=4", "payload.mass"), ("motion.radius=5", "motion.radius")):
-        refusal(lambda: run("reproduce", "--out", out, "--set", words), key)  # noqa: B023
-        assert not out.exists()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from parts import folder_with, frame
-from runs import run
+from runs import run, summary_of
 
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
@@ -76,10 +76,6 @@ def test_buckling_of_the_part_stands_in_the_table(made):
     values = check.to_dict()["table"]["buckling"]
     assert values == {"unit": "-", "density": None, "crisp": None, "part": row["part"]}
     assert not any("buckles" in text for text in check.warnings)
-
-
-def test_part_that_buckles_is_told(made):
-    check = made[2]
     weak = replace(check.part, buckling=LeastBuckling(1.2345, 0, 0.5))
     (warning,) = [text for text in replace(check, part=weak).warnings if "buckles" in text]
     assert warning.startswith("arm1 buckles at 1.23 times its loads at 0.500 s")
@@ -99,7 +95,7 @@ def test_model_checks_parts_of_a_design(made):
 
 def test_stiffening_is_that_of_the_run(made, tmp_path):
     """Decided anew, a softer form of the arms might be simulated as another machine."""
-    summary = json.loads((made[0] / "summary.json").read_text())
+    summary = summary_of(made[0])
     for on in (True, False):
         asked = summary["scene"] | {"simulation": summary["scene"]["simulation"]}
         asked["simulation"] |= {"stiffening": "auto"}
@@ -135,7 +131,7 @@ def test_command_prints_and_keeps_the_table(made, capsys, tmp_path):
     # The scene of the parts is the machine of the table.
     out = tmp_path / "out"
     run("simulate", tmp_path / "part" / "part.toml", "--no-plots", "--out", out)
-    summary = json.loads((out / "summary.json").read_text())
+    summary = summary_of(out)
     assert summary["compliance"] == pytest.approx(check.part.values["compliance"], rel=1e-6)
     assert summary["max_deviation"] == pytest.approx(check.part.values["deviation"], rel=1e-6)
 

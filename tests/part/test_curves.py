@@ -36,21 +36,17 @@ def fine(curve):
 
 
 @pytest.mark.parametrize("curve", CURVES)
-def test_area_is_that_of_many_chords(curve):
-    x, y = fine(curve).T
+def test_curves_reversed_and_mirrored(curve):
+    """They run through the same points; their area is that of many chords."""
+    points, t = fine(curve), np.linspace(0.0, 1.0, 6)
+    x, y = points.T
     expected = 0.5 * (x[:-1] * y[1:] - x[1:] * y[:-1]).sum()
     assert curve.area == pytest.approx(expected, abs=1e-7)
-    assert curve.reversed().area == pytest.approx(-curve.area, rel=1e-12)
-    assert curve.mirrored().area == pytest.approx(-curve.area, rel=1e-12)
-
-
-@pytest.mark.parametrize("curve", CURVES)
-def test_reversed_and_mirrored_run_through_the_same_points(curve):
-    points = fine(curve)
+    for other in (curve.reversed(), curve.mirrored()):
+        assert other.area == pytest.approx(-curve.area, rel=1e-12)
     np.testing.assert_allclose(fine(curve.reversed()), points[::-1], atol=1e-12)
     np.testing.assert_allclose(fine(curve.mirrored()), points * [1.0, -1.0], atol=1e-12)
     np.testing.assert_allclose(direction(curve, 0.0), -direction(curve.reversed(), 1.0), atol=1e-9)
-    t = np.linspace(0.0, 1.0, 6)
     np.testing.assert_allclose(curvature(curve.mirrored(), t), -curvature(curve, t), atol=1e-9)
 
 
@@ -72,17 +68,14 @@ def test_parts_of_a_spline_are_the_spline():
     np.testing.assert_allclose(middle, spline.at(np.array([0.15, 0.5, 0.85])), atol=1e-8)
 
 
-# --- recognised shapes ------------------------------------------------------------------------
-
-
-def kinds(points, labels=None):
-    labels = np.full(len(points), "") if labels is None else labels
+def kinds(points):
+    labels = np.full(len(points), "")
     return [edge.curve for edge in recognise(points, labels, float(np.ptp(points)))]
 
 
-def circle(count, radius=0.01, centre=(0.3, 0.1), first=0.0):
-    angle = first + 2.0 * np.pi * np.arange(count) / count
-    return np.array(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+def circle(count):
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return np.array([0.3, 0.1]) + 0.01 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 @pytest.mark.parametrize("shift", [0, 3, 17])
@@ -144,9 +137,6 @@ def test_curves_do_not_go_beyond_a_label():
 def test_sides_are_chained_to_loops():
     found = loops(np.array([[0, 1], [5, 6], [1, 2], [6, 7], [2, 0], [7, 5]]))
     assert sorted(sorted(loop.tolist()) for loop in found) == [[0, 1, 2], [5, 6, 7]]
-
-
-# --- splines through points -------------------------------------------------------------------
 
 
 def wave(count=400):

@@ -44,6 +44,14 @@ def form(request, tmp_path_factory):
         yield folder, scene, part, problem, problem.evaluated({1: free_form(part, 1.0)}, {})
 
 
+@pytest.fixture
+def surface(form):
+    """The surface that moves; plates are made of outlines."""
+    if not isinstance(form[4].outlines[1], FreeSurface):
+        pytest.skip("plates are made of outlines")
+    return form[4].outlines[1]
+
+
 def moves_of(form):
     """Return smooth random moves of about a millimetre."""
     free = form[4].outlines[1]
@@ -90,10 +98,8 @@ def test_kept_arrays_are_the_form(form):
         assert one.shape == other.shape
 
 
-def test_one_place_that_would_fold_does_not_keep_back_the_others(form):
-    free, (_, s) = form[4].outlines[1], moves_of(form)
-    if not isinstance(free, FreeSurface):
-        pytest.skip("plates are made of outlines")
+def test_one_place_that_would_fold_does_not_keep_back_the_others(form, surface):
+    free, (_, s) = surface, moves_of(form)
     places, cell = free.mesh.points[free.nodes], free.part.domain.cell
     away = np.linalg.norm(places - places[0], axis=1)
     # How far a place must move to fold depends on the mesh, which every Gmsh makes its own.
@@ -108,21 +114,18 @@ def test_one_place_that_would_fold_does_not_keep_back_the_others(form):
     assert np.abs(went[away < 0.5 * cell]).max() < 1.0 * cell
 
 
-def test_a_surface_that_would_cross_itself_gives_way_to_that_of_the_mesh(form, monkeypatch):
-    state, (_, s) = form[4], moves_of(form)
-    moved = state.outlines[1].moved(s)
-    if not isinstance(moved, FreeSurface):
-        pytest.skip("plates are made of outlines")
+def test_a_surface_that_would_cross_itself_gives_way_to_that_of_the_mesh(
+    form, surface, monkeypatch
+):
+    moved = surface.moved(moves_of(form)[1])
     monkeypatch.setattr("dolfinopt.part.solid.free_surface.crossings", lambda _: np.ones((1, 2)))
     assert moved.made.watertight
     assert moved.made.volume == pytest.approx(moved.size, rel=1e-12)
 
 
-def test_a_surface_that_gmsh_cannot_mesh_keeps_its_triangles(form, monkeypatch):
+def test_a_surface_that_gmsh_cannot_mesh_keeps_its_triangles(form, surface, monkeypatch):
     """Its mesh is filled anew; there is no coarse one."""
-    moved = form[4].outlines[1].moved(moves_of(form)[1])
-    if not isinstance(moved, FreeSurface):
-        pytest.skip("plates are made of outlines")
+    moved = surface.moved(moves_of(form)[1])
 
     def lost(*_):
         raise InputError("Gmsh finds no faces")

@@ -69,22 +69,15 @@ def test_what_is_not_free_stays_and_joints_stay_smooth(made):
     assert after.is_simple(1e-5)
 
 
-def test_symmetric_arm_stays_symmetric(made):
-    shape = made[3].parts[0].shape
-    points = np.vstack([c.points for c in shape.curves if isinstance(c, Spline)])
+def test_curves_follow_those_of_the_part(made):
+    """Their area by moves is its difference, and symmetric ones stay so."""
+    points = np.vstack([c.points for c in made[3].parts[0].shape.curves if isinstance(c, Spline)])
     apart = np.linalg.norm(points[:, None] - points * MIRROR, axis=2).min(axis=1)
     assert apart.max() < 1e-9
-
-
-def test_curves_follow_those_of_the_part(made):
     part = made[2][0]
     outline = free_outline(part)
     assert outline.shape.area == pytest.approx(part.shape.area, rel=2e-3)
     assert outline.is_valid and len(outline.shape.loops) == len(part.shape.loops)
-
-
-def test_area_by_moves_is_its_difference(made):
-    outline = free_outline(made[2][0])
     moves = outline.filtered(1e-6 * np.random.default_rng(0).normal(size=outline.count))
     ends = [outline.moved(sign * moves).shape.area for sign in (1.0, -1.0)]
     # Area is quadratic in the moves: central differences are exact.
@@ -117,18 +110,19 @@ def test_lightest_part_keeps_its_limit(made):
     problem = Problem(scene, {}, {})
     outlines = {0: free_outline(parts[0])}
     deviation = problem.evaluated(outlines, {}).simulated.evaluation.max_deviation
-    posed = with_tables(
-        scene,
-        objective={"kind": "mass"},
-        constraints={"deviation": deviation / 1.02},
-        design={"volume_fraction": None},
-    )
+    posed = with_tables(scene, objective={"kind": "mass"}, design={"volume_fraction": None},
+                        constraints={"deviation": deviation / 1.02})  # fmt: skip
     found = optimize_parts(posed, parts, 12, lambda _: None)
     assert [one.met for one in found.best.limits] == [True]
     assert found.best.limits[0].value == pytest.approx(deviation / 1.02, rel=2e-2)
 
 
-def test_arcs_are_refused(made):
+def test_arcs_and_values_of_the_table_are_refused(made, monkeypatch):
+    """Before any outline is made."""
+    monkeypatch.setattr("dolfinopt.part.part.make_parts", None)
+    for change, words in (('part.curves="arcs"', ("part.curves", "splines")),
+                          ("part.starts=-1", ("0",))):  # fmt: skip
+        refusal(lambda: runs.scene("part.optimize=true", change), *words)  # noqa: B023
     with pytest.raises(InputError, match="expected splines"):
         run("part", made[0], "--curves", "arcs", "--optimize", "--no-plots", "--no-check")
     assert not (made[0] / "part").exists()
@@ -246,10 +240,9 @@ def test_command_goes_on(tmp_path, monkeypatch):
 def test_best_start_is_kept_and_the_others_told(made):
     _, scene, parts, alone, _ = made
     found = optimize_parts(scene, parts, STEPS, lambda _: None, starts=1)
-    assert {one.start for one in (found.best, *found.others)} == {
-        "the densities' parts", "trusses 1"
-    }  # fmt: skip
-    assert found.best.value == min(one.value for one in (found.best, *found.others))
+    every = (found.best, *found.others)
+    assert {one.start for one in every} == {"the densities' parts", "trusses 1"}
+    assert found.best.value == min(one.value for one in every)
     assert found.best.value <= alone.best.value * (1.0 + 1e-9)
     assert found.sentences[1].startswith("not kept")
 
@@ -262,14 +255,6 @@ def test_command_takes_the_scene_s_table(tmp_path):
     assert figures["optimize"]["iterations"] == 1
     assert figures["arms"]["arm1"]["tool_radius"] == 0.006
     assert figures["arms"]["arm1"]["smallest_concave_radius"] > 0.98 * 0.006
-
-
-@pytest.mark.parametrize(
-    "change, words",
-    [('part.curves="arcs"', ("part.curves", "splines")), ("part.starts=-1", ("0",))],
-)
-def test_values_of_the_table_are_refused(change, words):
-    refusal(lambda: runs.scene("part.optimize=true", change), *words)
 
 
 def test_command_writes_optimised_parts(made, tmp_path, capsys):

@@ -64,12 +64,11 @@ def test_concave_corners_have_the_radius_of_the_tool(design, radius):
 
 
 def test_tolerance_bounds_the_distance_and_sets_the_number_of_points(design):
-    parts = [
-        make_part(design(frame), Curves(tolerance=tolerance)) for tolerance in (5e-4, 1e-4, 2e-5)
-    ]
-    for part in parts:
+    points = []
+    for tolerance in (5e-4, 1e-4, 2e-5):
+        part = make_part(design(frame), Curves(tolerance=tolerance))
         check(part, holes=4)
-    points = [part.shape.control_points for part in parts]
+        points.append(part.shape.control_points)
     assert points[0] <= points[1] <= points[2] < 8 * points[0]
 
 
@@ -90,39 +89,36 @@ def test_lines_and_arcs_on_request(design):
     assert shapely.hausdorff_distance(here, there) < 2.0 * part.tolerance
 
 
-def test_island_is_dropped(design):
-    def density(x, y):
-        return frame(x, y) | (np.hypot(x - 0.375, y) < 0.008)
-
-    part = make_part(design(density))
-    check(part, holes=4)
-    assert part.outline.islands == 1
-    assert "1 piece without a joint to both interfaces (" in " ".join(part.warnings)
+def diagonal(x, y):
+    """A chain of cells that share corners, which elements join at their nodes."""
+    column, row = np.floor(x / 0.005 + 1e-9), np.floor((y + 0.03) / 0.005 + 1e-9)
+    return (column - 72 == row - 3) & (np.abs(y) < 0.015)
 
 
-def test_strut_of_one_cell_stays(design):
-    def density(x, y):
-        return frame(x, y) | (np.abs(x - 0.3725) < 0.002)
-
-    part = make_part(design(density))
-    check(part, holes=5)
-    assert 0.002 < part.thinnest < 0.006
-
-
-def test_cells_that_share_a_corner_stay_joined(design):
-    """A diagonal chain, which elements join at their nodes."""
-
-    def density(x, y):
-        column, row = np.floor(x / 0.005 + 1e-9), np.floor((y + 0.03) / 0.005 + 1e-9)
-        return frame(x, y) | ((column - 72 == row - 3) & (np.abs(y) < 0.015))
-
-    part = make_part(design(density))
-    check(part, holes=5)
+# What stands in a window of the frame, and the windows then.
+IN_A_WINDOW = {
+    "island": (lambda x, y: np.hypot(x - 0.375, y) < 0.008, 4),
+    "strut of one cell": (lambda x, y: np.abs(x - 0.3725) < 0.002, 5),
+    "diagonal chain": (diagonal, 5),
+}
 
 
-def test_design_that_falls_apart_is_refused(design):
+@pytest.mark.parametrize("name", IN_A_WINDOW)
+def test_struts_stay_and_islands_are_dropped(design, name):
+    more, holes = IN_A_WINDOW[name]
+    part = make_part(design(lambda x, y: frame(x, y) | more(x, y)))
+    check(part, holes)
+    assert part.outline.islands == (name == "island")
+    told = "1 piece without a joint to both interfaces (" in " ".join(part.warnings)
+    assert told == (name == "island")
+    assert name != "strut of one cell" or 0.002 < part.thinnest < 0.006
+
+
+def test_designs_and_tools_that_are_refused(design):
     with pytest.raises(InputError, match=r"arm 'arm1'.*does not hang together"):
         make_part(design(lambda x, y: np.abs(x - 0.5) > 0.05))
+    with pytest.raises(InputError, match=r"--tool-radius = 0.03 m: the tool is as wide as"):
+        draw_outline(design(frame), 0.03, 1e-4)
 
 
 def test_full_arm_is_its_own_outline(design):
@@ -165,11 +161,6 @@ def test_regions_stay_solid_and_void(design):
     polygon = shapely.Polygon(outer, holes)
     assert polygon.buffer(1e-8).covers(shapely.box(0.3, -0.02, 0.4, 0.01))
     assert not polygon.buffer(-1e-8).intersects(shapely.box(0.5, 0.02, 0.6, 0.03))
-
-
-def test_tool_as_wide_as_the_arm_is_refused(design):
-    with pytest.raises(InputError, match=r"--tool-radius = 0.03 m: the tool is as wide as"):
-        draw_outline(design(frame), 0.03, 1e-4)
 
 
 def tapered(path):

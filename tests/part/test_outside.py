@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from mpi4py import MPI
-from parts import folder_with, frame, write_run
+from parts import folder_with, frame, windows, write_run
 from petsc4py import PETSc
 from runs import ROOT, run
 from scipy.linalg import eigh
+from solids import rigid_tip
 
 import dolfinopt as do
 from dolfinopt.arms.arm import build_arms
@@ -70,14 +70,7 @@ def peak(part, state):
 
 
 def meshed(file, around, largest, plane=True):
-    """Return cells of the solid in a STEP file (mm), or of its lower face, as scikit-fem's, m.
-
-    Args:
-        file: STEP.
-        around: cells on a full circle of curves.
-        largest: side, m.
-        plane: whether the lower face alone is meshed, in triangles.
-    """
+    """Return cells of the solid in a STEP file (mm), or of its lower face, as scikit-fem's, m."""
     gmsh = pytest.importorskip("gmsh")
     gmsh.initialize()
     try:
@@ -107,14 +100,7 @@ def meshed(file, around, largest, plane=True):
 
 
 def outside(mesh, material, length, thickness=1.0):
-    """Return the figures by scikit-fem, in plane stress or of a solid, whose stress is not asked.
-
-    Args:
-        mesh: from x = 0 to the length.
-        material: of the scene.
-        length: m.
-        thickness: in the plane, m.
-    """
+    """Return the figures by scikit-fem, in plane stress or of a solid, whose stress is left out."""
     from skfem.helpers import ddot, dot, eye, sym_grad, trace
 
     d, young, poisson = mesh.dim(), material.young_modulus, material.poisson_ratio
@@ -184,28 +170,6 @@ def solver(K):
     return solve
 
 
-def rigid_tip(basis, length):
-    """Return the matrix from free degrees of freedom, and 3 or 6 of a rigid tip, to all of them."""
-    d = basis.mesh.dim()
-    axis = np.zeros(basis.N, dtype=int)
-    for dofs in (basis.nodal_dofs, basis.facet_dofs if d == 2 else basis.edge_dofs):
-        for a in range(d):
-            axis[dofs[a]] = a
-    x = basis.doflocs[0]
-    ends = np.flatnonzero(np.abs(x - length) < 1e-7)
-    free = np.flatnonzero((np.abs(x - length) >= 1e-7) & (np.abs(x) >= 1e-7))
-    lever = np.zeros((3, len(ends)))
-    lever[:d] = basis.doflocs[:, ends]
-    lever[0] -= length
-    turns = np.eye(3)[2:] if d == 2 else np.eye(3)
-    moves = [np.eye(d)[a][axis[ends]] for a in range(d)]
-    moves += [np.cross(turn, lever.T)[np.arange(len(ends)), axis[ends]] for turn in turns]
-    T = sp.lil_matrix((basis.N, len(free) + len(moves)))
-    T[free, np.arange(len(free))] = 1.0
-    T[ends, len(free) :] = np.column_stack(moves)
-    return T.tocsr()
-
-
 def test_a_plane_part_as_another_program_sees_it(made):
     """Measured on finer meshes: 0.13, 0.08 and 0.33 %; on these 0.12, 0.08 and 0.64 %."""
     folder, part = made
@@ -218,15 +182,8 @@ def test_a_plane_part_as_another_program_sees_it(made):
     compliance = static_response(state.elastic, np.array([[0.0, 1.0, 0.0]])).tip[1, 0]
     own = Figures(compliance, state.first_frequency, peaks[-1])
     arm, material = scene.arms[0], scene.material_of(0)
-    coarse, fine = (
-        outside(
-            meshed(folder / "part" / "arm1.step", around, side),
-            material,
-            arm.length,
-            arm.thickness,
-        )
-        for around, side in ((32, 0.006), (64, 0.004))
-    )
+    meshes = (meshed(folder / "part" / "arm1.step", *fine) for fine in ((32, 0.006), (64, 0.004)))
+    coarse, fine = (outside(mesh, material, arm.length, arm.thickness) for mesh in meshes)
     assert peaks[-1] == pytest.approx(peaks[-2], rel=0.02)
     for name in ("compliance", "frequency", "stress"):
         settled = getattr(fine, name)
@@ -234,17 +191,9 @@ def test_a_plane_part_as_another_program_sees_it(made):
         assert getattr(own, name) == pytest.approx(settled, rel=0.01), name
 
 
-def windows(x, y, z):
-    """A frame with struts, holes along z."""
-    return 1.0 * ((np.abs(y) > 0.0131) | (np.abs((x + 0.05) % 0.1 - 0.05) < 0.0255))
-
-
 @pytest.mark.slow
 def test_a_plate_in_space_as_another_program_sees_it(tmp_path):
-    """Tetrahedra in the solid of the STEP file.
-
-    Measured: 0.77 and 0.24 %, and on meshes 0.7 times as coarse on both sides 0.61 and 0.18 %.
-    """
+    """Measured: 0.77 and 0.24 %; on meshes 0.7 times as coarse on both sides 0.61 and 0.18 %."""
     changes = ["arms.link1.cells=[40,6,1]", "arms.link2.rigid=true"]
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes)
     folder = write_run(tmp_path / "run", scene, windows)

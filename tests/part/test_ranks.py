@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from parts import frame, write_run
-from runs import TWO_ARM, run, shell
+from runs import TWO_ARM, contents, run, shell
 
 import dolfinopt as do
 
@@ -19,10 +19,6 @@ def two_arms(path):
     """Write a run of two arms."""
     designs = (lambda x, y, at=at: frame(x, y) | (np.abs(x - at) < 0.02) for at in (0.3, 0.7))
     return write_run(path, do.load_scene(TWO_ARM, CHANGES), *designs)
-
-
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 @pytest.mark.slow

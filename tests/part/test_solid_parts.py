@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from machines import fork
 from mpi4py import MPI
-from parts import write_run
-from runs import ROOT, run, shell
+from parts import windows, write_run
+from runs import ROOT, contents, run, shell
 from scipy.ndimage import gaussian_filter
 from solids import HEIGHT, LENGTH, THICKNESS, rasterised, solid_scene
 
@@ -49,11 +49,6 @@ LOW = np.array([0.0, -0.5 * HEIGHT, -0.5 * THICKNESS])
 HIGH = np.array([LENGTH, 0.5 * HEIGHT, 0.5 * THICKNESS])
 
 
-def windows(x, y, z):
-    """A frame with struts, holes along z; crisp."""
-    return 1.0 * ((np.abs(y) > 0.0131) | (np.abs((x + 0.05) % 0.1 - 0.05) < 0.0255))
-
-
 def hollow(x, y, z):
     """A cavity that no face shows, and slanted grey ends."""
     inside = (np.abs(y) < 0.013) & (np.abs(z) < 0.005)
@@ -62,9 +57,8 @@ def hollow(x, y, z):
 
 def islands(x, y, z):
     """A bar along the lower side, and two pieces that no joint holds."""
-    return 1.0 * (
-        (y < -0.006) | (x < 0.03) | (x > 0.47) | ((y > 0.01) & (np.abs(x % 0.2 - 0.1) < 0.02))
-    )
+    bar = (y < -0.006) | (x < 0.03) | (x > 0.47)
+    return 1.0 * (bar | ((y > 0.01) & (np.abs(x % 0.2 - 0.1) < 0.02)))
 
 
 def read_three_mf(data):
@@ -96,9 +90,8 @@ def test_part_of_a_solid(domain_with, density):
     assert part.watertight
     assert part.volume == pytest.approx(domain.volume, rel=1e-4)
     assert 0.01 * domain.cell < part.distance <= 0.5 * domain.cell
-    stl = trimesh.load_mesh(
-        io.BytesIO(triangle_bytes(MM * part.surface.corners, "part, mm")), "stl"
-    )
+    data = triangle_bytes(MM * part.surface.corners, "part, mm")
+    stl = trimesh.load_mesh(io.BytesIO(data), "stl")
     for found, size in ((stl, 1e-7), (read_three_mf(three_mf_bytes(part.surface, "a & b")), 1e-9)):
         assert found.is_watertight and found.is_winding_consistent
         assert found.volume == pytest.approx(1e9 * domain.volume, rel=1e-4)
@@ -206,8 +199,7 @@ def test_surfaces_do_not_cross_themselves(monkeypatch):
 
 
 def test_crossings_of_known_bodies():
-    """Two tetrahedra with a common corner, edge, or apart do not cross; pushed into each other,
-    they do."""
+    """Two tetrahedra with a common corner, or apart, do not cross; pushed together they do."""
     one = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
@@ -280,7 +272,7 @@ def test_what_stays_solid_or_void_is_kept(domain_with):
     for axis, place, across in ((0, 0.2375, HEIGHT / 3.0), (1, HEIGHT / 6.0, 0.025)):
         assert area_in(surface, axis, place) == pytest.approx(across * THICKNESS, rel=1e-9)
     voxel = 1e-3
-    solid = rasterised(surface, voxel, 0)
+    solid = rasterised(surface, voxel)
     assert solid.shape == (500, 40, 20)
     x, y = (0.5 + np.arange(n) - n / 2 for n in (500, 40))  # mm, from the middle
     wide, high = np.abs(x) < 37.0, np.abs(y) < 13.0
@@ -372,8 +364,7 @@ def test_widths_of_a_box_with_walls(domain_with, cell):
 
 
 def test_the_width_of_a_tail_in_space(domain_with):
-    """A pyramid's stump from 12 mm to 3 mm square over 60 mm, on a block: that of the ball which
-    touches its sides and its end."""
+    """A pyramid's stump on a block: that of the ball which touches its sides and its end."""
     tail = trimesh.convex.convex_hull(
         [[x, y * w, z * w] for x, w in ((0.1, 0.006), (0.16, 0.0015))
          for y in (-1, 1) for z in (-1, 1)])  # fmt: skip
@@ -387,7 +378,8 @@ def test_the_width_of_a_tail_in_space(domain_with):
     assert found.member == pytest.approx(end, abs=2.0 * found.to * np.sin(slant))
 
 
-def test_narrow_members_are_told(domain_with):
+def test_narrow_members_are_told_and_pieces_without_a_joint_left_out(domain_with):
+    """The level makes up for the pieces."""
     domain = replace(domain_with(windows), filter_radius=0.012)
     part = make_solid_part(domain)
     assert part.widths.member == pytest.approx(HEIGHT / 6.0, abs=2.0 * part.widths.to)
@@ -395,10 +387,6 @@ def test_narrow_members_are_told(domain_with):
                for one in part.warnings)  # fmt: skip
     asked = replace(part, domain=replace(domain, minimum_member=0.004))
     assert not any("thinnest member" in one for one in asked.warnings)
-
-
-def test_pieces_without_a_joint_are_left_out(domain_with):
-    """The level makes up for them, and they are told."""
     part = make_solid_part(domain_with(islands))
     assert part.pieces == 2 and part.pieces_volume > 0.0
     assert any("2 pieces without a joint" in one for one in part.warnings)
@@ -412,15 +400,11 @@ def test_smoothing_takes_stairs_away(domain_with):
     part = make_solid_part(domain)
     points, nodes, values = halved(domain.corners, domain.field)
     before = outside(cut(points, eighths(nodes), values, part.level))[0]
-    after, stairs = (
-        trimesh.Trimesh(one.points, one.triangles).area for one in (part.surface, before)
-    )
-    assert after < 0.995 * stairs
+    assert area_of(part.surface.corners) < 0.995 * area_of(before.corners)
 
 
 def test_member_of_one_cell_keeps_its_size(domain_with):
-    """A strip of one cell along an edge of the box, between its ends: at one half all of it but
-    what is rounded off its inner edge."""
+    """A strip along an edge of the box: at one half all but what is rounded off its inner edge."""
     strip = domain_with(lambda x, y, z: 1.0 * ((y > 0.0134) & (z > 0.005)))
     points, nodes, values = halved(strip.corners, strip.field)
     surface, _ = outside(cut(points, eighths(nodes), values, 0.5))
@@ -429,16 +413,13 @@ def test_member_of_one_cell_keeps_its_size(domain_with):
     assert coarse.volume < 0.9 * strip.volume
 
 
-@pytest.mark.parametrize(
-    ("density", "words"),
-    [
+def test_no_part_can_be_made(domain_with):
+    for density, words in (
         (lambda x, y, z: 1.0 * (np.abs(x - 0.25) > 0.1), "and joins both interfaces"),
         (lambda x, y, z: np.full_like(x, 0.5), "too grey for a part"),
-    ],
-)
-def test_no_part_can_be_made(domain_with, density, words):
-    with pytest.raises(InputError, match=f"arm 'arm1': .*{words}"):
-        make_solid_part(domain_with(density))
+    ):
+        with pytest.raises(InputError, match=f"arm 'arm1': .*{words}"):
+            make_solid_part(domain_with(density))
 
 
 def finished(path, densities, *changes):
@@ -457,10 +438,7 @@ def test_two_ranks_write_the_same_solids(tmp_path, capfd):
     assert "no STEP of link1:" in told and "column: no part" in told
     done = shell("part", folder, "--out", tmp_path / "two", *options, ranks=2)
     assert done.returncode == 0, done.stderr
-    here, there = (
-        {path.name: path.read_bytes() for path in (tmp_path / name).iterdir()}
-        for name in ("one", "two")
-    )
+    here, there = (contents(tmp_path / name) for name in ("one", "two"))
     kinds = [f"link{k}.{kind}" for k in (1, 2) for kind in ("3mf", "msh", "stl")]
     assert sorted(there) == sorted([*kinds, "link2.step", "link2.dxf", "part.json", "part.toml"])
     assert [name for name in there if here[name] != there[name]] == []

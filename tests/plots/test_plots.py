@@ -28,10 +28,7 @@ LENGTHS = (1.0, 0.7, 0.4)  # m
 
 
 def beam(name: str, length: float, height: float, nx: int, ny: int) -> ArmView:
-    """Return an arm of nx x ny rectangles, solid above its axis and void below.
-
-    Its modes are u = (x, 0), the stretch, and u = (-2 x y, x^2), the bend.
-    """
+    """Return rectangles, solid above the axis, with modes u = (x, 0) and u = (-2 x y, x^2)."""
     x = np.linspace(0.0, length, nx + 1)
     y = np.linspace(-0.5 * height, 0.5 * height, ny + 1)
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
@@ -76,10 +73,10 @@ def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Closure | N
     )  # fmt: skip
 
 
-def swinging(mechanism: Mechanism, count: int = 41) -> Any:
+def swinging(mechanism: Mechanism) -> Any:
     """Return a motion; the deviation is some centimetres."""
     arms = len(mechanism.bodies)
-    t = np.linspace(0.0, 2.0, count)
+    t = np.linspace(0.0, 2.0, 41)
     q_r = np.column_stack([0.3 * t] + [0.9 * np.cos(t + k) for k in range(arms)])
     return motion(mechanism, t, q_r, 0.01 * np.sin(np.outer(t, 2.0 + np.arange(2 * arms))))
 
@@ -96,9 +93,6 @@ def shown(figure) -> np.ndarray:
     image = np.asarray(figure.canvas.buffer_rgba())[..., :3].astype(int)
     assert np.ptp(image) > 200
     return image
-
-
-# -- numbers ---------------------------------------------------------------------------------
 
 
 def test_magnification_is_round_from_1_to_100_and_turns_ends_no_further_than_arms_do():
@@ -138,9 +132,6 @@ def test_areas_and_volume_fraction_of_any_polygons():
     corners = np.array([[[0, 0], [0, 1], [3, 1], [3, 0]], [[3, 0], [4, 0], [4, 1], [3, 1]]], float)
     view = ArmView("a", corners, corners.mean(axis=1), np.array([1.0, 0.2]), np.zeros((2, 4, 2, 0)))
     assert design.volume_fraction(view) == pytest.approx(0.8)  # the first one is clockwise
-
-
-# -- designs ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("arms", [1, 6])
@@ -207,19 +198,10 @@ def test_stress_says_where_when_and_in_what_unit():
     shown(figure)
 
 
-# -- curves ----------------------------------------------------------------------------------
-
-
-def history(count: int) -> list[HistoryRow]:
-    return [
-        HistoryRow(k, 28.0 * 0.9**k, 0.055 * 0.95**k, 1.0 / (k + 1), 0.5, 0.2, 0.1 * k)
-        for k in range(count)
-    ]
-
-
 @pytest.mark.parametrize("count", [1, 400])
 def test_history_shows_the_rows(count):
-    rows = history(count)
+    rows = [HistoryRow(k, 28.0 * 0.9**k, 0.055 * 0.95**k, 1.0 / (k + 1), 0.5, 0.2, 0.1 * k)
+            for k in range(count)]  # fmt: skip
     figure = curves.history_figure(rows, "compliance of the load cases [N m]")
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_visible()}
     columns = {
@@ -241,30 +223,20 @@ def test_history_shows_the_rows(count):
 
 
 def test_history_has_a_panel_for_every_column_there_is():
-    """Constraints by name, a residual: as the rows have them."""
+    """Constraints by name, a residual: as the rows have them; limits in mm and MPa."""
     name, some = "first frequency of arm1 [Hz]", (2.0, 0.01, 0.5, 0.5, 0.1, 1.0)
     rows = [HistoryRow(k, *some, 10.0**-k, {name: 60.0 + k}) for k in range(3)]
     panels = curves.history_panels(rows, "objective [N m]")
     np.testing.assert_allclose(panels["Karush-Kuhn-Tucker residual [-]"], [1.0, 0.1, 0.01])
     np.testing.assert_allclose(panels[name], [60.0, 61.0, 62.0])
-
-
-def test_limits_have_panels_in_millimetres_and_megapascals():
     found = {"deviation": 0.02, "stress": 90e6}
-    rows = [HistoryRow(k, 2.0, 0.02, 0.5, 0.5, 0.1, 1.0, constraints=found) for k in range(3)]
+    rows = [HistoryRow(k, *some, constraints=found) for k in range(3)]
     figure = curves.history_figure(rows, "mass", {"deviation": 0.008, "stress": 60e6})
     lines = {axes.get_title(loc="left"): axes.lines for axes in figure.axes if axes.get_visible()}
     assert "maximal deviation [mm]" not in lines
     for label, value, limit in (("deviation [mm]", 20.0, 8.0), ("stress [MPa]", 90.0, 60.0)):
         np.testing.assert_allclose(lines[label][0].get_ydata(), value)
         assert set(lines[label][1].get_ydata()) == {limit}
-
-
-@pytest.mark.parametrize("size", [1e-7, 0.3, 50.0])  # m
-def test_the_picture_of_the_deviation_holds_its_labels(size):
-    t = np.linspace(0.0, 3.0, 301)
-    deviation = size * np.stack([np.sin(7.0 * t), np.cos(7.0 * t) - 1.0], axis=1)
-    shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
 
 
 def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
@@ -281,9 +253,9 @@ def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
     (limit,) = axes.collections[0].get_segments()
     np.testing.assert_allclose(limit, [[1.9, 10.0], [3.0, 10.0]])
     assert "[s]" in axes.get_xlabel() and "[mm]" in axes.get_ylabel()
-
-
-# -- motion ----------------------------------------------------------------------------------
+    for size in (1e-7, 0.3, 50.0):  # m
+        deviation = size * np.stack([np.sin(7.0 * t), np.cos(7.0 * t) - 1.0], axis=1)
+        shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
 
 
 @pytest.mark.parametrize("magnification", [1.0, 20.0])
@@ -355,9 +327,6 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
     assert (pictures[3] != pictures[0]).any(axis=2).sum() > 1000
 
 
-# -- the machine -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("arms", [1, 3])
 def test_machine_shows_every_arm_where_it_is(arms):
     views, mechanism = manipulator(arms)
@@ -378,16 +347,13 @@ def test_machine_shows_every_arm_where_it_is(arms):
     assert solid.sum() > 2000
 
 
-# -- closed loops and control ----------------------------------------------------------------
-
-
-def slider_crank(count: int = 61) -> tuple[list[ArmView], Any]:
+def slider_crank() -> tuple[list[ArmView], Any]:
     """Return a rigid crank and a bending rod whose end is on y = 0, over more than a turn."""
     crank = replace(beam("crank", 0.3, 0.2, 10, 2), modes=np.zeros((20, 4, 2, 0)), designed=False)
     views = [crank, beam("rod", 0.7, 0.06, 20, 4)]
     bodies = (body(np.zeros((3, 0)), 0.3), beam_body(0.7))
     mechanism = plane_chain(bodies, 0.5, 0.0, (0.0, 0.0), joint_height=0.0)
-    t = np.linspace(0.0, 0.1, count)
+    t = np.linspace(0.0, 0.1, 61)
     angle = 80.0 * t
     desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
     q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
@@ -414,15 +380,13 @@ def test_a_drawn_loop_is_closed_by_its_last_joints(kind):
 
 
 def test_magnified_loops_stay_closed():
+    """Where a loop does not reach its pin, it is magnified less."""
     views, moving = slider_crank()
     for asked in (1.0, 20.0, 1e4):
         film = animation.make_film(views, moving, asked, 9)
         assert film.magnification == asked
         assert np.abs(film.motion.place[:, -1].imag).max() < 2e-6
         assert np.abs(film.rigid[:, -1].imag).max() < 1e-12
-
-
-def test_magnification_is_less_where_the_loop_does_not_reach_its_pin():
     views, mechanism = manipulator(3)
     t, desired = np.arange(2.0), np.array([[0.0, 0.5, -0.6, 0.8], [0.0, 0.52, -0.6, 0.8]])
     shortened = np.tile([-0.01, 0.0], (2, 3))
@@ -477,13 +441,6 @@ def test_machine_shows_one_turn_of_a_loop():
     shown(figure)
 
 
-# -- drives ----------------------------------------------------------------------------------
-
-
-def simulated(scene):
-    return do.Model(scene, comm=MPI.COMM_SELF).simulate().trajectory
-
-
 @pytest.mark.slow
 def test_drives_have_a_row_each_and_the_ground_one():
     titles = {}
@@ -495,7 +452,7 @@ def test_drives_have_a_row_each_and_the_ground_one():
         "soft": scene_from_dict(tree, overrides=["arms.joint_stiffness=2e4"]),
     }
     for name, scene in cases.items():
-        trajectory = simulated(scene)
+        trajectory = do.Model(scene, comm=MPI.COMM_SELF).simulate().trajectory
         figure = curves.drives_figure(trajectory)
         visible = [axes for axes in figure.axes if axes.get_visible()]
         titles[name] = [axes.get_title(loc="left") for axes in visible]
@@ -518,14 +475,12 @@ def test_drives_have_a_row_each_and_the_ground_one():
 def test_units_of_drives_in_space(slides):
     """They follow the joints' kinds; the first joint of a tree is no cart."""
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml")
-    joints = tuple(
-        joint.model_copy(update={"type": "prismatic" if k in slides else joint.type})
-        for k, joint in enumerate(scene.movable)
-    )
-    count = len(joints)
+    kinds = ["prismatic" if k in slides else one.type for k, one in enumerate(scene.movable)]
+    count = len(kinds)
     assert count == 3
+    joints = [one.model_copy(update={"type": t}) for one, t in zip(scene.movable, kinds)]
     control = SimpleNamespace(stiffness=(1.0,) * count, damping=(1.0,) * count)
-    scene = scene.model_copy(update={"joints": joints, "control": control})
+    scene = scene.model_copy(update={"joints": (*joints,), "control": control})
     zero = np.zeros((4, count))
     trajectory = SimpleNamespace(
         scene=scene, q_r=zero, desired=SimpleNamespace(q=zero), joint_forces=zero,

@@ -29,9 +29,8 @@ def link(density):
     corners[..., 1:] -= 0.5 * SIZE[1:]
     centroid = corners.mean(axis=1)
     modes = corners[..., None] * [1.0, 2.0]
-    return ArmView(
-        "link", corners[:, AROUND[8, 3]], centroid, density(centroid), modes[:, AROUND[8, 3]]
-    )
+    view = ArmView("link", corners, centroid, density(centroid), modes)
+    return replace(view, corners=corners[:, AROUND[8, 3]], modes=modes[:, AROUND[8, 3]])
 
 
 def test_projected_area_of_a_link():

@@ -45,8 +45,9 @@ def make_arm(cells=(20, 4), comm=SELF, length=LENGTH):
     return substructure((length, HEIGHT, THICKNESS), cells, comm)
 
 
-def with_densities(arm, x):
-    """Return the arm with densities x (n_cells,), interpolated as in the scenes."""
+def with_densities(arm, design):
+    """Return the arm with densities x (n_cells,), or a design of places, as the scenes have it."""
+    x = design(arm.mesh.centroid) if callable(design) else design
     substructure = getattr(arm, "substructure", arm)
     return substructure.at(YOUNG * (1e-6 + x**3), DENSITY * (1e-6 + x))
 
@@ -72,9 +73,7 @@ def dense(arm):
     """Return T'KT and T'MT (n, n) of an arm on one rank, outboard coordinates last."""
     unit = np.eye(arm.num_dofs)
     T = arm.expand(unit[:-3], unit[-3:])
-    return np.vstack(arm.restrict(arm.stiffness_times(T))), np.vstack(
-        arm.restrict(arm.mass_times(T))
-    )
+    return [np.vstack(arm.restrict(times(T))) for times in (arm.stiffness_times, arm.mass_times)]
 
 
 def products(arm, basis):
@@ -111,12 +110,7 @@ def own_arm():
 @pytest.fixture(scope="module")
 def at(shared_arm, own_arm):
     """Return both with the densities of a design."""
-    return lambda design: [
-        with_densities(one, design(one.mesh.centroid)) for one in (shared_arm, own_arm)
-    ]
-
-
-# -- against dense algebra ------------------------------------------------------------------------
+    return lambda design: [with_densities(one, design) for one in (shared_arm, own_arm)]
 
 
 @pytest.mark.serial
@@ -175,10 +169,7 @@ def test_modes(at, method, q, design):
 @pytest.mark.parametrize("method", sorted(REDUCTORS))
 def test_a_hundred_coordinates(method):
     """All of the first 100 modes, none twice, none missed, on any number of ranks."""
-    arm, own = (
-        with_densities(one, graded(one.mesh.centroid))
-        for one in (make_arm((48, 6), COMM), make_arm((48, 6)))
-    )
+    arm, own = (with_densities(make_arm((48, 6), comm), graded) for comm in (COMM, SELF))
     basis = assert_modes(arm, own, method, 100)
     for array in dataclasses.astuple(shape_integrals(arm, basis, 0.0)):
         assert np.isfinite(array).all()
@@ -186,7 +177,7 @@ def test_a_hundred_coordinates(method):
 
 @pytest.mark.parametrize("method", sorted(ALL))
 def test_modes_keep_the_interfaces(shared_arm, method):
-    arm = with_densities(shared_arm, graded(shared_arm.mesh.centroid))
+    arm = with_densities(shared_arm, graded)
     basis = ALL[method](arm, Options(7))
     assert basis.V.shape == basis.MV.shape == (len(arm.points), 2, 7)
     assert basis.start.shape[0] in (arm.num_interior, arm.num_interior + 3)
@@ -200,9 +191,7 @@ def test_modes_keep_the_interfaces(shared_arm, method):
 @pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov"])
 def test_every_degree_of_freedom(method):
     """As many coordinates as the arm has: the reduced model is the full one."""
-    arm = make_arm((3, 1), COMM)
-    own = make_arm((3, 1))
-    arm, own = (with_densities(one, graded(one.mesh.centroid)) for one in (arm, own))
+    arm, own = (with_densities(make_arm((3, 1), comm), graded) for comm in (COMM, SELF))
     body = shape_integrals(arm, ALL[method](arm, Options(arm.num_dofs)), 0.0)
     reduced = scipy.linalg.eigvalsh(body.K, body.M)
     assert arm.num_dofs == 11
@@ -210,25 +199,17 @@ def test_every_degree_of_freedom(method):
 
 
 def test_too_many_modes_are_an_error_that_says_so():
-    arm = make_arm((2, 1))
-    arm = with_densities(arm, uniform(arm.mesh.centroid))
     with pytest.raises(ConvergenceError, match=r"arm 'arm': only \d+ of 5.*reduction\.coordinates"):
-        lowest_eigenpairs(interior_pencil(arm), 5, None)
-
-
-# -- the search's start ---------------------------------------------------------------------------
+        lowest_eigenpairs(interior_pencil(with_densities(make_arm((2, 1)), uniform)), 5, None)
 
 
 @pytest.mark.parametrize(
     ("method", "q"), [("craig-bampton", 4), ("craig-bampton", 8), ("modal", 4)]
 )
 def test_a_warm_start_finds_the_same_modes_with_less_work(shared_arm, method, q):
-    arm = shared_arm
-    counts = arm.profile.counts
-    x = graded(arm.mesh.centroid)
-    arm = with_densities(arm, 0.97 * x)
-    before = REDUCTORS[method](arm, Options(q))
-    arm = with_densities(arm, x)
+    counts, x = shared_arm.profile.counts, graded(shared_arm.mesh.centroid)
+    before = REDUCTORS[method](with_densities(shared_arm, 0.97 * x), Options(q))
+    arm = with_densities(shared_arm, x)
     begin = counts.solves
     cold = REDUCTORS[method](arm, Options(q))
     middle = counts.solves
@@ -260,14 +241,8 @@ def test_designs_are_forgotten(own_arm, method):
 
 
 def test_a_mode_of_another_symmetry_becomes_the_lowest():
-    """Beams keep their symmetry about the axis: bending and stretching modes do not mix.
-
-    As the core of a stubby arm is emptied, stretching falls below bending. A search that starts
-    from the bending mode alone never leaves bending.
-    """
-    arm = make_arm((16, 12), length=0.1)
-    start = None
-    kinds = set()
+    """Stretching falls below bending as a stubby arm is emptied; bending alone leads to bending."""
+    arm, start, kinds = make_arm((16, 12), length=0.1), None, set()
     for core in (1.0, 0.5, 0.2, 0.1):
         x = np.where(np.abs(arm.mesh.centroid[:, 1]) < HEIGHT / 3.0, core, 1.0)
         arm = with_densities(arm, x)
@@ -285,8 +260,7 @@ def test_a_mode_of_another_symmetry_becomes_the_lowest():
 def test_modes_point_the_same_way_on_any_mesh():
     seen = {method: [] for method in ALL}
     for cells in ((20, 2), (40, 4), (60, 6)):
-        arm = make_arm(cells, COMM)
-        arm = with_densities(arm, uniform(arm.mesh.centroid))
+        arm = with_densities(make_arm(cells, COMM), uniform)
         owned = arm.operators.space.dofmap.index_map.size_local
         # No mode counted here rests at a quarter of the length.
         place = np.abs(arm.points[:owned] - [0.25 * LENGTH, 0.5 * HEIGHT]).max(axis=1) < 1e-6
@@ -300,9 +274,6 @@ def test_modes_point_the_same_way_on_any_mesh():
         ways = [np.sign(value[larger, np.arange(len(larger))]) for value in values]
         assert np.array_equal(ways[0], ways[1]) and np.array_equal(ways[0], ways[2])
         assert ways[0].all()
-
-
-# -- subspaces ------------------------------------------------------------------------------------
 
 
 def inputs(arm):
@@ -331,14 +302,11 @@ def stubby_arm():
 @pytest.mark.parametrize("blocks", [1, 3])
 @pytest.mark.parametrize("places", [(0,), (1,), (0, 2)], ids=str)
 def test_moments_match_at_the_shifts(stubby_arm, design, blocks, places):
-    """k complete blocks: B' (K - s M)^-1 B and its reduced twin differ by O((s - w^2)^(2 k)).
-
-    Shifts at 0 and half way from the n-th natural frequency to the next, in squares, where
-    K - w^2 M is indefinite.
-    """
-    arm = with_densities(stubby_arm, design(stubby_arm.mesh.centroid))
+    """k complete blocks: B' (K - s M)^-1 B and its reduced twin differ by O((s - w^2)^(2 k))."""
+    arm = with_densities(stubby_arm, design)
     (K, M), B = dense(arm), inputs(arm)
     values = scipy.linalg.eigvalsh(K, M)
+    # Half way from the n-th natural frequency to the next, where K - w^2 M is indefinite.
     centres = [0.5 * (values[n - 1] + values[n]) if n else 0.0 for n in places]
     shifts = tuple(float(np.sqrt(s) / (2.0 * np.pi)) for s in centres)
     basis = krylov(arm, Options(6 * blocks * len(shifts), shifts))
@@ -381,7 +349,7 @@ def dense_gramian(arm, options):
 @pytest.mark.parametrize("design", DESIGNS)
 @pytest.mark.parametrize("band", [(0.0, 1000.0), (1000.0, 4000.0)])
 def test_balanced_is_the_dense_gramians_dominant_space(stubby_arm, design, band):
-    arm = with_densities(stubby_arm, design(stubby_arm.mesh.centroid))
+    arm = with_densities(stubby_arm, design)
     options = Options(6, band=band, damping=1e-5)  # resonances wide enough for one Gauss rule
     K, P = dense_gramian(arm, options)
     lower = np.linalg.cholesky(K)
@@ -411,9 +379,8 @@ def test_quadrature_resolves_resonances(low, high):
 
     inside = [peak for peak in peaks if low < peak < high]
     for pair in itertools.combinations_with_replacement(peaks, 2):
-        exact = scipy.integrate.quad(
-            product, low, high, pair, points=inside, limit=500, epsabs=0.0, epsrel=1e-11
-        )[0]
+        told = {"points": inside, "limit": 500, "epsabs": 0.0, "epsrel": 1e-11}
+        exact = scipy.integrate.quad(product, low, high, pair, **told)[0]
         assert weights @ product(omega, *pair) == pytest.approx(exact, rel=1e-7)
 
 
@@ -431,8 +398,7 @@ FIRST = 49.0  # Hz; replaced by the arm's first frequency
     ],
 )
 def test_what_subspaces_cannot_do(cells, reduce, options, words):
-    arm, own = make_arm(cells, COMM), make_arm(cells)
-    arm, own = (with_densities(one, graded(one.mesh.centroid)) for one in (arm, own))
+    arm, own = (with_densities(make_arm(cells, comm), graded) for comm in (COMM, SELF))
     if options.shifts == (FIRST,):
         first = float(np.sqrt(scipy.linalg.eigvalsh(*dense(own))[0]) / (2.0 * np.pi))
         options = dataclasses.replace(options, shifts=(first,))
@@ -442,8 +408,8 @@ def test_what_subspaces_cannot_do(cells, reduce, options, words):
 
 @pytest.mark.serial
 def test_vectors_that_are_nearly_dependent(shared_arm):
-    V = krylov(with_densities(shared_arm, graded(shared_arm.mesh.centroid)), Options(3)).V
-    arm = with_densities(shared_arm, graded(shared_arm.mesh.centroid))
+    arm = with_densities(shared_arm, graded)
+    V = krylov(arm, Options(3)).V
     for apart in (0.0, 1e-7):  # the square of it is lost in the energies' rounding
         near = np.concatenate([V[:, :, :2], V[:, :, 1:2] + apart * V[:, :, 2:]], axis=2)
         with pytest.raises(ConvergenceError, match="ask for fewer"):
@@ -489,9 +455,6 @@ def test_adjoint_of_modes_is_no_answer_where_a_product_is_no_number(iterative):
             complement_solve(pencil, modes, values, right)
 
 
-# -- ranks ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
 @pytest.mark.parametrize(
     ("method", "q"),
@@ -500,22 +463,16 @@ def test_adjoint_of_modes_is_no_answer_where_a_product_is_no_number(iterative):
 def test_ranks_agree_with_one_rank(at, method, q):
     shared_arm, own_arm = at(graded)
     together, alone = (ALL[method](arm, Options(q)) for arm in (shared_arm, own_arm))
-    pairs = [
-        (together.stiffness, alone.stiffness),
-        (together.outboard, alone.outboard),
-        (by_place(shared_arm, together.V), by_place(own_arm, alone.V)),
-    ]
-    bodies = [
+    pairs = [(together.stiffness, alone.stiffness), (together.outboard, alone.outboard)]
+    pairs.append((by_place(shared_arm, together.V), by_place(own_arm, alone.V)))
+    pairs += zip(*(
         dataclasses.astuple(shape_integrals(arm, basis, 2e-4, unit_loads(arm)))
         for arm, basis in ((shared_arm, together), (own_arm, alone))
-    ]
-    pairs += list(zip(*bodies))
+    ))  # fmt: skip
     for ours, reference in pairs:
         scale = np.abs(reference).max(initial=0.0)  # of further interfaces: none
         assert np.abs(np.asarray(ours) - reference).max(initial=0.0) <= 1e-9 * scale
 
-
-# -- against beam theory --------------------------------------------------------------------------
 
 SHEAR = YOUNG / (2.0 * (1.0 + POISSON))  # Pa
 AREA, INERTIA = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0  # m2, m4
@@ -523,10 +480,7 @@ SHEAR_FACTOR = 5.0 / 6.0  # exact for the energy of parabolic shear over a recta
 
 
 def rates_and_limit(values):
-    """Return the orders seen in three successive differences, and Richardson's limit.
-
-    For values v + c h^p the differences fall by 2^p with each halving.
-    """
+    """Return the orders seen in three successive differences of v + c h^p, and the limit v."""
     steps = np.diff(values, axis=0)
     rates = np.log2(steps[:-1] / steps[1:])
     return rates, values[-1] + steps[-1] / (2.0 ** rates[-1] - 1.0)
@@ -542,14 +496,9 @@ def test_tip_compliance_converges_to_timoshenko():
         C = tip_compliance(craig_bampton(arm.at(YOUNG * ones, DENSITY * ones), Options(3)))
         compliance.append([C[0, 0], C[1, 1], C[2, 2], C[1, 2]])
     compliance = np.array(compliance)
-    theory = np.array(
-        [
-            LENGTH / (YOUNG * AREA),
-            LENGTH**3 / (3.0 * YOUNG * INERTIA) + LENGTH / (SHEAR_FACTOR * SHEAR * AREA),
-            LENGTH / (YOUNG * INERTIA),
-            LENGTH**2 / (2.0 * YOUNG * INERTIA),
-        ]
-    )
+    bending = LENGTH**3 / (3.0 * YOUNG * INERTIA) + LENGTH / (SHEAR_FACTOR * SHEAR * AREA)
+    turning = LENGTH / (YOUNG * INERTIA)
+    theory = np.array([LENGTH / (YOUNG * AREA), bending, turning, 0.5 * LENGTH * turning])
     assert (np.diff(compliance, axis=0) > 0.0).all()  # displacement elements are too stiff
     # Bending: 5.5 %, 1.5 %, 0.5 %, 0.2 % below theory.
     rates, limit = rates_and_limit(compliance[:, 1:])

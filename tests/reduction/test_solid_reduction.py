@@ -22,11 +22,7 @@ BETA = 2e-5  # s, damping D = BETA K
 
 
 class Full:
-    """A graded arm without symmetry, unreduced: dense K, M, and its responses.
-
-    Inputs are unit loads of the outboard interface and unit accelerations of the frame, outputs
-    what does work with them.
-    """
+    """A graded arm without symmetry, unreduced: dense K, M, responses of interface and frame."""
 
     def __init__(self) -> None:
         mesh = box_arm(MPI.COMM_SELF, "a", (LENGTH, HEIGHT, THICKNESS), (6, 2, 2))
@@ -101,15 +97,9 @@ def test_response_of_the_full_model(full, method):
 
 def test_automatic_order_in_space():
     """As few coordinates as a loose tolerance allows, but those of the interface."""
-    changes = (
-        *(f"arms.link{k}.cells=[4,1,1]" for k in (1, 2)),
-        "arms.passive=0.1",
-        "simulation.sample=0.05",
-        "objective.load_cases=6",
-        "simulation.stiffening=false",
-        'reduction.coordinates="auto"',
-        "reduction.tolerance=0.5",
-    )
+    changes = (*(f"arms.link{k}.cells=[4,1,1]" for k in (1, 2)), "arms.passive=0.1",
+               "simulation.sample=0.05", "objective.load_cases=6", "simulation.stiffening=false",
+               'reduction.coordinates="auto"', "reduction.tolerance=0.5")  # fmt: skip
     demo = ROOT / "demos" / "spatial_arm.toml"
     for method, fewest in (("modal", 1), ("krylov", 6), ("craig-bampton", 6)):
         scene = do.load_scene(demo, (*changes, f"reduction.method={method}"))

@@ -36,8 +36,7 @@ ROBOT = {
 
 
 @pytest.fixture(scope="module")
-def source(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("robot")
+def source(folder):
     (folder / "table.csv").write_text(TABLE)
     return str(folder / "robot.toml")
 
@@ -219,9 +218,9 @@ def test_plane_scenes_have_no_keys_of_space():
     data = copy.deepcopy(ROBOT)
     del data["joints"]
     data["motion"], data["payload"] = {"path": "arc"}, {"mass": 2.0}
+    bar = {"name": "a", "rigid": True, "length": 0.3, "height": 0.01, "thickness": 0.01}
     for key, value in (("centre", [0, 0, 0]), ("inertia", [1, 1, 1, 0, 0, 0]), ("length", 0.0)):
-        data["arms"][0] = {"name": "a", "rigid": True, "length": 0.3, "height": 0.01,
-                           "thickness": 0.01, key: value}  # fmt: skip
+        data["arms"][0] = bar | {key: value}
         refusal(lambda: scene_from_dict(data), f"arms.0.{key}", "without [[joints]]")
 
 
@@ -234,10 +233,6 @@ def test_coordinates_follow_from_the_interfaces(tmp_path):
     path.write_text(text.replace('"spatial_arm.csv"', f'"{space.with_suffix(".csv")}"'))
     assert "coordinates" not in load_scene(path).to_tree()["reduction"]
     fork = 'arms.link2.interfaces=[{name="side", point=[0.2, 0.02, 0.0], radius=0.02}]'
-    for changes, number in (
-        ([], 6),
-        ([fork, "payload.interface=side"], 12),
-        (["reduction.coordinates=7"], 7),
-        (["reduction.method=modal"], 4),
-    ):
+    cases = ((6,), (12, fork, "payload.interface=side"), (7, "reduction.coordinates=7"))
+    for number, *changes in (*cases, (4, "reduction.method=modal")):
         assert load_scene(path, changes).reduction.coordinates == number

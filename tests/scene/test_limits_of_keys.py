@@ -104,25 +104,27 @@ def run(overrides):
     assert all(np.isfinite(x).all() for x in result.x_phys.values())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("key", "value", "allowed"), list(limits()), ids=str)
-def test_a_number_at_its_limit_runs_or_is_refused_in_one_line(key, value, allowed):
-    try:
-        run([*USED.get(key, []), f"{key}={toml(value, allowed)}"])
-    except (InputError, ConvergenceError) as error:
-        assert len(str(error).splitlines()) == 1
+def run_machine(scene):
+    """Evaluate a machine's initial design."""
+    check_motion(scene)
+    built = built_of(scene, MPI.COMM_SELF)
+    evaluation, trajectory = built.evaluate(built.uniform())
+    assert np.isfinite(evaluation.objective)
+    assert np.isfinite(trajectory.joint_forces).all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("key", "value", "_"), list(limits(MACHINE_KEYS)), ids=str)
-def test_a_number_of_a_machine_at_its_limit_runs_or_is_refused_in_one_line(key, value, _):
+@pytest.mark.parametrize(
+    ("machine", "key", "value", "allowed"),
+    [(bool(keys), *case) for keys in ((), MACHINE_KEYS) for case in limits(keys)],
+    ids=str,
+)
+def test_a_number_at_its_limit_runs_or_is_refused_in_one_line(machine, key, value, allowed):
     try:
-        scene = scene_from_dict(tree_at(key, value))
-        check_motion(scene)
-        built = built_of(scene, MPI.COMM_SELF)
-        evaluation, trajectory = built.evaluate(built.uniform())
-        assert np.isfinite(evaluation.objective)
-        assert np.isfinite(trajectory.joint_forces).all()
+        if machine:
+            run_machine(scene_from_dict(tree_at(key, value)))
+        else:
+            run([*USED.get(key, []), f"{key}={toml(value, allowed)}"])
     except (InputError, ConvergenceError) as error:
         assert len(str(error).splitlines()) == 1
 

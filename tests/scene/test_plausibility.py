@@ -1,17 +1,14 @@
 """Warnings for what a scene may say, but hardly means."""
 
-import json
-from pathlib import Path
-
 import pytest
-from runs import TWO_ARM, overrides, run
+from runs import ROOT, TWO_ARM, overrides, run, summary_of
 
 from dolfinopt.scene.load import load_scene
 from dolfinopt.scene.messages import implausible
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
-DEMOS = sorted((Path(__file__).parents[2] / "demos").glob("*.toml"))
+DEMOS = sorted((ROOT / "demos").glob("*.toml"))
 
 
 @pytest.mark.parametrize("demo", DEMOS, ids=lambda path: path.stem)
@@ -59,5 +56,4 @@ def test_warnings_come_before_the_run_once_and_are_kept(tmp_path, capsys):
     run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "out", *changes)
     words = "material.density = 0.5 kg/m3"
     assert capsys.readouterr().err.count(words) == 1
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert any(words in warning for warning in summary["warnings"])
+    assert any(words in warning for warning in summary_of(tmp_path / "out")["warnings"])

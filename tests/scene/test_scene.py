@@ -27,8 +27,6 @@ pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
 JOINTS = {"path": "joints", "file": str(TWO_ARM)}
 
-# --- valid scenes ----------------------------------------------------------------------------
-
 
 def test_demo_holds_the_defaults():
     demo = load_scene(TWO_ARM)
@@ -124,9 +122,6 @@ def test_borders_of_the_ranges_are_allowed(paths, value):
         scene_from_dict(data, overrides=["arms.passive=0"])
 
 
-# --- what an arm derives from its keys -------------------------------------------------------
-
-
 def test_reducible_dofs():
     # 3 x 2 cells: 2 columns of interior nodes with 3 nodes of 2 dofs, and the outboard interface.
     assert Arm(**ARM, cells=(3, 2)).n_reducible == 2 * 3 * 2 + 3
@@ -164,9 +159,6 @@ def test_ends_are_solid_unless_the_scene_says_otherwise():
     data = scene_from_dict(minimal()).to_dict()  # the default is not frozen by writing it
     ends = [arm.solid_ends for arm in scene_from_dict(data, overrides=["arms.height=0.1"]).arms]
     assert ends == [0.025, 0.025]
-
-
-# --- overrides -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -271,8 +263,6 @@ def test_several_problems_are_counted(pairs, overrides, more):
 def test_the_file_or_the_last_override_is_blamed(path, value, overrides, start):
     assert refused(changed(path, value), overrides=overrides).startswith(FILE + start)
 
-
-# --- bad values ------------------------------------------------------------------------------
 
 LENGTHS, MODULI = "a number >= 1e-06 and <= 10000", "a number >= 1 and <= 1e+15"
 FLAGS, STRING = "true or false", "a string"
@@ -474,11 +464,6 @@ def test_value_that_is_shown_otherwise(path, value, shown, allowed):
     assert "more)" not in message
 
 
-def test_more_arms_than_any_machine_has():
-    """They were read for half a minute without a word."""
-    refused(minimal(1001), "arms: 1001", "at most 1000")
-
-
 def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
@@ -549,6 +534,7 @@ def test_contradictions(n_arms, changes, shown, allowed):
 
 
 def test_whatever_is_shown_is_short_and_printable():
+    refused(minimal(1001), "arms: 1001", "at most 1000")  # more than any machine has
     assert len(refused(changed("objective.kind", 10_000 * "x"), "...")) < 500
     with pytest.raises(InputError) as caught:
         scene_from_dict(changed("objective.kind", "\x1b[31m\u2028\n"), "a\nb\udc80.toml")
@@ -557,9 +543,6 @@ def test_whatever_is_shown_is_short_and_printable():
     assert r"\u001b[31m\u2028\n" in message
     for data in (5, [1], None, "name"):
         refused(data, "a table of scene keys", written(data))
-
-
-# --- unknown and missing keys ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -591,11 +574,11 @@ def test_unknown_key(path, unknown, closest, allowed):
 
 
 def test_misspelt_key_comes_before_the_missing_one():
+    refused(minimal(payload={1: 2}), "unknown key payload.1", "mass")  # a key that is no string
     data = minimal()
     data["material"]["youngs_modulus"] = data["material"].pop("young_modulus")
     words = "unknown key material.youngs_modulus", "material.young_modulus?"
     assert refused(data, *words).endswith("(and 1 more)")
-    refused(minimal(payload={1: 2}), "unknown key payload.1", "mass")  # a key that is no string
 
 
 @pytest.mark.parametrize(
@@ -652,10 +635,7 @@ def test_gradient_is_exact_but_of_the_esl_objective_alone(tables, gradient):
         assert scene_from_dict(scene.to_tree(), overrides=[change]).objective.gradient == later
 
 
-# --- documentation ---------------------------------------------------------------------------
-
-
-def test_every_key_is_described_with_a_unit():
+def test_every_key_is_described_with_a_unit_and_its_default():
     keys = describe_keys()
     assert len({info.key for info in keys}) == len(keys)
     tables = {info.key.partition(".")[0] for info in keys}
@@ -663,13 +643,7 @@ def test_every_key_is_described_with_a_unit():
     for info in keys:
         assert info.description[-1] == "]" and " [" in info.description, info
         assert info.allowed and not info.allowed.endswith(" "), info
-
-
-BORE = ("point", "axis", "radius")
-
-
-def test_described_defaults():
-    defaults = {info.key: info.default for info in describe_keys()}
+    defaults = {info.key: info.default for info in keys}
     assert defaults["arms.cells"] == "[200, 12]"
     assert defaults["reduction.method"] == '"craig-bampton"'
     required = {key for key, default in defaults.items() if not default}
@@ -677,18 +651,15 @@ def test_described_defaults():
         "name",  # of the file
         *(f"material.{key}" for key in MATERIAL),
         *(f"arms.{key}" for key in ARM),
-        *("motion.path", "payload.mass"),
-        *("scenarios.changes", "arms.regions.kind"),  # of every one that there is
-        *("closures.name", "closures.kind", "closures.between"),
-        *("arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm"),
-        *("control.stiffness", "control.damping", "closure.kind"),  # of tables that may be absent
+        "motion.path", "payload.mass", "forces.arm",
+        "scenarios.changes", "arms.regions.kind",  # of every one that there is
+        "closures.name", "closures.kind", "closures.between",
+        "arms.interfaces.name", "arms.interfaces.point", "constraints.stiffness.arm",
+        "control.stiffness", "control.damping", "closure.kind",  # of tables that may be absent
         *(f"joints.{key}" for key in ("name", "type", "parent", "child")),
-        "forces.arm",
-        *(f"arms.{end}_bore.{key}" for end in ("inboard", "outboard") for key in BORE),
-    }
-
-
-# --- scenarios -------------------------------------------------------------------------------
+        *(f"arms.{end}_bore.{key}" for end in ("inboard", "outboard")
+          for key in ("point", "axis", "radius")),
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -721,10 +692,7 @@ def test_scenarios_change_what_they_name():
     assert scene_from_dict(scene.to_dict()) == scene
 
 
-# --- arms that share a design, are rigid, or come from a file --------------------------------
-
-
-def test_who_owns_which_design():
+def test_who_owns_which_design_and_limits():
     data = minimal(4)
     data["arms"][1]["rigid"] = True
     data["arms"][3]["design"] = "arm1"
@@ -732,6 +700,11 @@ def test_who_owns_which_design():
     assert scene.owners == (0, None, 2, 0)
     assert scene.cell_counts == {0: 2400, 2: 2400}
     assert [arm.rigid for arm in scene.arms] == [False, True, False, False]  # not inherited
+    # One limit for all or one for each flexible arm; none at all.
+    scene = scene_from_dict(minimal(constraints={"first_frequency": [10.0, 20.0]}))
+    assert scene.constraints.first_frequency == (10.0, 20.0)
+    assert scene_from_dict(scene.to_dict()).constraints == scene.constraints
+    scene_from_dict(minimal(objective={"kind": "mass", "direction": "maximize"}))
 
 
 def test_nothing_attached_needs_solid_ends():
@@ -764,14 +737,6 @@ def test_volume_is_limited_unless_mass_is(tables, limit):
     assert stated.design.volume_fraction == tables.get("design", {}).get("volume_fraction")
 
 
-def test_limits_of_every_arm():
-    """One for all or one for each: of the flexible arms, and of those with a design."""
-    scene = scene_from_dict(minimal(constraints={"first_frequency": [10.0, 20.0]}))
-    assert scene.constraints.first_frequency == (10.0, 20.0)
-    assert scene_from_dict(scene.to_dict()).constraints == scene.constraints
-    scene_from_dict(minimal(objective={"kind": "mass", "direction": "maximize"}))  # no limit
-
-
 def test_length_of_a_body_from_a_file(tmp_path):
     from dolfinopt.exchange.sid import write_sid
     from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
@@ -789,8 +754,6 @@ def test_length_of_a_body_from_a_file(tmp_path):
     first = scene_from_dict(data, str(tmp_path / "scene.toml")).arms[0]
     assert first.height == first.thickness == pytest.approx(0.04)
 
-
-# -- options that nothing uses -----------------------------------------------------------------
 
 # Key, a value that is not its default, and settings with which something uses it.
 UNUSED = {
@@ -831,12 +794,9 @@ def test_every_option_of_a_response_is_used_by_one():
     """The table of their users names options, objectives and limits that there are."""
     for key, (objectives, limits) in OPTIONS.items():
         assert key in Objective.model_fields
-        assert set(objectives) <= set(get_args(ObjectiveKind)) and set(limits) <= set(
-            Constraints.model_fields
-        )
-
-
-def test_no_volume_is_shared_where_none_is_limited():
+        assert set(objectives) <= set(get_args(ObjectiveKind))
+        assert set(limits) <= set(Constraints.model_fields)
+    # No volume is shared where none is limited.
     lightest, shared = TWO_ARM.with_name("lightest_two_arm.toml"), "design.shared_volume=true"
     assert load_scene(lightest, ["design.volume_fraction=0.4", shared]).design.shared_volume
     refusal(lambda: load_scene(lightest, [shared]), "design.shared_volume = true", "false")

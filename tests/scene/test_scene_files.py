@@ -23,7 +23,6 @@ from dolfinopt.scene.load import (
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
-# --- files a scene names ---------------------------------------------------------------------
 
 TABLE = {"path": "points", "file": "table.csv"}
 
@@ -61,9 +60,6 @@ def test_missing_file_is_named_with_all_places(tmp_path, monkeypatch):
     refused(minimal(), f'{FILE} with --set {overrides[1]}: motion.file = "', overrides=overrides)
     for value in ("", ".", "a\0b", 5000 * "x", "\ud800", "/"):
         refused(changed("motion.file", value), "motion.file = ")
-
-
-# --- mesh files ------------------------------------------------------------------------------
 
 
 def test_a_mesh_excludes_cells():
@@ -132,9 +128,6 @@ def test_kinds_of_mesh_files(tmp_path, suffix, keys, words):
     refused(data, *words)
 
 
-# --- files -----------------------------------------------------------------------------------
-
-
 def load_error(path, *words):
     return refusal(lambda: load_scene(path), str(path), *words)
 
@@ -194,8 +187,6 @@ def test_files_that_cannot_be_read(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", deny)
     load_error(TWO_ARM, "permission denied", "make the file readable")
 
-
-# --- whatever else comes ---------------------------------------------------------------------
 
 KEYS = [info.key for info in describe_keys()]
 TABLES = sorted({key.partition(".")[0] for key in KEYS})

@@ -14,9 +14,8 @@ from dolfinopt.optimization import iterate
 from dolfinopt.optimization import loop as optimization
 from dolfinopt.output import checkpoint
 from dolfinopt.responses import evaluation
-from dolfinopt.study import store
-from dolfinopt.study.cases import Case, scene_content, simulate_scenarios
-from dolfinopt.study.store import run_cases
+from dolfinopt.study import cases as computing
+from dolfinopt.study.cases import Case, run_cases, scene_content, simulate_scenarios
 
 WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 TOLERANCE = 1e-3  # of the coordinates
@@ -49,9 +48,6 @@ class Killed(Exception):
 
 def killed(*args, **kwargs):
     raise Killed
-
-
-# -- keys ------------------------------------------------------------------------------------
 
 
 CHANGES = {
@@ -138,9 +134,6 @@ def test_batches_have_one_basis():
     assert chosen.batch_key == chosen.key
 
 
-# -- doing them ------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def plan():
     """An optimisation's design and the initial one in three scenes."""
@@ -213,7 +206,7 @@ def test_ranks_do_not_matter(plan, done, tmp_path, shared_tmp_path, batches):
 
 def test_second_run_computes_nothing(plan, done, monkeypatch):
     folder, outcomes = done
-    monkeypatch.setattr(store, "_do", killed)
+    monkeypatch.setattr(computing, "_do", killed)
     again = run_cases([*plan, *plan], folder, WORLD, shown=False)
     assert again.computed == 0
     assert repr(again.by_case) == repr(outcomes.by_case)  # nan is not equal to nan
@@ -293,15 +286,12 @@ def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batche
         assert_close(after[one], outcomes[one])
 
 
-# -- interruptions and failures --------------------------------------------------------------
-
-
 @alone
 def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch, batches):
     """Nothing of it is in place: it is computed anew as a whole, to the same bits."""
     _, outcomes = done
     written = []
-    whole = store.write_simulation
+    whole = computing.write_simulation
 
     def stop(*args, **kwargs):
         if written:
@@ -309,7 +299,7 @@ def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch
         written.append(whole(*args, **kwargs))
 
     with monkeypatch.context() as patch:
-        patch.setattr(store, "write_simulation", stop)
+        patch.setattr(computing, "write_simulation", stop)
         with pytest.raises(Killed):
             run_cases(plan[3:6], tmp_path, SELF, shown=False)
     assert not list(tmp_path.rglob("summary.json"))
@@ -344,7 +334,7 @@ def test_interrupted_optimisation_goes_on(plan, done, tmp_path, monkeypatch, whe
     reached = 3
     with monkeypatch.context() as patch:
         if where == "at the end":
-            patch.setattr(store, "write_result", killed)
+            patch.setattr(computing, "write_result", killed)
         else:
             reached, told = 1, []
 
@@ -353,7 +343,7 @@ def test_interrupted_optimisation_goes_on(plan, done, tmp_path, monkeypatch, whe
                 if len(told) == 4:  # before the job, then after each iteration
                     raise Killed
 
-            patch.setattr(store._Place, "check", stop)
+            patch.setattr(computing._Place, "check", stop)
         with pytest.raises(Killed):
             run_cases([made], tmp_path, SELF, shown=False)
     left = tmp_path / "cases" / made.key
@@ -397,7 +387,7 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
 
     with monkeypatch.context() as patch:
         patch.setattr(evaluation, "simulate_batch", fail_at_four)
-        patch.setattr(store, "optimize", fail)
+        patch.setattr(computing, "optimize", fail)
         first = run_cases(plan[:6], shared_tmp_path, WORLD, shown=False)
     told = sorted(one.failure for one in first.failures)
     assert told == ["made: no way"] * 3 + ["no solution at 4 kg", "no way"]
@@ -412,9 +402,6 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
 def test_another_run_is_refused(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(disk, "try_lock", lambda *arguments: False)
     refusal(lambda: run_cases(plan, tmp_path, SELF, shown=False), str(tmp_path), "another run")
-
-
-# -- progress --------------------------------------------------------------------------------
 
 
 def test_plain_lines_tell_of_every_case(plan, shared_tmp_path, capsys):

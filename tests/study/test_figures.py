@@ -11,20 +11,8 @@ import pytest
 from matplotlib.text import Text
 from pictures import TOLERANCE, difference
 
-from dolfinopt.plots.style import (
-    BLUE,
-    LONGEST,
-    ORANGE,
-    look,
-    look_numbers,
-    shortened,
-    spread,
-)
-from dolfinopt.study.figures import (
-    common_looks,
-    draw,
-    line_figure,
-)
+from dolfinopt.plots.style import BLUE, LONGEST, ORANGE, look, look_numbers, shortened, spread
+from dolfinopt.study.figures import common_looks, draw, line_figure
 from dolfinopt.study.tables import FrameFigure, Line, LineFigure, Panel, Study, Table, write_study
 
 PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
@@ -89,21 +77,16 @@ def test_one_thing_has_one_look_in_all_figures():
         assert len({line.get_linewidth() for line in lines}) == 1
         assert len({line.get_markersize() for line in lines}) == 1
     # What every run's pictures show looks alike in all of them.
-    assert (
-        styles["initial design"]["color"] == ORANGE and styles["optimised design"]["color"] == BLUE
-    )
+    looks = (styles[f"{which} design"]["color"] for which in ("initial", "optimised"))
+    assert (*looks,) == (ORANGE, BLUE)
 
 
 def test_looks_of_a_crowd():
-    """28 before one comes twice; a figure's own differ in colour up to the seventh."""
+    """28 before one comes twice; a figure's own differ up to the seventh; names do not overlap."""
     numbers = look_numbers([list("abcdefg"), [f"n{k}" for k in range(19)]])
     assert len(set(numbers.values())) == 26
     assert len({look(numbers[name])["color"] for name in "abcdefg"}) == 7
-    more = look_numbers([[f"n{k}" for k in range(60)]])
-    assert len(more) == 60
-
-
-def test_names_do_not_overlap():
+    assert len(look_numbers([[f"n{k}" for k in range(60)]])) == 60
     np.testing.assert_allclose(spread([0.5, 0.5, 0.9], 0.1), [0.5, 0.6, 0.9])
     np.testing.assert_allclose(spread([1.0, 0.99], 0.1), [1.0, 0.9])
 
@@ -173,34 +156,23 @@ def test_sweep_looks_as_it_did(tmp_path):
     assert difference(PICTURE, sweep_figure(1.05), tmp_path) > TOLERANCE
 
 
-# -- files ------------------------------------------------------------------------------------
-
-
-def test_table():
+def test_a_table_and_curves_as_text():
+    """A row a point; where panels differ in what they show, the axes have no common name."""
     columns = ["a|b [m]", "n", "x"]
-    rows = [("one|two", 3, 1.23456), ("", 4, np.nan)]
-    table = Table("", "Title.", pd.DataFrame(rows, columns=columns))
+    cells = [("one|two", 3, 1.23456), ("", 4, np.nan)]
+    table = Table("", "Title.", pd.DataFrame(cells, columns=columns))
     lines = table.markdown().splitlines()
     assert lines[0] == "Title." and len({len(line) for line in lines[2:]}) == 1
     assert r"one\|two" in lines[4] and "1.235" in lines[4]
     assert table.csv() == "a|b [m],n,x\none|two,3,1.23456\n,4,\n"
-
-
-def test_curves_as_csv():
-    """A row a point; where panels differ in what they show, the axes have no common name."""
     x = np.array([1.0, 2.0])
-    panels = [
-        Panel(
-            "p", "m [kg]", "c [N m]", (Line("a", x, 2.0 * x), Line("b", x, np.array([3, np.nan])))
-        ),
-        Panel("q", "m [kg]", "d [mm]", (Line("a", x, x),)),
-    ]
-    alone = LineFigure("", "", (panels[0],)).csv()
-    rows = list(csv.reader(io.StringIO(alone)))
-    assert rows[0] == ["panel", "line", "m [kg]", "c [N m]"]
-    assert rows[1:] == [["p", "a", "1", "2"], ["p", "a", "2", "4"], ["p", "b", "1", "3"],
-                        ["p", "b", "2", ""]]  # fmt: skip
-    both = LineFigure("", "", tuple(panels)).csv()
+    curves = Line("a", x, 2.0 * x), Line("b", x, np.array([3, np.nan]))
+    panels = (Panel("p", "m [kg]", "c [N m]", curves),
+              Panel("q", "m [kg]", "d [mm]", (Line("a", x, x),)))  # fmt: skip
+    rows = list(csv.reader(io.StringIO(LineFigure("", "", panels[:1]).csv())))
+    assert rows == [["panel", "line", "m [kg]", "c [N m]"], ["p", "a", "1", "2"],
+                    ["p", "a", "2", "4"], ["p", "b", "1", "3"], ["p", "b", "2", ""]]  # fmt: skip
+    both = LineFigure("", "", panels).csv()
     assert both.splitlines()[0] == "panel,line,x,y" and len(both.splitlines()) == 7
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from mpi4py import MPI
-from runs import ROOT, TWO_ARM, command, environment, overrides, refusal
+from runs import ROOT, TWO_ARM, by_root, command, contents, environment, overrides, refusal
 from runs import run as run_command
 from studies import COARSE, cells_of, column, rows_of, write_uniform
 
@@ -27,6 +27,7 @@ WORLD, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 TOLERANCE = 1e-3
 SMALL = [*COARSE, "optimizer.max_iterations=2", f"simulation.tolerance={TOLERANCE}"]
 SETTINGS = overrides(*SMALL)
+QUANTITIES = ("compliance [N m]", "maximal deviation [mm]")
 alone = pytest.mark.serial  # ranks: test_ranks_do_not_matter
 
 
@@ -45,9 +46,6 @@ def is_drawn(path):
     return np.asarray(Image.open(path).convert("L")).std() > 5.0
 
 
-# -- what is asked ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("text", "values"),
     [
@@ -64,20 +62,20 @@ def test_vary(text, values):
     assert parse_vary(text).values == values
 
 
-def test_vary_refuses():
+def test_vary_refuses_and_axes_bear_units():
     for text in ("payload.mass", "=1:2:3", "a=", "a=1:2", "a=1:2:1", "a=1:1:3", "a=1:2:x",
                  "a=one,two", "a=nan", "a=1:inf:3", "a=1:2:3:4", "a=1:2:-3"):  # fmt: skip
         refusal(lambda: parse_vary(text), "--vary", "expected")  # noqa: B023
+    with pytest.raises(click.UsageError, match="what"):
+        run_command("compare", TWO_ARM)
+    for axis in ("payload.mass [kg]", "arms.arm2.length [m]", "motion.flattening [-]"):
+        assert parse_vary(f"{axis.split()[0]}=1,2").axis == axis
 
 
-def test_axes_bear_units():
-    units = {"payload.mass": "kg", "arms.length": "m", "arms.arm2.length": "m"}
-    for key, unit in (units | {"motion.flattening": "-"}).items():
-        assert parse_vary(f"{key}=1,2").axis == f"{key} [{unit}]"
-
-
-SWEEP, REDUCTIONS = ["sweep", TWO_ARM], ["compare", TWO_ARM, "reductions"]
-OBJECTIVES = ["compare", TWO_ARM, "objectives"]
+SWEEP, RANDOM, MASS = ["sweep", TWO_ARM], ["uncertainty", TWO_ARM], "payload.mass=normal:6:0.3"
+OBJECTIVES, REDUCTIONS, SECTIONS = (
+    ["compare", TWO_ARM, what] for what in ("objectives", "reductions", "sections")
+)
 BAD = [
     ([*SWEEP], "--vary"),
     ([*SWEEP, "tides"], "tides"),
@@ -96,33 +94,55 @@ BAD = [
     ([*SWEEP, "coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
     ([*SWEEP, "--design", "a.npz", "b.npz"], "b.npz"),  # a file that looks like a preset
     ([*SWEEP, "coordinates", "--reoptimize"], "compare reductions"),
+    (["study", TWO_ARM, "payload"], "sweep"),  # the command of before
     (["compare", TWO_ARM, "designs"], "objectives"),
     ([*OBJECTIVES, "--coordinates", "4"], "--coordinates"),
-    ([*REDUCTIONS, "--coordinates", "100000"], "100000"),
-    ([*REDUCTIONS, "--kind", "esl"], "--kind"),
+    ([*OBJECTIVES, "--design", "a.npz"], "--design", "sections"),
     ([*OBJECTIVES, "--kind", "joy"], 'objective.kind = "joy"'),
     ([*OBJECTIVES, "--kind", "mass"], "a limit under"),
+    ([*REDUCTIONS, "--coordinates", "100000"], "100000"),
+    ([*REDUCTIONS, "--kind", "esl"], "--kind"),
+    ([*SECTIONS, "--kind", "esl"], "--kind"),
+    ([*SECTIONS, "--coordinates", "4"], "--coordinates"),
+    ([*SECTIONS, "--design", "nowhere.npz"], "nowhere.npz", "no such file"),
+    ([*SECTIONS, "--design", "a.npz", "--design", "b.npz"], "one file"),
+    (["reproduce", "--set", "payload.mas=4"], "payload.mass"),
+    (["reproduce", "--set", "motion.radius=5"], "motion.radius"),
+    ([*RANDOM], "--random"),
+    ([*RANDOM, "--random", "payload.mass"], "KEY=DISTRIBUTION"),
+    ([*RANDOM, "--random", "payload.mass=cauchy:6:1"], "one of normal"),
+    ([*RANDOM, "--random", "payload.mass=normal:6"], "normal:MEAN:DEVIATION"),
+    ([*RANDOM, "--random", "payload.mas=normal:6:1"], "payload.mass"),
+    ([*RANDOM, "--random", "arms.leg.thickness=normal:6:1"], "arm1"),
+    ([*RANDOM, "--random", "payload=normal:6:1"], "a table"),
+    ([*RANDOM, "--random", "reduction.coordinates=normal:4.2:1"], "an integer"),
+    ([*RANDOM, "--random", "motion.elbow=uniform:0:1"], "motion.elbow"),  # a choice
+    ([*RANDOM, "--random", "motion.gravity=normal:0:1"], "motion.gravity"),  # an array
+    ([*RANDOM, "--random", "motion.flattening=normal:2:0.1"], "<= 1"),  # median out of range
+    ([*RANDOM, "--random", "motion.flattening=uniform:0.9:1.1"], ">= 0 and <= 1"),
+    ([*RANDOM, "--random", "payload.mass=normal:-1:2"], "payload.mass = -1"),  # half of it beyond
+    ([*RANDOM, "--random", "design.initial=uniform:0.4:0.6"], "given design"),  # of the optimiser
+    ([*RANDOM, "--random", "simulation.sample=uniform:1e-3:2e-3"], "given design"),
+    ([*RANDOM, "--random", "arms.arm2.length=normal:1:0.01"], "another length"),
+    ([*RANDOM, "--random", MASS, "--random", "payload.mass=uniform:1:2"], "twice"),
+    ([*RANDOM, "--random", "motion.radius=normal:1:1"], "from the shoulder"),
+    ([*RANDOM, "--random", MASS, "--samples", "5"], "at least 10"),
+    ([*RANDOM, "--random", MASS, "--seed", "-1"], "--seed -1"),
+    ([*RANDOM, "--random", MASS, "--sampler", "dice"], "latin-hypercube"),
+    ([*RANDOM, "--random", MASS, "--design", "nowhere.npz"], "nowhere.npz"),
 ]
 
 
-@pytest.mark.parametrize(("words", "word"), BAD)
-def test_bad_input_is_one_line(words, word, shared_tmp_path):
+@pytest.mark.parametrize("refused", BAD, ids=lambda refused: " ".join(map(str, refused[0][2:])))
+def test_bad_input_is_one_line(refused, shared_tmp_path):
+    """Of sweeps, comparisons, random values and the paper: before anything is written."""
+    words, *expected = refused
     other = shared_tmp_path / "OTHER.npz"
-    if WORLD.rank == 0:
-        np.savez(other, **{"leg/centroid": np.zeros((1, 2)), "leg/density": np.ones(1)})
-    WORLD.barrier()
+    arrays = {"leg/centroid": np.zeros((1, 2)), "leg/density": np.ones(1)}
+    by_root(lambda: np.savez(other, **arrays))
     line = [str(other) if part == other.name else part for part in words]
-    refusal(lambda: run_command(*line, *SETTINGS, "--out", shared_tmp_path / "o"), word)
+    refusal(lambda: run_command(*line, *SETTINGS, "--out", shared_tmp_path / "o"), *expected)
     assert not (shared_tmp_path / "o").exists()
-
-
-def test_missing_words_and_the_command_of_before():
-    refusal(lambda: run_command("study", TWO_ARM, "payload", "--designs", "a.npz"), "sweep")
-    with pytest.raises(click.UsageError, match="what"):
-        run_command("compare", TWO_ARM)
-
-
-# -- sweeps ----------------------------------------------------------------------------------
 
 
 def evaluated(scene, result, x=None):
@@ -143,19 +163,15 @@ def test_payload(folder, capsys):
     for row, mass in zip(rows, masses, strict=True):
         for label, x in (("initial design", 0.5), ("optimised design", None)):
             one = evaluated(scene(f"payload.mass={mass}"), result, x)
-            for name, value in (
-                ("compliance [N m]", one.compliance),
-                ("maximal deviation [mm]", 1e3 * one.max_deviation),
-            ):
-                found = float(row[f"{label}: {name}"])
-                assert found == pytest.approx(value, rel=4.0 * TOLERANCE)
-    for name in ("payload.png", "payload.md", "payload_curves.csv"):
-        assert (folder / name).is_file()
+            found = [float(row[f"{label}: {name}"]) for name in QUANTITIES]
+            expected = [one.compliance, 1e3 * one.max_deviation]
+            assert found == pytest.approx(expected, rel=4.0 * TOLERANCE)
+    written = {path.name for path in folder.iterdir()}
+    assert written >= {"payload.png", "payload.md", "payload_curves.csv"}
     assert is_drawn(folder / "payload.png")
     if WORLD.rank == 0:
         assert "5 cases computed" in first.out
         assert (folder / "payload.md").read_text() in first.out
-    WORLD.barrier()
     before = (folder / "payload.csv").read_bytes()
     run(*arguments)
     if WORLD.rank == 0:
@@ -175,9 +191,8 @@ def test_cross_evaluation(folder):
     assert (np.diag(loss) == 0.0).all()
     for i, made in enumerate((8, 4)):
         design = do.optimize(scene(f"payload.mass={made}"), world=SELF)
-        for j, used in enumerate((8, 4)):
-            found = evaluated(scene(f"payload.mass={used}"), design)
-            assert values[i, j] == pytest.approx(found.compliance, rel=4.0 * TOLERANCE)
+        found = [evaluated(scene(f"payload.mass={m}"), design).compliance for m in (8, 4)]
+        assert values[i] == pytest.approx(found, rel=4.0 * TOLERANCE)
     # Those made for each scenario stand in the main table, too.
     made_for_it = [row[-2] for row in cells_of(tables[""])]
     np.testing.assert_array_equal(made_for_it, np.diag(values))
@@ -231,16 +246,13 @@ def test_three_keys_one_at_a_time(folder):
 def test_what_needs_reoptimising(folder, vary, made):
     """Less material is less stiff when designs are made for it; so is a longer arm, of any design.
 
-    Arms of several sizes are made for themselves: no design goes into another's scenario.
+    Arms of several sizes are made for themselves alone.
     """
     done = study.study(scene(), None, [vary], [], folder, WORLD, reoptimize=True, shown=False)
     assert len(done.tables) == (5 if made else 1)
     first, second = cells_of(done.tables[0])
     assert first[-2] < second[-2]  # made for it, N m
     assert made or first[1] < second[1]  # the initial design
-
-
-# -- names and folders -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -272,16 +284,12 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
         said = capsys.readouterr().out
         return int(re.search(r"(\d+) cases computed", said)[1]) if WORLD.rank == 0 else None
 
-    def files():
-        WORLD.barrier()
-        return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-
     first = computed("--vary", "payload.mass=4,8")
-    before = files()
+    before = contents(folder)
     names = {f"payload.mass{end}" for end in (".csv", ".md", ".json", ".png", "_curves.csv")}
     assert set(before) == names
     computed("--vary", "motion.duration=1.9,2.1", "--no-plots")
-    after = files()
+    after = contents(folder)
     assert {name: after[name] for name in names} == before
     others = {f"motion.duration{end}" for end in (".csv", ".md", ".json", "_curves.csv")}
     assert set(after) == names | others
@@ -289,17 +297,14 @@ def test_two_sweeps_share_a_folder(shared_tmp_path, capsys):
     if WORLD.rank == 0:
         # Two designs by value; the optimised design is made once, and 12 kg alone is new.
         assert (first, grown) == (1 + 4, 2)
-    assert "payload.mass.png" not in files()  # it showed two values
+    assert "payload.mass.png" not in contents(folder)  # it showed two values
     assert len(rows_of(folder / "payload.mass.csv")) == 3
-    before = files()
+    before = contents(folder)
     other = ["--vary", "payload.mass=4,8", "--set", "payload.inertia=0.1"]
     refusal(lambda: run(TWO_ARM, *other, *quick), "payload.mass.*", "another scene")
-    assert files() == before
+    assert contents(folder) == before
     computed(*other, "--overwrite", "--no-plots")
-    assert files()["payload.mass.csv"] != before["payload.mass.csv"]
-
-
-# -- objectives and reductions ---------------------------------------------------------------
+    assert contents(folder)["payload.mass.csv"] != before["payload.mass.csv"]
 
 
 @pytest.mark.slow
@@ -309,8 +314,7 @@ def test_objective(folder):
     run(TWO_ARM, "objectives", *SETTINGS, *quick, "--out", folder, name="compare")
     rows = rows_of(folder / "objective.csv")
     names = [row["objective"] for row in rows]
-    # "Nothing attached" needs solid ends.
-    # Nor does the scene limit what grows as material is taken away.
+    # "Nothing attached" needs solid ends; nothing is limited that grows as material is taken away.
     every = (*variants.OBJECTIVES, *variants.RESPONSES[:2])
     possible = [label for label, _ in every if "nothing attached" not in label]
     assert names == ["initial design", *possible]
@@ -324,8 +328,8 @@ def test_objective(folder):
     assert is_drawn(folder / "objective_designs.png")
 
 
-def test_what_a_comparison_and_a_study_plan():
-    """Solid ends allow "nothing attached"; only some integrators have an exact gradient."""
+def test_what_comparisons_and_studies_plan():
+    """Solid ends allow "nothing attached"; few directions are not asked of the Gramian."""
     plan = study.objective_plan(scene("arms.passive=0.05"))
     every = (*variants.OBJECTIVES, *variants.RESPONSES[:2])
     assert [c.label for _, c in plan.rows] == ["initial design", *(label for label, _ in every)]
@@ -335,6 +339,13 @@ def test_what_a_comparison_and_a_study_plan():
     solid = do.load_scene(TWO_ARM, ["design.initial=1.0", "design.volume_fraction=1.0"])
     assert given_designs(solid, ()) == {"solid arms": None}
     assert len(given_designs(do.load_scene(TWO_ARM), ())) == 2
+    swept = variants.reductions(scene(), None, (4, 48))
+    pairs = {(s.reduction.method, s.reduction.coordinates) for s in swept}
+    assert ("balanced", 4) in pairs and ("balanced", 48) not in pairs
+    krylov = ("reduction.method=krylov", "reduction.shifts=[0.0,100.0]")
+    base = scene(*krylov, "reduction.coordinates=6")
+    assert variants.reduced(base, "krylov", 8).reduction.shifts == (0.0, 100.0)
+    assert variants.reduced(base, "modal", 8).reduction.shifts == (0.0,)
 
 
 SIX = ("mass", "esl", "deviation", "stress", "effort", "settling")
@@ -373,10 +384,8 @@ def test_reduction(folder, monkeypatch):
     """Craig-Bampton and Krylov do not depend on q, modal truncation is below and climbs."""
     monkeypatch.setattr(study, "SWEPT", (4, 8))
     monkeypatch.setattr(variants, "REFERENCE", 8)
-    run(
-        TWO_ARM, "reductions", "--coordinates", 4, *SETTINGS, "--set",
-        "optimizer.max_iterations=1", "--no-plots", "--out", folder, name="compare",
-    )  # fmt: skip
+    run(TWO_ARM, "reductions", "--coordinates", 4, *SETTINGS, "--set", "optimizer.max_iterations=1",
+        "--no-plots", "--out", folder, name="compare")  # fmt: skip
     main = {row["method"]: row for row in rows_of(folder / "reduction.csv")}
     assert list(main) == list(variants.METHODS)
     own, again = "compliance, own model [N m]", "compliance, craig-bampton 8 [N m]"
@@ -387,26 +396,12 @@ def test_reduction(folder, monkeypatch):
             assert abs(off) < 0.1
     assert not list(folder.glob("reduction_*"))  # one table
     run(TWO_ARM, "coordinates", *SETTINGS, "--no-plots", "--out", folder)
-    sweep = rows_of(folder / "coordinates.csv")
-    value = {
-        (row["method"], int(row["coordinates"])): float(row["initial design: compliance [N m]"])
-        for row in sweep
-    }
+    initial = "initial design: compliance [N m]"
+    value = {(row["method"], int(row["coordinates"])): float(row[initial])
+             for row in rows_of(folder / "coordinates.csv")}  # fmt: skip
     assert value["craig-bampton", 4] == pytest.approx(value["craig-bampton", 8], rel=1e-4)
     assert value["krylov", 4] == pytest.approx(value["craig-bampton", 8], rel=1e-4)
     assert value["modal", 4] < value["modal", 8] < 0.99 * value["craig-bampton", 8]
-
-
-def test_balanced_where_it_is_possible():
-    """Too few directions are not asked of the Gramian; options of one method stay there."""
-    swept = variants.reductions(scene(), None, (4, 48))
-    pairs = {(s.reduction.method, s.reduction.coordinates) for s in swept}
-    assert ("balanced", 4) in pairs and ("balanced", 48) not in pairs
-    base = scene(
-        "reduction.method=krylov", "reduction.shifts=[0.0,100.0]", "reduction.coordinates=6"
-    )
-    assert variants.reduced(base, "krylov", 8).reduction.shifts == (0.0, 100.0)
-    assert variants.reduced(base, "modal", 8).reduction.shifts == (0.0,)
 
 
 def test_failures_end_with_status_one(folder, monkeypatch):
@@ -425,11 +420,9 @@ def test_failures_end_with_status_one(folder, monkeypatch):
         run(TWO_ARM, "payload", "--vary", "payload.mass=4,7.25", *SETTINGS, "--out", folder)
     WORLD.barrier()
     rows = rows_of(folder / "payload.csv")
-    assert rows[0]["failed"] == "" and rows[0]["initial design: compliance [N m]"]
-    assert rows[1]["failed"] == "no solution" and not rows[1]["initial design: compliance [N m]"]
-
-
-# -- killed ----------------------------------------------------------------------------------
+    value = "initial design: compliance [N m]"
+    assert rows[0]["failed"] == "" and rows[0][value]
+    assert rows[1]["failed"] == "no solution" and not rows[1][value]
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM, overrides, refusal
+from runs import TWO_ARM, by_root, overrides, refusal
 from runs import run as run_command
 from studies import COARSE, cells_of, column, rows_of, write_uniform
 
@@ -11,9 +11,8 @@ import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.study import cases as computing
 from dolfinopt.study import uncertainty
-from dolfinopt.study.cases import scales_bodies, with_sample
+from dolfinopt.study.cases import run_cases, scales_bodies, with_sample
 from dolfinopt.study.figures import draw
-from dolfinopt.study.store import run_cases
 from dolfinopt.study.uncertainty import (
     Sampling,
     nominal_value,
@@ -54,43 +53,6 @@ def evaluated(*overrides, density=0.5):
     return do.evaluate(other, partition, arms, x, do.Profile())[0]
 
 
-# -- what is asked ---------------------------------------------------------------------------
-
-
-BAD = [
-    (["payload.mass"], [], "KEY=DISTRIBUTION"),
-    (["payload.mass=cauchy:6:1"], [], "one of normal"),
-    (["payload.mass=normal:6"], [], "normal:MEAN:DEVIATION"),
-    (["payload.mas=normal:6:1"], [], "payload.mass"),
-    (["arms.leg.thickness=normal:6:1"], [], "arm1"),
-    (["payload=normal:6:1"], [], "a table"),
-    (["reduction.coordinates=normal:4.2:1"], [], "an integer"),
-    (["motion.elbow=uniform:0:1"], [], "motion.elbow"),  # a choice
-    (["motion.gravity=normal:0:1"], [], "motion.gravity"),  # an array
-    (["motion.flattening=normal:2:0.1"], [], "<= 1"),  # median out of range
-    (["motion.flattening=uniform:0.9:1.1"], [], ">= 0 and <= 1"),
-    (["payload.mass=normal:-1:2"], [], "payload.mass = -1"),  # half of it beyond
-    (["design.initial=uniform:0.4:0.6"], [], "given design"),  # of the optimisation
-    (["simulation.sample=uniform:1e-3:2e-3"], [], "given design"),  # of the integration
-    (["arms.arm2.length=normal:1:0.01"], [], "another length"),
-    ([MASS, "payload.mass=uniform:1:2"], [], "twice"),
-    (["motion.radius=normal:1:1"], [], "from the shoulder"),
-    ([MASS], ["--samples", "5"], "at least 10"),
-    ([MASS], ["--seed", "-1"], "--seed -1"),
-    ([MASS], ["--sampler", "dice"], "latin-hypercube"),
-    ([], [], "--random"),
-    ([MASS], ["--design", "nowhere.npz"], "nowhere.npz"),
-]
-
-
-@pytest.mark.parametrize(("random", "words", "word"), BAD)
-def test_bad_input_is_one_line(random, words, word, shared_tmp_path):
-    line = [part for one in random for part in ("--random", one)]
-    line += [*words, *overrides(*SMALL), "--out", shared_tmp_path / "o"]
-    refusal(lambda: run(TWO_ARM, *line), word)
-    assert not (shared_tmp_path / "o").exists()
-
-
 def test_inputs_are_cut_off_at_the_range():
     """Half a normal distribution about the key's largest value is left: mean 1 - s sqrt(2/pi)."""
     one = parse_input(scene(), "motion.flattening=normal:0.999999:0.01")
@@ -101,26 +63,14 @@ def test_inputs_are_cut_off_at_the_range():
     assert young.axis == "arms.arm2.young_modulus [Pa]" and young.distribution.low == 1.0
 
 
-def test_nominal_values():
+def test_nominal_values_and_a_sample_out_of_reach():
     given = scene("arms.arm2.density=2600.0", "arms.arm2.thickness=0.02")
-    for key, value in (
-        ("payload.mass", 6.0),
-        ("arms.arm2.density", 2600.0),
-        ("arms.arm1.density", 2700.0),
-        ("arms.1.thickness", 0.02),
-        ("arms.density", None),
-        ("arms.height", 0.06),
-    ):
-        assert nominal_value(given, key) == value
-
-
-def test_a_sample_out_of_reach_names_its_number():
+    nominal = {"payload.mass": 6.0, "arms.arm2.density": 2600.0, "arms.arm1.density": 2700.0,
+               "arms.1.thickness": 0.02, "arms.density": None, "arms.height": 0.06}  # fmt: skip
+    assert {key: nominal_value(given, key) for key in nominal} == nominal
     assert with_sample(scene(), (), 0) == scene()
     words = "--random", "sample 2", "motion.radius=5.0"
     refusal(lambda: with_sample(scene(), ("motion.radius=5.0",), 2), *words)
-
-
-# -- samples ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -176,11 +126,8 @@ def test_what_is_known_is_not_done_again(chunks, given, shared_tmp_path):
     count = 2 * CHUNK - 1  # and the scene itself: two chunks
     first, computed, _ = respond(payloads(count), shared_tmp_path)
     assert computed == 2 * CHUNK and first.shape == (3, 2 * CHUNK)
-    WORLD.barrier()  # all have read them
-    if WORLD.rank == 0:
-        damaged, _ = (shared_tmp_path / "cases").glob("*/summary.json")
-        damaged.write_bytes(damaged.read_bytes()[:100])
-    WORLD.barrier()
+    damaged = next((shared_tmp_path / "cases").glob("*/summary.json"))
+    by_root(lambda: damaged.write_bytes(damaged.read_bytes()[:100]))
     again, computed, _ = respond(payloads(count), shared_tmp_path)
     assert computed == CHUNK
     np.testing.assert_array_equal(first, again)
@@ -207,10 +154,10 @@ def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
     monkeypatch.setattr(computing, "simulate_batch", interrupted)
     with pytest.raises(KeyboardInterrupt):
         respond(payloads(count), tmp_path / "a", SELF)
-    found, computed, _ = respond(payloads(count), tmp_path / "a", SELF)
-    assert computed == CHUNK
-    expected, computed, _ = respond(payloads(count), tmp_path / "b", SELF)
-    assert computed == 3 * CHUNK
+    (found, again, _), (expected, all_of_it, _) = (
+        respond(payloads(count), tmp_path / name, SELF) for name in ("a", "b")
+    )
+    assert (again, all_of_it) == (CHUNK, 3 * CHUNK)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -254,9 +201,6 @@ def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch)
     assert computed == CHUNK and not failures and np.isfinite(found).all()
 
 
-# -- what comes out --------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 @alone
 def test_command(folder, capsys):
@@ -271,19 +215,15 @@ def test_command(folder, capsys):
     assert mass.mean() == pytest.approx(6.0, abs=0.02)
     assert mass.std() == pytest.approx(0.3, rel=0.1)
     statistics = rows_of(folder / "two" / f"{TWO}_statistics.csv")
+    shares = {f"{100 * share:g} % quantile": share for share in (0.05, 0.5, 0.95)}
     for label in ("initial design", "optimised design"):
         for quantity in ("compliance [N m]", "maximal deviation [mm]"):
             values = column(rows, f"{label}: {quantity}")
             mine = {r["statistic"]: r for r in statistics if r["quantity"] == quantity}
-            expected = {
-                "mean": values.mean(),
-                "standard deviation": values.std(ddof=1),
-                "5 % quantile": np.quantile(values, 0.05),
-                "50 % quantile": np.quantile(values, 0.5),
-                "95 % quantile": np.quantile(values, 0.95),
-            }
-            for name, value in expected.items():
-                assert float(mine[name][label]) == pytest.approx(value, rel=1e-8)
+            expected = {"mean": values.mean(), "standard deviation": values.std(ddof=1)}
+            expected |= {name: np.quantile(values, share) for name, share in shares.items()}
+            found = {name: float(mine[name][label]) for name in expected}
+            assert found == pytest.approx(expected, rel=1e-8)
             low, high = (float(mine["mean"][f"{label}: {end}"]) for end in ("from", "to"))
             assert low < values.mean() < high
             assert 0.0 < float(mine["nominal"][label]) < values.max()
