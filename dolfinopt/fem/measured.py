@@ -94,6 +94,11 @@ SMOOTHED_LOWER_SHARE = 0.1
 SMOOTHED_UPPER_SHARE = 1.1
 LANCZOS_ITERATIONS = 10
 ZERO_DIAGONAL_SHARE = 1e-15  # of the largest diagonal entry
+# Boxes: nodal values of so many cells, times right sides, at a time stay in the cache.
+BOX_CHUNK_COLUMNS = 4096
+# Ratio of a cell's edges to the shortest that can be joined up to which they are joined, too.
+COARSENED_EDGE_RATIO = 2.0
+COARSEST_BAND_WORK = 3e8  # rows times bandwidth squared up to which a grid is the coarsest
 RIGHT_SIDES_CHUNK = 12  # right sides at a time: memory of their vectors on all levels
 SOLVER_ITERATIONS = 500
 # The hierarchy of another design is kept while it takes at most so many times the steps a digit.
