@@ -31,11 +31,14 @@ from dolfinopt.fem.measured import (
     FACTOR_ROWS,
     FREE_MEMORY_SHARE,
     KRYLOV_TOLERANCE,
+    LEAST_STATICS_TOLERANCE,
     MUMPS_ROWS,
     SOLID_BAND_WORK_LIMIT,
+    STATICS_TOLERANCE_SHARE,
     TETRAHEDRA_BAND_WORK_LIMIT,
     TETRAHEDRA_ROWS,
     WIDEST,
+    WIDEST_OF_STATICS,
 )
 from dolfinopt.mesh.budget import free_memory, ranks_here
 from dolfinopt.profiling import Profile
@@ -227,8 +230,13 @@ class InteriorSystem:
         T = self._T
         if T.dim == 2 or has_options(OPTIONS):
             return False
-        wide = T.num_dofs > TETRAHEDRA_ROWS if self._irregular else T.bandwidth > WIDEST
+        wide = T.num_dofs > TETRAHEDRA_ROWS if self._irregular else T.bandwidth > self._widest
         return wide or self._memory_is_short()
+
+    @property
+    def _widest(self) -> int:
+        """Bandwidth beyond which regular meshes are solved by conjugate gradients."""
+        return WIDEST
 
     def _memory_is_short(self) -> bool:
         """Return whether a factor would take too much of a machine's free memory (collective)."""
@@ -241,14 +249,16 @@ class InteriorSystem:
     @cached_property
     def _boxed(self) -> BoxSolver | None:
         """Conjugate gradients of a box, where the user gives no options of other ones."""
-        from dolfinopt.fem.box_multigrid import BoxSolver
         from dolfinopt.fem.multigrid import PREFIX
 
         if self._box is None or has_options(PREFIX):
             return None
-        return BoxSolver(self._box, self._has_coordinates, self.tolerance)
+        return self._solver_of(self._box)
 
-    _has_coordinates = False  # whether the outboard ones are rows
+    def _solver_of(self, box: Box) -> BoxSolver:
+        from dolfinopt.fem.box_multigrid import BoxSolver
+
+        return BoxSolver(box, False, self.tolerance)
 
     @cached_property
     def _algebraic(self) -> AlgebraicSolver:
@@ -480,7 +490,15 @@ class ExtendedSystem(InteriorSystem):
         self.near = near
         self._is_last = T.comm.rank == T.comm.size - 1
 
-    _has_coordinates = True
+    def _solver_of(self, box: Box) -> BoxSolver:
+        from dolfinopt.fem.box_multigrid import BoxSolver
+
+        exact = max(LEAST_STATICS_TOLERANCE, STATICS_TOLERANCE_SHARE * self.tolerance)
+        return BoxSolver(box, True, min(self.tolerance, exact))
+
+    @property
+    def _widest(self) -> int:
+        return WIDEST if self._boxed is None else min(WIDEST, WIDEST_OF_STATICS)
 
     @property
     def is_worth_it(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 from solids import elastic_link, link_mesh, solid_arm, solid_scene
@@ -14,6 +15,7 @@ from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
 from dolfinopt.fem.box_multigrid import BoxMultigrid, BoxSolver
 from dolfinopt.fem.multigrid import Level
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import eigenproblem
 from dolfinopt.responses.sensitivity import exact_gradient
 
@@ -114,6 +116,48 @@ def test_contrast(direct, iterative):
         assert np.abs(found / right - 1.0).diagonal().max() < 1e-9
         steps.append(solver.iterative.steps)
     assert max(steps) < 1.3 * steps[0]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("cells", [(7, 4, 5), (9, 3, 2), (8, 2, 2)])
+def test_grids_of_a_box(cells):
+    """All levels are P' K P of the assembled matrix, odd counts, too; the cycle is symmetric."""
+    scene = solid_scene(cells=cells)
+    static = scene.objective.model_copy(update={"kind": "static"})
+    arm = Arm(scene.model_copy(update={"objective": static}), 0, MPI.COMM_SELF, Profile())
+    substructure, rng = arm.substructure, np.random.default_rng(2)
+    young = 70e9 * 10.0 ** rng.uniform(-4.0, 0.0, arm.mesh.num_cells)
+    elastic = substructure.at(young, young)
+    extended = substructure.extended
+    for system, K in (
+        (substructure.interior, elastic.K),
+        (extended, substructure.extend(elastic.K)),
+    ):
+        solver = system._solver_of(system._box)
+        solver.update(young)
+        indptr, columns, values = system.stiffness(K).getValuesCSR()
+        order = np.argsort(solver._place)  # the multigrid's rows
+        A = sp.csr_matrix((values, columns, indptr)).toarray()[np.ix_(order, order)]
+        assert solver._grid.times(np.eye(len(A))) == pytest.approx(A, abs=1e-14 * np.abs(A).max())
+        P = np.eye(len(A))
+        for grid, step, _ in solver._grid.grids:
+            P = P @ step
+            coarse = P.T @ A @ P
+            found = grid.times(np.eye(grid.rows))
+            assert found == pytest.approx(coarse, abs=1e-14 * np.abs(coarse).max())
+        V = solver._grid.cycle(np.eye(len(A)))
+        assert np.abs(V - V.T).max() < 1e-12 * np.abs(V).max()
+        assert np.linalg.eigvalsh(0.5 * (V + V.T))[0] > 0.0
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("shape", "element"), [("hexahedron", "linear"), ("tetrahedron", "quadratic")]
+)
+def test_only_grids_are_boxes(shape, element):
+    box = elastic_link(element, link_mesh(shape, (4, 3, 2))).substructure.interior._box
+    assert (box is None) == (shape == "tetrahedron")
+    assert box is None or box.shape == (4, 2, 3)
 
 
 @pytest.mark.serial
