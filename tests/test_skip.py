@@ -138,7 +138,8 @@ def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most) -
     found = counts(tmp_path / "out")
     assert found["factorisations"] == EACH and found["reductions"] == 0
     if most < 6:
-        assert found["assemblies"] == EACH and found["eigenproblems"] == 0
+        # A box is solved without its matrix.
+        assert found["assemblies"] == EACH * bool(width) and found["eigenproblems"] == 0
         assert EACH <= found["solves"] <= most * EACH
     else:
         assert found["solves"] >= most * EACH

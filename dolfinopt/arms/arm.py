@@ -408,7 +408,7 @@ class Arm:
 
     @guesses.setter
     def guesses(self, guesses: Guesses | None) -> None:
-        if self.substructure.interior.is_iterative:
+        if (self.substructure.extended or self.substructure.interior).is_iterative:
             self.substructure.set_guesses(guesses)
 
     def forget_modes(self) -> None:

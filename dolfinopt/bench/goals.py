@@ -108,6 +108,15 @@ def _power_of_dofs(what: str, ranks: int, frame: Frame) -> float:
     return fitted_power(ours[["dofs", "iteration [s]"]])
 
 
+def _over_pymoto(design: str, dofs: int, frame: Frame) -> float:
+    """Return the seconds over pyMOTO's of the largest link with at most so many dofs."""
+    here = _at(frame[frame["dofs"] <= dofs], design=design)
+    ours, theirs = (_at(here, program=one) for one in (solid.STATIC, solid.PYMOTO))
+    if not len(ours) or len(ours) != len(theirs):
+        return math.nan
+    return ours["iteration [s]"].iloc[-1] / theirs["iteration [s]"].iloc[-1]
+
+
 def _over_straight(frame: Frame) -> float:
     """Return the rod's least mass over that of the straight one."""
     kept = frame[(frame["problem"] == optimiser.ROD) & (frame["largest excess [-]"] <= EXCESS)]
@@ -154,6 +163,9 @@ GOALS = (
        ("exponent of a nearby design beyond the range of factors", 1.15, _power_of_dofs,
         solid.WARM),
     )),
+    *(Goal("statics", f"nearby design over pyMOTO's, up to {dofs} dofs [-]", limit,
+           partial(_over_pymoto, solid.NEARBY, dofs))
+      for dofs, limit in ((80_000, 0.7), (170_000, 1.0))),
     Goal("solid", "memory of a million dofs on two ranks [GB]", 20.0,
          lambda f: _links(f[f["dofs"] >= MILLION], solid.COLD, 2)["memory [GB]"].max()),
 )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -89,29 +89,43 @@ class PlainStatics:
         return float(self.load.dot(self._solution)), gradient
 
 
-def pymoto_iteration(scene: Scene, cells: tuple[int, int]) -> Iteration | None:
-    """Return the same by pyMOTO 1.5, https://github.com/aatmdelissen/pyMOTO; None: not there."""
+def pymoto_iteration(scene: Scene, cells: Sequence[int]) -> Iteration | None:
+    """Return the same by pyMOTO 1.5, https://github.com/aatmdelissen/pyMOTO; None: not there.
+
+    In the plane with a factor, in space by CG with three geometric grids, to its own 1e-7.
+    """
     try:
         import pymoto as pym
     except ImportError:
         return None
-    (along, across), arm, solid = cells, scene.arms[0], scene.material_of(0)
-    domain = pym.DomainDefinition(
-        along, across, unitx=arm.length / along, unity=arm.height / across, unitz=arm.thickness
-    )
-    rows = np.arange(across + 1)
-    left, right = domain.get_nodenumber(0, rows), domain.get_nodenumber(along, rows)
-    force, fixed = np.zeros(2 * domain.nnodes), (2 * left[:, None] + np.arange(2)).ravel()
-    force[2 * right + 1] = np.where((rows == 0) | (rows == across), 0.5, 1.0) / across
+    arm, solid, d = scene.arms[0], scene.material_of(0), len(cells)
+    thickness = arm.thickness / (cells[2] if d == 3 else 1)
+    edges = arm.length / cells[0], arm.height / cells[1], thickness
+
+    def grid(step: int) -> Any:
+        units = {f"unit{axis}": step * edge for axis, edge in zip("xyz", edges, strict=True)}
+        return pym.DomainDefinition(*(n // step for n in cells), **units)
+
+    domain = grid(1)
+    across = np.array([one.ravel() for one in np.indices([n + 1 for n in cells[1:]])])
+    left, right = (domain.get_nodenumber(at, *across) for at in (0, cells[0]))
+    force, fixed = np.zeros(d * domain.nnodes), (d * left[:, None] + np.arange(d)).ravel()
+    edge = [(at == 0) | (at == n) for at, n in zip(across, cells[1:], strict=True)]
+    force[d * right + 1] = np.prod(np.where(edge, 0.5, 1.0), axis=0) / np.prod(cells[1:])
     density, load = pym.Signal("x", np.ones(domain.nel)), pym.Signal("f", force)
     stiff, matrix, u, compliance = (pym.Signal(name) for name in "sKuc")
     options = {"domain": domain, "bc": fixed, "plane": "stress"}
     options |= {"e_modulus": solid.young_modulus, "poisson_ratio": solid.poisson_ratio}
     law = f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
+    solver = None
+    if d == 3:
+        inner = pym.solvers.GeometricMultigrid(grid(2))
+        outer = pym.solvers.GeometricMultigrid(domain, inner_level=inner)
+        solver = pym.solvers.CG(preconditioner=outer)
     network = pym.Network(
         pym.MathGeneral(density, stiff, expression=law),
         pym.AssembleStiffness(stiff, matrix, **options),
-        pym.LinSolve([matrix, load], u),
+        pym.LinSolve([matrix, load], u, solver=solver),
         pym.EinSum([u, load], compliance, expression="i,i->"),
     )
 

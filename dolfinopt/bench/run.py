@@ -25,7 +25,7 @@ Measured by `dolfinopt bench{}`: CPU seconds of this process, the least of the r
 thread, unless a table says otherwise."""
 # The main one first; what takes long, or is about designs, only when it is named.
 DIAGRAMS = motion.DIAGRAM, iterations.DIAGRAM, elements.DIAGRAM, tolerance.DIAGRAM
-NAMED = optimiser.DIAGRAM, solid.DIAGRAM
+NAMED = optimiser.DIAGRAM, solid.DIAGRAM, solid.STATICS
 
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:

@@ -1,4 +1,4 @@
-"""Seconds and memory of a design iteration of one solid link, beside plain DOLFINx."""
+"""Seconds and memory of a design iteration of one solid link, beside DOLFINx and pyMOTO."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mpi4py import MPI
 from dolfinopt.arms.arm import Arm, field_tolerance
 from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Rows, Steps
-from dolfinopt.bench.programs import PlainStatics
+from dolfinopt.bench.programs import PlainStatics, pymoto_iteration
 from dolfinopt.fem import interior
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.mesh.budget import free_memory, solid_bytes
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.sensitivity import esl_gradient
+from dolfinopt.responses.sensitivity import esl_gradient, static_gradient, static_response
 from dolfinopt.scene.load import Scene
 
 SIZE = LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
@@ -31,6 +31,10 @@ QUICK = (40, 4, 3), (60, 6, 4)
 OURS = COLD, WARM = "dolfinopt, first design", "dolfinopt, nearby design"
 PLAIN = "plain DOLFINx, one load"
 ITERATIVE = interior.ITERATIVE
+STATIC, PYMOTO = "dolfinopt, one load", "pyMOTO, one load"
+DESIGNS = FIRST, NEARBY = "first design", "nearby design"
+STATIC_CELLS = (64, 8, 8), (112, 16, 12), (156, 20, 16)  # that three grids divide
+LOAD = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0  # N across the end
 
 Cells = tuple[int, int, int]
 Found = tuple[int, str, list[float]]  # dofs of all ranks, solver, CPU seconds by design
@@ -70,9 +74,7 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
         _ = state.body
         arm.backward(esl_gradient(state, np.eye(6)))
 
-    first = box_beam(arm.mesh.centroid)
-    moved = first + MOVE * np.sin(60.0 * arm.mesh.centroid @ [1.0, 2.0, 3.0])
-    found = [_seconds(comm, iterate, x) for x in (first, np.clip(moved, 1e-3, 1.0))]
+    found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
     return arm.substructure.T.num_dofs, arm.substructure.interior.solver_name, found
 
 
@@ -82,6 +84,55 @@ def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     elastic = solid.young_modulus, solid.poisson_ratio
     plain = PlainStatics(arm, *elastic, HEIGHT * THICKNESS, field_tolerance(scene))
     return plain.load.getSize(), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
+
+
+def static_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
+    """Return static iterations of this package: one load, two designs (collective)."""
+    link = link_scene(scene, cells)
+    objective = link.objective.model_copy(update={"kind": "static"})
+    arm = Arm(link.model_copy(update={"objective": objective}), 0, comm, Profile())
+
+    def iterate(x: np.ndarray) -> None:
+        state = arm.state(x)
+        response = static_response(state.elastic, np.array([LOAD]))
+        static_gradient(state, response)
+
+    found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
+    system = arm.substructure.extended or arm.substructure.interior
+    return arm.substructure.T.num_dofs, system.solver_name, found
+
+
+def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found | None:
+    """Return the same by pyMOTO, None where it is not installed."""
+    iterate = pymoto_iteration(link_scene(scene, cells), cells)
+    if iterate is None:
+        return None
+    # Its cells run along first, then up the height.
+    places = [(np.arange(n) + 0.5) / n * size for n, size in zip(cells, SIZE, strict=True)]
+    z, y, x = (one.ravel() for one in np.meshgrid(*places[::-1], indexing="ij"))
+    centroid = np.column_stack([x, y - 0.5 * HEIGHT, z - 0.5 * THICKNESS])
+    found = [_seconds(comm, iterate, x) for x in two_designs(centroid)]
+    return 3 * math.prod(n + 1 for n in cells), ITERATIVE, found
+
+
+def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box beam and a design nearby, (n,) each."""
+    first = box_beam(centroid)
+    moved = first + MOVE * np.sin(60.0 * centroid @ [1.0, 2.0, 3.0])
+    return first, np.clip(moved, 1e-3, 1.0)
+
+
+def _static_steps(plan: Plan) -> Steps:
+    def rows(link: Callable[..., Found | None], name: str, cells: Cells) -> Rows:
+        result, memory = in_processes(link, plan.scene, cells, ranks=1)
+        if result is not None:
+            dofs, solver, found = result
+            for design, seconds in zip(DESIGNS, found, strict=True):
+                yield name, design, dofs, seconds, memory * 2**20 / 1e9, solver
+
+    for cells in STATIC_CELLS[: 1 if plan.quick else None]:
+        for name, link in ((STATIC, static_link), (PYMOTO, pymoto_link)):
+            yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, link, name, cells)
 
 
 def _steps(plan: Plan) -> Steps:
@@ -111,4 +162,19 @@ DIAGRAM = Diagram(
     f"a nearby one (densities moved by up to {MOVE:g}) starts from its fields. Plain DOLFINx: K, "
     "one load by conjugate gradients with GAMG to the same tolerance, energies.",
     each=("ranks",),
+)
+
+STATICS = Diagram(
+    "statics",
+    "One solid link: a static iteration against degrees of freedom",
+    "program | design | dofs | iteration [s] | memory [GB] | solver",
+    _static_steps,
+    "dofs",
+    ("iteration [s]", "memory [GB]"),
+    "program",
+    "CPU seconds on one rank of compliance under one load across the end and its gradient; a box "
+    f"beam, then densities moved by up to {MOVE:g}. pyMOTO: conjugate gradients with three "
+    "geometric grids; the loaded end is not rigid there.",
+    each=("design",),
+    uses=("pymoto",),
 )

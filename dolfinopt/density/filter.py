@@ -11,7 +11,6 @@ import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinopt.density.measured import (
@@ -522,5 +521,7 @@ def preserving_threshold(x: np.ndarray, area: np.ndarray, beta: float, comm: MPI
 
     if beta == 0.0 or not gain(0.0) > 0.0 > gain(1.0):
         return MIDDLE_THRESHOLD
+    from scipy.optimize import brentq  # takes as long to import as NumPy
+
     # As exact as eta can be: the volume is then right to about beta times its rounding.
     return float(brentq(gain, 0.0, 1.0, xtol=1e-16, rtol=4.0 * np.finfo(float).eps))

@@ -8,7 +8,6 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
@@ -319,4 +318,6 @@ def _read_forces(
     table = read_table(file, columns)
     if table.t is None:
         raise InputError(f"{file}: expected a column {TIME} besides {', '.join(columns)}")
+    from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
+
     return table.t, make_interp_spline(table.t, table.rows, k=1)

@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from dolfinopt.dynamics.collocation import GivenUp, Solution, even_steps, first_num_steps, spend
 from dolfinopt.dynamics.measured import (
@@ -326,6 +325,8 @@ def _interpolated(
     # Twice differentiable as the motion is. A cubic through both q and qd of a step would have
     # accelerations of first order only: Newmark's qd is the derivative of his q up to h^2, a
     # difference that a further derivative turns into h.
+    from scipy.interpolate import CubicSpline  # takes as long to import as NumPy
+
     spline = CubicSpline(time_grid, q, bc_type=((1, qd_0), "not-a-knot"))
     a = spline(time_grid, 2)
     ends = np.stack([a[:-1], a[1:]], axis=1)

@@ -19,6 +19,7 @@ from dolfinopt.fem.measured import (
     STRESS_CHUNK_CELLS,
     STRESS_CHUNK_ENTRIES,
 )
+from dolfinopt.profiling import Profile
 
 
 class AffineMatrix:
@@ -119,6 +120,31 @@ class CellMatrix:
         size = b * pattern.shape[0]
         values = values.reshape(-1, b, b)
         return sp.bsr_matrix((values, pattern.indices, pattern.indptr), (size, size))
+
+
+class AssembledMatrix:
+    """sum_e s_e A_e of one design, assembled when it is first asked for.
+
+    Attributes:
+        scale: (n_cells,) s, not to be changed.
+    """
+
+    def __init__(self, affine: AffineMatrix | CellMatrix, scale: np.ndarray, profile: Profile):
+        self.scale = scale.copy()
+        self._affine, self._profile = affine, profile
+
+    @cached_property
+    def matrix(self) -> sp.csr_matrix:
+        """The contributions of this rank's cells, over local dofs."""
+        with self._profile.phase("assembly"):
+            matrix = self._affine.assemble(self.scale)
+        self._profile.counts.assemblies += 1
+        return matrix
+
+    @property
+    def data(self) -> np.ndarray:
+        """Its values, one behind the other."""
+        return self.matrix.data.ravel()
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import (
     AffineMatrix,
+    AssembledMatrix,
     CellMatrix,
     NodePairs,
     StressTensor,
@@ -95,10 +96,15 @@ class Substructure:
                 self._mass = AffineMatrix(cells, operators.mass, size)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
         quadratic = operators.cells.shape[1] == 10  # tetrahedra
+        box = None
+        if dim == 3 and mesh.wall is None:
+            from dolfinopt.fem.box_multigrid import box_of
+
+            box = box_of(self.T, self.cells, mesh.centroid)
+        self._statics_alone, self._solution = statics_alone, (tolerance, quadratic, box)
         self.interior = InteriorSystem(
-            self.T, self._stiffness, self._mass, profile, tolerance, quadratic
+            self.T, self._stiffness, self._mass, profile, *self._solution
         )
-        self._statics_alone, self._solution = statics_alone, (tolerance, quadratic)
         self._last: ElasticArm | None = None
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> Substructure:
@@ -134,8 +140,10 @@ class Substructure:
         touched = np.zeros((*self.operators.points.shape, 1))
         touched[self.operators.cells[self._rigid_forces[0]]] = 1.0
         near = np.flatnonzero(self.T.restrict(touched)[0])
-        matrices = self._stiffness, self._mass
-        found = ExtendedSystem(self.T, *matrices, self.profile, *self._solution, near)
+        tolerance, irregular, box = self._solution
+        found = ExtendedSystem(
+            self.T, self._stiffness, self._mass, self.profile, tolerance, irregular, box, near
+        )
         return found if found.is_worth_it else None
 
     def release_extended(self) -> None:
@@ -218,10 +226,10 @@ class Substructure:
             return StressTensor(self.cells, *every)
         return StressTensor(self.cells, derivatives[None], stress[None])
 
-    def extend(self, K: sp.csr_matrix, young: np.ndarray) -> ExtendedStiffness:
-        """Return what `extended` takes of K of a design, which has this modulus (collective)."""
+    def extend(self, K: AssembledMatrix) -> ExtendedStiffness:
+        """Return what `extended` takes of K of a design (collective)."""
         assert self.extended is not None
-        coupling, corner = self.T.restrict(self.rigid_forces(young))
+        coupling, corner = self.T.restrict(self.rigid_forces(K.scale))
         return ExtendedStiffness(K, np.append(coupling[self.extended.near].ravel(), corner))
 
     @property
@@ -233,10 +241,9 @@ class Substructure:
         """Let iterative solves set out as others did, see `InteriorSystem.guesses` (collective)."""
         system, K = self.extended or self.interior, None
         if guesses is not None and not system.has_hierarchy_of(guesses):
-            K = AssembledMatrix(self._stiffness, guesses.young, Profile()).matrix
-            if self.extended is not None:
-                K = self.extend(K, guesses.young)
-        system.set_guesses(guesses, K)
+            K = AssembledMatrix(self._stiffness, guesses.young, Profile())
+        extended = self.extend(K) if K and self.extended else K
+        system.set_guesses(guesses, extended)
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.
@@ -262,26 +269,6 @@ class Substructure:
         if self.mesh.comm.size > 1:  # some ranks may see no change in their cells
             self.mesh.comm.Allreduce(MPI.IN_PLACE, same, op=MPI.LAND)
         return bool(same[0]), bool(same[1])
-
-
-class AssembledMatrix:
-    """sum_e s_e A_e of one design, assembled when it is first asked for.
-
-    Attributes:
-        scale: (n_cells,) s, not to be changed.
-    """
-
-    def __init__(self, affine: AffineMatrix | CellMatrix, scale: np.ndarray, profile: Profile):
-        self.scale = scale.copy()
-        self._affine, self._profile = affine, profile
-
-    @cached_property
-    def matrix(self) -> sp.csr_matrix:
-        """The contributions of this rank's cells, over local dofs."""
-        with self._profile.phase("assembly"):
-            matrix = self._affine.assemble(self.scale)
-        self._profile.counts.assemblies += 1
-        return matrix
 
 
 class ElasticArm:
@@ -373,11 +360,11 @@ class ElasticArm:
 
     def factorise(self) -> Factor:
         """Return the factor of K_II of this design, see `InteriorSystem`."""
-        return self.substructure.interior.factorise(self.K.matrix, self.young)
+        return self.substructure.interior.factorise(self.K)
 
     def interior_stiffness(self) -> PETSc.Mat:
         """Return K_II, valid until another design of the arm asks for its own or is factorised."""
-        return self.substructure.interior.stiffness(self.K.matrix)
+        return self.substructure.interior.stiffness(self.K)
 
     def interior_mass(self) -> PETSc.Mat:
         """Return M_II, valid until another design of the arm asks for its own."""
@@ -397,15 +384,15 @@ class ElasticArm:
             ConvergenceError: K_II is singular but for rounding.
         """
         interior = self.substructure.interior
-        interior.factorise(self.K.matrix, self.young)
+        interior.factorise(self.K)
         with self.profile.phase("solves"):
-            out, failed = interior.solve(self.K.matrix, right, purpose, held)
+            out, failed = interior.solve(self.K, right, purpose, held)
         self._count(right.shape[1], failed)
         return out
 
     @cached_property
     def _extended(self) -> ExtendedStiffness:
-        return self.substructure.extend(self.K.matrix, self.young)
+        return self.substructure.extend(self.K)
 
     def solve_loads(self, loads: np.ndarray, purpose: str) -> tuple[np.ndarray, np.ndarray]:
         """Return what loads (b, k) of the outboard interfaces do, see `ExtendedSystem.solve_loads`.
@@ -415,7 +402,7 @@ class ElasticArm:
         """
         extended = self.substructure.extended
         assert extended is not None
-        extended.factorise(self._extended, self.young)
+        extended.factorise(self._extended)
         with self.profile.phase("solves"):
             interior, tip, failed = extended.solve_loads(self._extended, loads, purpose)
         self._count(loads.shape[1], failed)
@@ -435,7 +422,7 @@ class ElasticArm:
         """Return K_II^-1 right for one right side (num_interior,) of owned rows."""
         self.profile.counts.solves += 1
         self.factorise()
-        return self.substructure.interior.inverse(self.K.matrix, right)
+        return self.substructure.interior.inverse(self.K, right)
 
     def interior_stiffness_times(self, vector: np.ndarray) -> np.ndarray:
         """Return K_II times a vector (num_interior,) of owned rows."""

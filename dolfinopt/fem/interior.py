@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,6 +14,7 @@ from petsc4py import PETSc
 
 from dolfinopt.fem.assembly import (
     AffineMatrix,
+    AssembledMatrix,
     CellMatrix,
     InteriorEntries,
     InteriorMatrix,
@@ -30,11 +31,14 @@ from dolfinopt.fem.measured import (
     FACTOR_ROWS,
     FREE_MEMORY_SHARE,
     KRYLOV_TOLERANCE,
+    LEAST_STATICS_TOLERANCE,
     MUMPS_ROWS,
     SOLID_BAND_WORK_LIMIT,
+    STATICS_TOLERANCE_SHARE,
     TETRAHEDRA_BAND_WORK_LIMIT,
     TETRAHEDRA_ROWS,
     WIDEST,
+    WIDEST_OF_STATICS,
 )
 from dolfinopt.mesh.budget import free_memory, ranks_here
 from dolfinopt.profiling import Profile
@@ -48,7 +52,8 @@ from dolfinopt.solver import (
 )
 
 if TYPE_CHECKING:
-    from dolfinopt.fem.multigrid import BlockConjugateGradients
+    from dolfinopt.fem.box_multigrid import Box, BoxSolver
+    from dolfinopt.fem.multigrid import AlgebraicSolver
 
 Columns = Callable[[np.ndarray], np.ndarray]
 ITERATIVE = "conjugate gradients"  # name of that solver
@@ -70,6 +75,45 @@ class Guesses:
     young: np.ndarray
     gradual: bool
     progress: tuple[float, float]
+
+
+class Stiffness(Protocol):
+    """K of one design.
+
+    Attributes:
+        scale: (n_cells,) Young's modulus of the cells, Pa.
+        data: all values, one behind the other; assembled when they are first asked for.
+    """
+
+    @property
+    def scale(self) -> np.ndarray: ...
+
+    @property
+    def data(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class ExtendedStiffness:
+    """K of one design, and what `ExtendedSystem` takes of it at the outboard interfaces.
+
+    Attributes:
+        of: K over local dofs.
+        border: coupling of the owned nodes beside the interfaces with the interfaces'
+            coordinates, then stiffness of these alone.
+    """
+
+    of: AssembledMatrix
+    border: np.ndarray
+
+    @property
+    def scale(self) -> np.ndarray:
+        """See `Stiffness`."""
+        return self.of.scale
+
+    @property
+    def data(self) -> np.ndarray:
+        """See `Stiffness`; not kept."""
+        return np.append(self.of.data, self.border)
 
 
 def _is_too_much(comm: MPI.Comm, needed: float) -> bool:
@@ -98,6 +142,7 @@ class InteriorSystem:
         profile: Profile,
         tolerance: float | None = None,
         irregular: bool = False,
+        box: Box | None = None,
     ):
         """Set up for such matrices; nothing is selected before it is asked for.
 
@@ -108,14 +153,15 @@ class InteriorSystem:
             profile: of this rank.
             tolerance: in place of `ENERGY_TOLERANCE`.
             irregular: whether the mesh is of quadratic tetrahedra.
+            box: that all of the arm's cells fill, or None.
         """
-        self._irregular = irregular
+        self._irregular, self._box = irregular, box
         self._T, self._profile = T, profile
         self.tolerance = tolerance or ENERGY_TOLERANCE
         self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
         self._factor: Factor | None = None
-        self._factorised: sp.csr_matrix | None = None  # the K whose factor is at hand
-        self._stiffness_of: sp.csr_matrix | None = None
+        self._factorised: Stiffness | None = None  # the K whose factor is at hand
+        self._stiffness_of: Stiffness | None = None
         self._mass_of: sp.csr_matrix | None = None
         self._solutions: dict[str, np.ndarray] = {}
         self._node_mass_of: sp.csr_matrix | None = None
@@ -184,8 +230,13 @@ class InteriorSystem:
         T = self._T
         if T.dim == 2 or has_options(OPTIONS):
             return False
-        wide = T.num_dofs > TETRAHEDRA_ROWS if self._irregular else T.bandwidth > WIDEST
+        wide = T.num_dofs > TETRAHEDRA_ROWS if self._irregular else T.bandwidth > self._widest
         return wide or self._memory_is_short()
+
+    @property
+    def _widest(self) -> int:
+        """Bandwidth beyond which regular meshes are solved by conjugate gradients."""
+        return WIDEST
 
     def _memory_is_short(self) -> bool:
         """Return whether a factor would take too much of a machine's free memory (collective)."""
@@ -196,11 +247,30 @@ class InteriorSystem:
         return bool(T.comm.allreduce(short, op=MPI.LOR))
 
     @cached_property
-    def _iterative(self) -> BlockConjugateGradients:
-        from dolfinopt.fem.multigrid import BlockConjugateGradients
+    def _boxed(self) -> BoxSolver | None:
+        """Conjugate gradients of a box, where the user gives no options of other ones."""
+        from dolfinopt.fem.multigrid import PREFIX
+
+        if self._box is None or has_options(PREFIX):
+            return None
+        return self._solver_of(self._box)
+
+    def _solver_of(self, box: Box) -> BoxSolver:
+        from dolfinopt.fem.box_multigrid import BoxSolver
+
+        return BoxSolver(box, False, self.tolerance)
+
+    @cached_property
+    def _algebraic(self) -> AlgebraicSolver:
+        from dolfinopt.fem.multigrid import AlgebraicSolver
 
         self._tell_rigid_motions()
-        return BlockConjugateGradients(self._stiffness.mat, self.tolerance)
+        return AlgebraicSolver(self._stiffness.mat, self.tolerance)
+
+    @property
+    def iterative(self) -> BoxSolver | AlgebraicSolver:
+        """The iterative solver, of the design that asked last."""
+        return self._boxed or self._algebraic
 
     def _tell_rigid_motions(self) -> None:
         from dolfinopt.fem.multigrid import with_rigid_motions
@@ -217,49 +287,46 @@ class InteriorSystem:
             return "LAPACK's band"
         return str(self._ksp.getPC().getFactorSolverType())
 
-    def factorise(self, K: sp.csr_matrix, young: np.ndarray | None = None) -> Factor:
-        """Return the factor of K_II; nothing is done if K was the last one (collective).
-
-        Args:
-            K: assembled for one design.
-            young: (n_cells,) its Young's modulus, which `guesses` are to know; Pa.
-        """
+    def factorise(self, K: Stiffness) -> Factor:
+        """Return the factor of K_II; nothing is done if K was the last one (collective)."""
         if self._factor is not None and self._factorised is K:
             return self._factor
         self._factorised = None
-        if self.is_iterative:
-            return self._refreshed(K, young)
-        band = self._band
         with self._profile.phase("factorisation"):
-            # What rounding has made indefinite PETSc factorises all the same; whether the result
-            # is worth anything is judged by it.
-            if band is not None and band.factorise(K.data.ravel()[self._band_source]):
-                self._factor = band
-            else:
-                self._factor = self._petsc(K)
+            self._factor = self._refreshed(K) if self.is_iterative else self._direct(K)
         self._profile.counts.factorisations += 1
         self._factorised = K
         return self._factor
 
-    def _refreshed(self, K: sp.csr_matrix, young: np.ndarray | None) -> BlockConjugateGradients:
+    def _direct(self, K: Stiffness) -> Factor:
+        band = self._band
+        # What rounding has made indefinite PETSc factorises all the same; whether the result is
+        # worth anything is judged by it.
+        if band is not None and band.factorise(K.data[self._band_source]):
+            return band
+        return self._petsc(K)
+
+    def _refreshed(self, K: Stiffness) -> BoxSolver | AlgebraicSolver:
         """Return the iterative solver of K_II (collective)."""
-        with self._profile.phase("factorisation"):
-            self.stiffness(K)
-            if "_iterative" in self.__dict__:
-                self._iterative.update()
-            self._factor, self._asked = self._iterative, young
-            self._note_hierarchy()
-        self._profile.counts.factorisations += 1
-        self._factorised = K
-        return self._iterative
+        self._asked = K.scale
+        if self._boxed is not None:
+            self.__dict__.pop("_algebraic", None)
+            self._boxed.update(K.scale)
+            self._young = self._asked
+            return self._boxed
+        self.stiffness(K)
+        if "_algebraic" in self.__dict__:
+            self._algebraic.update()
+        self._note_hierarchy()
+        return self._algebraic
 
     def _note_hierarchy(self) -> None:
         """Remember whose hierarchy it is, if it is a new one."""
-        if self._iterative.grid.setups != self._setups:
-            self._setups, self._young = self._iterative.grid.setups, self._asked
+        if self._boxed is None and self._algebraic.grid.setups != self._setups:
+            self._setups, self._young = self._algebraic.grid.setups, self._asked
 
     def solve(
-        self, K: sp.csr_matrix, right: np.ndarray, purpose: str, held: np.ndarray | None = None
+        self, K: Stiffness, right: np.ndarray, purpose: str, held: np.ndarray | None = None
     ) -> tuple[np.ndarray, bool]:
         """Return K_II^-1 right (num_interior, k) and whether that failed (collective).
 
@@ -271,21 +338,41 @@ class InteriorSystem:
             return factor.solve(right), factor.failed
         if right.shape[1] == 0:
             return right.copy(), False
-        out = self._iterative.solve(right, self._solutions.get(purpose), held=held)
-        self._note_hierarchy()
+        out, failed = self._iterated(K, right, self._solutions.get(purpose), held=held)
         if purpose:
             self._solutions[purpose] = out
-        return out, self._iterative.failed
+        return out, failed
+
+    def _iterated(
+        self,
+        K: Stiffness,
+        right: np.ndarray,
+        guess: np.ndarray | None = None,
+        tolerance: float | None = None,
+        held: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, bool]:
+        """Return the iterative solution, and whether that failed (collective)."""
+        solver = self._boxed
+        if solver is not None:
+            out = solver.solve(right, guess, tolerance, held)
+            if not solver.failed:
+                return out, False
+            self.stiffness(K)  # this design alone is solved with aggregates
+        out = self._algebraic.solve(right, guess, tolerance, held)
+        self._note_hierarchy()
+        return out, self._algebraic.failed
 
     @property
     def guesses(self) -> Guesses | None:
         """What the next iterative solves set out from; None where there is nothing."""
         if self._young is None:
             return None
-        gradual = self._iterative.grid.gradual
-        return Guesses(dict(self._solutions), self._young, gradual, self._iterative.progress)
+        if self._boxed is not None:
+            return Guesses(dict(self._solutions), self._young, False, (-1.0, 0.0))
+        gradual = self._algebraic.grid.gradual
+        return Guesses(dict(self._solutions), self._young, gradual, self._algebraic.progress)
 
-    def set_guesses(self, guesses: Guesses | None, K: sp.csr_matrix | None) -> None:
+    def set_guesses(self, guesses: Guesses | None, K: Stiffness | None) -> None:
         """Let the next iterative solves set out from what was `guesses` (collective).
 
         Args:
@@ -295,39 +382,43 @@ class InteriorSystem:
         if guesses is None:
             self._solutions, self._young, self._setups = {}, None, 0
             self._factor = self._factorised = None
-            self.__dict__.pop("_iterative", None)
+            self.__dict__.pop("_algebraic", None)
             return
         self._solutions = dict(guesses.fields)
+        if self._boxed is not None:  # whose grids are those of any design
+            self._young = guesses.young
+            return
         if K is not None:
             self._factor = self._factorised = None
             self.stiffness(K)
-            known = "_iterative" in self.__dict__
-            grid = self._iterative.grid
+            known = "_algebraic" in self.__dict__
+            grid = self._algebraic.grid
             grid.gradual = guesses.gradual
             if known or grid.gradual:
                 grid.make()
             self._young, self._setups = guesses.young, grid.setups
             self._stiffness_of = None  # the matrix is to be given free
-        self._iterative.progress = guesses.progress
+        self._algebraic.progress = guesses.progress
 
     def has_hierarchy_of(self, guesses: Guesses) -> bool:
         """Return whether the hierarchy at hand is that of these guesses (collective)."""
+        if self._boxed is not None:
+            return True
         mine = self._young is not None and np.array_equal(self._young, guesses.young)
-        mine = mine and self._iterative.grid.gradual == guesses.gradual
+        mine = mine and self._algebraic.grid.gradual == guesses.gradual
         return self._T.comm.allreduce(mine, op=MPI.LAND)
 
-    def inverse(self, K: sp.csr_matrix, right: np.ndarray) -> np.ndarray:
+    def inverse(self, K: Stiffness, right: np.ndarray) -> np.ndarray:
         """Return K_II^-1 times a vector (num_interior,), to nearly all digits."""
         factor = self.factorise(K)
         if self.is_iterative:
-            return self._iterative.solve(right, tolerance=KRYLOV_TOLERANCE)
+            return self._iterated(K, right, tolerance=KRYLOV_TOLERANCE)[0]
         return factor.solve(right)
 
-    def multigrid(self, K: sp.csr_matrix) -> tuple[Columns, Columns]:
+    def multigrid(self, K: Stiffness) -> tuple[Columns, Columns]:
         """Return products with K_II and its approximate inverse, of an iterative solver."""
         self.factorise(K)
-        grid = self._iterative.grid
-        return grid.levels[0].times, grid.cycle
+        return self.iterative.times, self.iterative.cycle
 
     @cached_property
     def _nodes(self) -> InteriorEntries:
@@ -345,17 +436,18 @@ class InteriorSystem:
             self._node_mass_of = M
         return self._node_mass
 
-    def _petsc(self, K: sp.csr_matrix) -> PetscFactor:
+    def _petsc(self, K: Stiffness) -> PetscFactor:
         self._ksp.setOperators(self.stiffness(K))
         with obeying_options(OPTIONS):
             self._ksp.setUp()
         return PetscFactor(self._ksp)
 
-    def stiffness(self, K: sp.csr_matrix) -> PETSc.Mat:
+    def stiffness(self, K: Stiffness) -> PETSc.Mat:
         """Return K_II, owned by this object (collective)."""
         if self._stiffness_of is not K:
             # Those of PETSc would follow the matrix.
-            if isinstance(self._factor, PetscFactor) or self.is_iterative:
+            algebraic = self.is_iterative and self._boxed is None
+            if isinstance(self._factor, PetscFactor) or algebraic:
                 self._factorised = None
             self._stiffness.update(K.data)
             self._stiffness_of = K
@@ -367,25 +459,6 @@ class InteriorSystem:
             self._mass.update(M.data)
             self._mass_of = M
         return self._mass.mat
-
-
-@dataclass(frozen=True, eq=False)
-class ExtendedStiffness:
-    """K of one design, and what `ExtendedSystem` takes of it at the outboard interfaces.
-
-    Attributes:
-        matrix: K over local dofs.
-        border: coupling of the owned nodes beside the interfaces with the interfaces'
-            coordinates, then stiffness of these alone.
-    """
-
-    matrix: sp.csr_matrix
-    border: np.ndarray
-
-    @property
-    def data(self) -> np.ndarray:
-        """All values, one behind the other; not kept."""
-        return np.concatenate([self.matrix.data.ravel(), self.border])
 
 
 class ExtendedSystem(InteriorSystem):
@@ -404,17 +477,28 @@ class ExtendedSystem(InteriorSystem):
         profile: Profile,
         tolerance: float | None,
         irregular: bool,
+        box: Box | None,
         near: np.ndarray,
     ):
         """Set up as an `InteriorSystem`.
 
         Args:
-            T, stiffness, mass, profile, tolerance, irregular: see there.
+            T, stiffness, mass, profile, tolerance, irregular, box: see there.
             near: interior dofs of this rank that an outboard interface's coordinates couple with.
         """
-        super().__init__(T, stiffness, mass, profile, tolerance, irregular)
+        super().__init__(T, stiffness, mass, profile, tolerance, irregular, box)
         self.near = near
         self._is_last = T.comm.rank == T.comm.size - 1
+
+    def _solver_of(self, box: Box) -> BoxSolver:
+        from dolfinopt.fem.box_multigrid import BoxSolver
+
+        exact = max(LEAST_STATICS_TOLERANCE, STATICS_TOLERANCE_SHARE * self.tolerance)
+        return BoxSolver(box, True, min(self.tolerance, exact))
+
+    @property
+    def _widest(self) -> int:
+        return WIDEST if self._boxed is None else min(WIDEST, WIDEST_OF_STATICS)
 
     @property
     def is_worth_it(self) -> bool:
@@ -495,9 +579,8 @@ class ExtendedSystem(InteriorSystem):
             if guess is not None:
                 fixed = np.hstack([np.zeros((b, guess.shape[1])), np.eye(b)])
                 guess = self._owned(np.hstack([guess, np.zeros((size, b))]), fixed)
-            out = self._iterative.solve(right, guess)
-            self._note_hierarchy()
+            out, failed = self._iterated(K, right, guess)
             self._solutions[purpose] = out[:size].copy()
         else:
-            out = factor.solve(right)
-        return out[:size], T.comm.bcast(out[size:], root=T.comm.size - 1), factor.failed
+            out, failed = factor.solve(right), factor.failed
+        return out[:size], T.comm.bcast(out[size:], root=T.comm.size - 1), failed

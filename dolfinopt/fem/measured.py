@@ -61,8 +61,16 @@ SOLID_BAND_WORK_LIMIT = 1.5e11
 MUMPS_ROWS = 150_000
 # Bandwidth beyond which a solid arm is solved by conjugate gradients: they take the same time a row
 # whatever the shape, factors the longer the larger the cross-sections. With this one a nearby
-# design takes equally long: slender arms of 250 000 and cubes of 22 000 rows.
+# design takes equally long: slender arms of 250 000 and cubes of 22 000 rows by aggregates. By
+# grids six constraint modes and their exact gradient take 2.75 s at 51 603 rows, bandwidth 1391,
+# and 2.66 s by the band; 3.9 and 2.9 s at 132 645 rows, bandwidth 803.
 WIDEST = 1200
+# The same of boxes of which static loads are asked alone: one load by geometric multigrid takes as
+# long as the band at 11 157 rows, bandwidth 221 (0.022 s), a third of it at 41 775 rows, bandwidth
+# 395 (0.08 and 0.19 s), a sixth at 132 645 rows, bandwidth 803 (0.29 and 1.9 s).
+WIDEST_OF_STATICS = 250
+# Its tolerance by that of the scene, and the least: gradients are those of a factor to 1e-10.
+STATICS_TOLERANCE_SHARE, LEAST_STATICS_TOLERANCE = 1e-3, 1e-11
 # Quadratic tetrahedra, whose meshes are irregular, tell nothing by their bandwidth. Rows beyond
 # which they are solved by conjugate gradients, and rows times bandwidth squared up to which a band
 # is factorised. CPU seconds of a body for a nearby design, by MUMPS, conjugate gradients and the
@@ -94,6 +102,11 @@ SMOOTHED_LOWER_SHARE = 0.1
 SMOOTHED_UPPER_SHARE = 1.1
 LANCZOS_ITERATIONS = 10
 ZERO_DIAGONAL_SHARE = 1e-15  # of the largest diagonal entry
+# Boxes: nodal values of so many cells, times right sides, at a time stay in the cache.
+BOX_CHUNK_COLUMNS = 4096
+# Ratio of a cell's edges to the shortest that can be joined up to which they are joined, too.
+COARSENED_EDGE_RATIO = 2.0
+COARSEST_BAND_WORK = 3e8  # rows times bandwidth squared up to which a grid is the coarsest
 RIGHT_SIDES_CHUNK = 12  # right sides at a time: memory of their vectors on all levels
 SOLVER_ITERATIONS = 500
 # The hierarchy of another design is kept while it takes at most so many times the steps a digit.

@@ -1,4 +1,4 @@
-"""Algebraic multigrid for many right sides at once.
+"""Conjugate gradients and algebraic multigrid for many right sides at once.
 
 PETSc's GAMG makes the hierarchy; the cycles are done here, for all right sides together: a matrix
 is then read once for all of them, in blocks of nodes, which takes a quarter of the time of one
@@ -7,9 +7,10 @@ product after the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,6 +31,7 @@ from dolfinopt.fem.measured import (
 )
 from dolfinopt.parallel import on_root
 
+Columns = Callable[[np.ndarray], np.ndarray]
 PREFIX = "dolfinopt_multigrid_"  # of the PETSc options of the hierarchy
 
 
@@ -67,7 +69,15 @@ class Level:
     @cached_property
     def bounds(self) -> tuple[float, float]:
         """The part of the scaled matrix' spectrum that is smoothed (collective)."""
-        highest = _largest_eigenvalue(self.matrix, np.sqrt(self.inverse_diagonal[:, 0]))
+        x, y = self.matrix.createVecs()
+
+        def times(X: np.ndarray) -> np.ndarray:
+            x.array = X[:, 0]
+            self.matrix.mult(x, y)
+            return y.array_r.copy()[:, None]
+
+        comm = self.matrix.comm.tompi4py()
+        highest = largest_eigenvalue(comm, times, np.sqrt(self.inverse_diagonal[:, 0]))
         return SMOOTHED_LOWER_SHARE * highest, SMOOTHED_UPPER_SHARE * highest
 
     def times(self, X: np.ndarray) -> np.ndarray:
@@ -96,17 +106,36 @@ class Level:
         return result.getDenseArray().copy(order="F")
 
     def smooth(self, residual: np.ndarray, last: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return a correction and the residual that it leaves; `last`: that is not needed."""
-        low, high = self.bounds
-        theta, delta = 0.5 * (high + low), 0.5 * (high - low)
-        rho = delta / theta
-        step = (self.inverse_diagonal / theta) * residual
-        residual = residual - self.times(step)
-        again = 1.0 / (2.0 * theta / delta - rho)
-        second = (again * rho) * step + (2.0 * again / delta) * (self.inverse_diagonal * residual)
-        if not last:
-            residual = residual - self.times(second)
-        return step + second, residual
+        """Return a correction and the residual that it leaves, see `chebyshev`."""
+        return chebyshev(self.times, self.inverse_diagonal, self.bounds, residual, last)
+
+
+def chebyshev(
+    times: Columns,
+    inverse_diagonal: np.ndarray,
+    bounds: tuple[float, float],
+    residual: np.ndarray,
+    last: bool,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the correction by Chebyshev's polynomial of degree 2, and the residual that it leaves.
+
+    Args:
+        times: product with the matrix.
+        inverse_diagonal: (rows, 1) of the matrix.
+        bounds: the part of the diagonally scaled matrix' spectrum that is smoothed.
+        residual: (rows, k).
+        last: whether the residual that is left is not needed.
+    """
+    low, high = bounds
+    theta, delta = 0.5 * (high + low), 0.5 * (high - low)
+    rho = delta / theta
+    step = (inverse_diagonal / theta) * residual
+    residual = residual - times(step)
+    again = 1.0 / (2.0 * theta / delta - rho)
+    second = (again * rho) * step + (2.0 * again / delta) * (inverse_diagonal * residual)
+    if not last:
+        residual = residual - times(second)
+    return step + second, residual
 
 
 def _in_blocks(matrix: PETSc.Mat) -> PETSc.Mat:
@@ -121,20 +150,22 @@ def _in_blocks(matrix: PETSc.Mat) -> PETSc.Mat:
     return PETSc.Mat().createBAIJ(matrix.getSizes(), block, csr=csr, comm=matrix.comm)
 
 
-def _largest_eigenvalue(matrix: PETSc.Mat, scale: np.ndarray) -> float:
-    """Return an estimate of the largest eigenvalue of S A S from below, S = diag(scale)."""
-    comm = matrix.comm.tompi4py()
-    x, y = matrix.createVecs()
-    first = matrix.getOwnershipRange()[0]
+def largest_eigenvalue(comm: MPI.Comm, times: Columns, scale: np.ndarray) -> float:
+    """Return an estimate of the largest eigenvalue of S A S from below, S = diag(scale).
+
+    Args:
+        comm: the ranks that share the rows.
+        times: product of A with columns (rows, 1).
+        scale: of the owned rows.
+    """
+    first, size = comm.exscan(len(scale)) or 0, comm.allreduce(len(scale))
     v = np.modf(np.abs(np.sin(12.9898 * np.arange(first + 1.0, first + len(scale) + 1.0))) * 1e4)[0]
     v -= 0.5
     v /= np.sqrt(comm.allreduce(v @ v))
     before, beta = np.zeros_like(v), 0.0
     diagonal, beside = [], []
-    for _ in range(min(LANCZOS_ITERATIONS, matrix.getSize()[0])):
-        x.array = scale * v
-        matrix.mult(x, y)
-        w = scale * y.array_r - beta * before
+    for _ in range(min(LANCZOS_ITERATIONS, size)):
+        w = scale * times((scale * v)[:, None])[:, 0] - beta * before
         alpha = comm.allreduce(w @ v)
         w -= alpha * v
         beta = float(np.sqrt(comm.allreduce(w @ w)))
@@ -203,6 +234,10 @@ class Multigrid:
         whole = np.concatenate(comm.allgather(mine))
         self._first = coarse.getOwnershipRange()[0]
         self._coarse = np.linalg.pinv(0.5 * (whole + whole.T), hermitian=True)
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return A X."""
+        return self.levels[0].times(X)
 
     def cycle(self, B: np.ndarray, level: int = 0) -> np.ndarray:
         """Return an approximation of A^-1 B, by one V-cycle, symmetric in B."""
@@ -277,11 +312,21 @@ def with_rigid_motions(matrix: PETSc.Mat, points: np.ndarray) -> None:
     matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(places))
 
 
-# -- conjugate gradients for many right sides at once, preconditioned by algebraic multigrid -----
+# -- conjugate gradients for many right sides at once, preconditioned by multigrid -----------
+
+
+class Preconditioned(Protocol):
+    """A matrix with an approximate inverse, of the owned rows."""
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return A X (rows, k)."""
+
+    def cycle(self, B: np.ndarray) -> np.ndarray:
+        """Return an approximation of A^-1 B (rows, k), symmetric positive definite."""
 
 
 class BlockConjugateGradients:
-    """K^-1 of one design after another for blocks of right sides.
+    """K^-1 for blocks of right sides.
 
     O'Leary's block conjugate gradients, with directions made orthonormal and dependent ones left
     out. All right sides share one space, which takes fewer steps than each by itself.
@@ -289,10 +334,128 @@ class BlockConjugateGradients:
     Ji & Li, BIT 57 (2017) 379-403, doi:10.1007/s10543-016-0631-z.
 
     Attributes:
-        grid: the hierarchy.
+        grid: K and its approximate inverse.
         failed: the last solution did not converge.
         steps: of the last solution.
-        rate: its steps a digit.
+        digits: that its tolerance has asked for.
+    """
+
+    def __init__(self, grid: Preconditioned, comm: MPI.Comm, tolerance: float):
+        """Set up.
+
+        Args:
+            grid: see above.
+            comm: the ranks that share the rows.
+            tolerance: of the residual in the norm of the preconditioner, relative to the right
+                side's: about that of the solution in energy.
+        """
+        self.grid, self._comm, self.tolerance = grid, comm, tolerance
+        self.failed, self.steps, self.digits = False, 0, 1.0
+
+    def solve(
+        self,
+        right: np.ndarray,
+        guess: np.ndarray | None = None,
+        tolerance: float | None = None,
+        held: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the solution (n, k) of the owned rows, so many columns at a time (collective).
+
+        Args:
+            right: of that shape.
+            guess: (n, m) fields in whose space there may be something like it; or None.
+            tolerance: in place of the own one.
+            held: (k,) energies, twice, of boundary motions before the solutions relax them, N m:
+                the tolerance is of what is left of them then.
+        """
+        tolerance = tolerance or self.tolerance
+        out, self.failed, most = np.empty_like(right), False, 0
+        self.digits = -np.log10(tolerance)
+        for first in range(0, right.shape[1], RIGHT_SIDES_CHUNK):
+            part = slice(first, first + RIGHT_SIDES_CHUNK)
+            energies = None if held is None else held[part]
+            out[:, part] = self._solve(right[:, part], guess, tolerance, energies)
+            most = max(most, self.steps)
+        self.steps = most
+        return out
+
+    def _dot(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        part = left.T @ right
+        return part if self._comm.size == 1 else self._comm.allreduce(part)
+
+    def _lengths(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        part = np.einsum("nk,nk->k", left, right)
+        return part if self._comm.size == 1 else self._comm.allreduce(part)
+
+    def _solve(
+        self,
+        B: np.ndarray,
+        guess: np.ndarray | None,
+        tolerance: float,
+        held: np.ndarray | None,
+    ) -> np.ndarray:
+        grid = self.grid
+        R = np.array(B, order="F")
+        Z = grid.cycle(R)
+        own = self._lengths(R, Z)
+        X = np.zeros_like(R)
+
+        def goal() -> np.ndarray:
+            """Return the squared tolerance (k,) of the residual."""
+            if held is None:
+                return tolerance**2 * own
+            left = held - self._lengths(B, X)  # falls to that of the whole field, step by step
+            return np.clip(
+                tolerance**2 * left, SOLUTION_ROUNDING_ERROR**2 * own, tolerance**2 * own
+            )
+
+        if guess is not None:  # the best of their space, in energy
+            P = self._orthonormal(guess)
+            Q = grid.times(P)
+            both = self._dot(P, np.concatenate([Q, R], axis=1))
+            energy, along = np.split(both, [P.shape[1]], axis=1)
+            step = np.linalg.solve(0.5 * (energy + energy.T), along)
+            X += P @ step
+            R -= Q @ step
+            Z = grid.cycle(R)
+        P = self._orthonormal(Z)
+        self.steps = 0
+        while not (self._lengths(R, Z) <= goal()).all():  # not a number included
+            if self.steps == SOLVER_ITERATIONS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
+                self.failed = True
+                break
+            Q = grid.times(P)
+            both = self._dot(P, np.concatenate([Q, R], axis=1))
+            energy, along = np.split(both, [P.shape[1]], axis=1)
+            inverse = np.linalg.inv(0.5 * (energy + energy.T))
+            step = inverse @ along
+            X += P @ step
+            R -= Q @ step
+            Z = grid.cycle(R)
+            self.steps += 1
+            P = self._orthonormal(Z - P @ (inverse @ self._dot(Q, Z)))
+        shares = np.sqrt(goal()[own > 0.0] / own[own > 0.0])
+        self.digits = max(self.digits, -np.log10(shares.min(initial=1.0)))
+        return X
+
+    def _orthonormal(self, P: np.ndarray) -> np.ndarray:
+        """Return an orthonormal basis of the columns, dependent ones left out."""
+        gram = self._dot(P, P)
+        if not np.isfinite(gram).all():
+            return P[:, :0]
+        scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+        values, vectors = on_root(self._comm, np.linalg.eigh, gram / np.outer(scale, scale))
+        kept = values > INDEPENDENT_LENGTH_SHARE * values[-1]
+        return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))
+
+
+class AlgebraicSolver:
+    """K^-1 of one design after another by conjugate gradients with algebraic multigrid.
+
+    Attributes:
+        grid: the hierarchy.
+        failed: the last solution did not converge.
+        rate: steps a digit of the last solution.
     """
 
     def __init__(self, matrix: PETSc.Mat, tolerance: float):
@@ -300,16 +463,22 @@ class BlockConjugateGradients:
 
         Args:
             matrix: AIJ, symmetric positive definite, blocks of nodes.
-            tolerance: of the residual in the norm of the preconditioner, relative to the right
-                side's: about that of the solution in energy.
+            tolerance: see `BlockConjugateGradients`.
         """
-        self.tolerance = tolerance
         self.grid = Multigrid(matrix)
-        self._comm: MPI.Comm = matrix.comm.tompi4py()
-        self.failed, self.steps, self.rate = False, 0, 0.0
-        self._digits = 1.0  # of the residual that its tolerance has asked for
+        self._solver = BlockConjugateGradients(self.grid, matrix.comm.tompi4py(), tolerance)
+        self.rate = 0.0
         self._first_rate = 0.0  # right after the hierarchy was made
         self._fresh = True
+
+    @property
+    def failed(self) -> bool:
+        return self._solver.failed
+
+    @property
+    def steps(self) -> int:
+        """Of the last solution."""
+        return self._solver.steps
 
     @property
     def progress(self) -> tuple[float, float]:
@@ -341,110 +510,22 @@ class BlockConjugateGradients:
         tolerance: float | None = None,
         held: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the solution (n,) or (n, k) of the owned rows (collective).
-
-        Args:
-            right: of that shape.
-            guess: (n, m) fields in whose space there may be something like it; or None.
-            tolerance: in place of the own one.
-            held: (k,) energies, twice, of boundary motions before the solutions relax them, N m:
-                the tolerance is of what is left of them then.
-        """
+        """Return the solution (n,) or (n, k), see `BlockConjugateGradients` (collective)."""
         if right.ndim == 1:
             return self.solve(right[:, None], guess, tolerance)[:, 0]
-        tolerance = tolerance or self.tolerance
-        out = self._by_parts(right, guess, tolerance, held)
+        out = self._solver.solve(right, guess, tolerance, held)
         if self.failed and not self.grid.gradual:
             self._make(True)
-            out = self._by_parts(right, guess, tolerance, held)
-        self.rate = self.steps / self._digits
+            out = self._solver.solve(right, guess, tolerance, held)
+        self.rate = self.steps / self._solver.digits
         if self._fresh and guess is None:
             self._first_rate, self._fresh = self.rate, False
         return out
 
-    def _by_parts(
-        self,
-        right: np.ndarray,
-        guess: np.ndarray | None,
-        tolerance: float,
-        held: np.ndarray | None,
-    ) -> np.ndarray:
-        """Return the solution (n, k), so many columns at a time."""
-        out, self.failed, most = np.empty_like(right), False, 0
-        self._digits = -np.log10(tolerance)
-        for first in range(0, right.shape[1], RIGHT_SIDES_CHUNK):
-            part = slice(first, first + RIGHT_SIDES_CHUNK)
-            energies = None if held is None else held[part]
-            out[:, part] = self._solve(right[:, part], guess, tolerance, energies)
-            most = max(most, self.steps)
-        self.steps = most
-        return out
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return K X of the owned rows (rows, k)."""
+        return self.grid.times(X)
 
-    def _dot(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        part = left.T @ right
-        return part if self._comm.size == 1 else self._comm.allreduce(part)
-
-    def _lengths(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        part = np.einsum("nk,nk->k", left, right)
-        return part if self._comm.size == 1 else self._comm.allreduce(part)
-
-    def _solve(
-        self,
-        B: np.ndarray,
-        guess: np.ndarray | None,
-        tolerance: float,
-        held: np.ndarray | None,
-    ) -> np.ndarray:
-        grid, fine = self.grid, self.grid.levels[0]
-        R = np.array(B, order="F")
-        Z = grid.cycle(R)
-        own = self._lengths(R, Z)
-        X = np.zeros_like(R)
-
-        def goal() -> np.ndarray:
-            """Return the squared tolerance (k,) of the residual."""
-            if held is None:
-                return tolerance**2 * own
-            left = held - self._lengths(B, X)  # falls to that of the whole field, step by step
-            return np.clip(
-                tolerance**2 * left, SOLUTION_ROUNDING_ERROR**2 * own, tolerance**2 * own
-            )
-
-        if guess is not None:  # the best of their space, in energy
-            P = self._orthonormal(guess)
-            Q = fine.times(P)
-            both = self._dot(P, np.concatenate([Q, R], axis=1))
-            energy, along = np.split(both, [P.shape[1]], axis=1)
-            step = np.linalg.solve(0.5 * (energy + energy.T), along)
-            X += P @ step
-            R -= Q @ step
-            Z = grid.cycle(R)
-        P = self._orthonormal(Z)
-        self.steps = 0
-        while not (self._lengths(R, Z) <= goal()).all():  # not a number included
-            if self.steps == SOLVER_ITERATIONS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
-                self.failed = True
-                break
-            Q = fine.times(P)
-            both = self._dot(P, np.concatenate([Q, R], axis=1))
-            energy, along = np.split(both, [P.shape[1]], axis=1)
-            inverse = np.linalg.inv(0.5 * (energy + energy.T))
-            step = inverse @ along
-            X += P @ step
-            R -= Q @ step
-            Z = grid.cycle(R)
-            self.steps += 1
-            P = self._orthonormal(Z - P @ (inverse @ self._dot(Q, Z)))
-        shares = np.sqrt(goal()[own > 0.0] / own[own > 0.0])
-        self._digits = max(self._digits, -np.log10(shares.min(initial=1.0)))
-        return X
-
-    def _orthonormal(self, P: np.ndarray) -> np.ndarray:
-        """Return an orthonormal basis of the columns, dependent ones left out."""
-        gram = self._dot(P, P)
-        if not np.isfinite(gram).all():
-            return P[:, :0]
-        scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-        values, vectors = on_root(self._comm, np.linalg.eigh, gram / np.outer(scale, scale))
-        kept = values > INDEPENDENT_LENGTH_SHARE * values[-1]
-        return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))
+    def cycle(self, B: np.ndarray) -> np.ndarray:
+        """Return an approximation of K^-1 B of the owned rows (rows, k)."""
+        return self.grid.cycle(B)

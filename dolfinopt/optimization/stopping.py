@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import nnls
 
 from dolfinopt.optimization.measured import (
     CUT_OFF_MOVE_SHARE,
@@ -167,6 +166,8 @@ def _multipliers(
         return np.zeros(m)
     root = np.sqrt(values[kept])
     A, b = root[:, None] * vectors[:, kept].T, (vectors[:, kept].T @ (right / scale)) / root
+    from scipy.optimize import nnls  # takes as long to import as NumPy
+
     return np.asarray(nnls(A, b)[0] / scale)
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import CubicSpline, make_interp_spline
 
 from dolfinopt.errors import InputError
 from dolfinopt.paths.time_laws import SAME, Law
@@ -133,6 +132,8 @@ def curve_in_time(table: Table) -> Curve:
     first and the last instant of each move, which makes the interpolation of n rows by degree 5
     definite. Rows in succession that are equal are a stop: exactly there, without speed.
     """
+    from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
+
     assert table.t is not None
     t, rows = table.t, table.rows
     rest = [(1, np.zeros(rows.shape[1])), (2, np.zeros(rows.shape[1]))]
@@ -218,6 +219,8 @@ def curve_by_chord(table: Table, measured: int | None = None) -> Curve:
             f"{table.file}: line {table.lines[same[0] + 1]}: the same values as in the row before; "
             f"leave the row out, or add a column {TIME} to stay there for a while"
         )
+    from scipy.interpolate import CubicSpline  # takes as long to import as NumPy
+
     length = np.append(0.0, np.cumsum(chords))
     spline = CubicSpline(length / length[-1], table.rows, bc_type="natural")
     derivatives = (spline, spline.derivative(1), spline.derivative(2))

@@ -169,7 +169,7 @@ class Operators:
 def interior_operators(arm: ElasticArm) -> Operators:
     """Return those of the interior of an arm whose systems are solved iteratively."""
     arm.factorise()
-    stiffness, cycle = arm.substructure.interior.multigrid(arm.K.matrix)
+    stiffness, cycle = arm.substructure.interior.multigrid(arm.K)
     return Operators(
         arm.num_interior,
         stiffness,

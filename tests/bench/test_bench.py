@@ -321,6 +321,16 @@ def test_goals_of_links():
     assert all(map(math.isnan, measures("solid", solid=small).values()))
 
 
+def test_goals_of_statics():
+    """Of the largest link with so many dofs; nothing where the other program is not installed."""
+    sizes = (20_000, 1.0), (75_000, 2.0), (168_000, 6.0), (500_000, 9.0)
+    ours = [(solid.STATIC, design, n, 1.0, 1.0, "") for n, _ in sizes for design in solid.DESIGNS]
+    theirs = [(solid.PYMOTO, d, n, s, 1.0, "") for n, s in sizes for d in solid.DESIGNS]
+    for rows, expected in ((ours + theirs, [0.5, 1.0 / 6.0]), (ours, [math.nan, math.nan])):
+        found = measures("statics", statics=solid.STATICS.frame(rows))
+        assert [*found.values()] == pytest.approx(expected, nan_ok=True)
+
+
 def test_goals_of_the_optimiser():
     kept, left = 5e-4, 2e-3
     rows = [

@@ -1,5 +1,6 @@
 """What the diagrams measure is right: motions, elements, other programs, random cases."""
 
+import math
 from functools import partial
 from typing import get_args
 
@@ -91,18 +92,25 @@ def test_elements_that_do_not_lock():
     assert error["linear"] < -0.03  # they lock
 
 
-@pytest.mark.parametrize("make", [iterations.plain_statics, programs.pymoto_iteration])
-def test_static_iterations(make):
+@pytest.mark.parametrize(
+    ("make", "cells"),
+    [
+        (iterations.plain_statics, (100, 12)),
+        (programs.pymoto_iteration, (100, 12)),
+        (programs.pymoto_iteration, (100, 12, 4)),
+    ],
+)
+def test_static_iterations(make, cells):
     """Compliance of a slender uniform arm by beam theory; its slope by differences."""
-    iterate = make(SCENE, (100, 12))
+    iterate = make(SCENE, cells)
     if iterate is None:
         pytest.skip("not installed")
-    x = np.full(1200, 0.5)
+    x = np.full(math.prod(cells), 0.5)
     compliance, slope = iterate(x)
     # Q1 cells twice as long as high are up to 3 % too stiff; the floor adds 1e-5.
     beam = 1.0 / (3 * 70e9 * 0.5**3 * 0.01 * 0.06**3 / 12)
     assert compliance == pytest.approx(beam, rel=0.04)
-    d = np.random.default_rng(3).normal(size=1200)
+    d = np.random.default_rng(3).normal(size=len(x))
     central = (iterate(x + 1e-4 * d)[0] - iterate(x - 1e-4 * d)[0]) / 2e-4
     assert slope @ d == pytest.approx(central, rel=1e-4)
 
@@ -113,6 +121,8 @@ def test_both_links():
     assert dofs == 3 * 3 * 4 * 3 + 6 and solver == "LAPACK's band" and len(seconds) == 2
     dofs, _, seconds = solid.plain_link(MPI.COMM_SELF, SCENE, (4, 3, 2))
     assert dofs == 3 * 5 * 4 * 3 and len(seconds) == 1
+    dofs, solver, seconds = solid.static_link(MPI.COMM_SELF, SCENE, (4, 3, 2))
+    assert dofs == 3 * 3 * 4 * 3 + 6 and solver == "LAPACK's band" and len(seconds) == 2
 
 
 def test_plain_link_bends_like_a_beam():

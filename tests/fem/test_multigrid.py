@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 from solids import elastic_link, link_mesh, solid_arm, solid_scene
@@ -11,8 +12,10 @@ from solids import elastic_link, link_mesh, solid_arm, solid_scene
 from dolfinopt.arms.arm import Arm, field_tolerance
 from dolfinopt.fem import interior, multigrid
 from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
-from dolfinopt.fem.multigrid import Level, Multigrid
+from dolfinopt.fem.box_multigrid import BoxMultigrid, BoxSolver
+from dolfinopt.fem.multigrid import Level
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import eigenproblem
 from dolfinopt.responses.sensitivity import exact_gradient
 
@@ -27,9 +30,21 @@ def direct() -> Arm:
     return arm
 
 
-@pytest.fixture
-def iterative(monkeypatch: pytest.MonkeyPatch) -> Arm:
+@pytest.fixture(params=["aggregates", "grids"])
+def iterative(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Arm:
+    if request.param == "aggregates":
+        return by_aggregates(monkeypatch)
     monkeypatch.setattr(interior, "WIDEST", 0)
+    arm = solid_arm(cells=CELLS, stiffening=True)
+    assert arm.substructure.interior.is_iterative
+    assert isinstance(arm.substructure.interior.iterative, BoxSolver)
+    return arm
+
+
+def by_aggregates(monkeypatch: pytest.MonkeyPatch) -> Arm:
+    """Return an arm that is solved as one whose cells fill no box."""
+    monkeypatch.setattr(interior, "WIDEST", 0)
+    monkeypatch.setattr(interior.InteriorSystem, "_boxed", None)
     arm = solid_arm(cells=CELLS, stiffening=True)
     assert arm.substructure.interior.is_iterative
     return arm
@@ -61,26 +76,26 @@ def test_as_the_direct_solution(direct, iterative, void):
     gradients = [exact_gradient(state, by) for state in states]
     largest = COMM.allreduce(np.abs(gradients[0]).max(initial=0.0), MPI.MAX)
     assert np.abs(gradients[0] - gradients[1]).max(initial=0.0) < 5e-6 * largest
-    assert iterative.substructure.interior._iterative.steps < 70
+    assert iterative.substructure.interior.iterative.steps < 70
 
 
 @pytest.mark.serial
 def test_warm_start(iterative):
-    """A design nearby takes fewer steps, and the hierarchy is not made anew."""
+    """A design nearby takes fewer steps, and no aggregates are made anew."""
     solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
     iterative.state(x).elastic.constraint_modes()
-    cold = solver._iterative.steps
+    cold = solver.iterative.steps
     place = iterative.mesh.centroid
     change = 0.005 * np.sin(200.0 * place[:, 0]) * (1.0 - iterative.mesh.passive)
     nearby = iterative.state(np.clip(x - np.abs(change), 0.0, 1.0))
     warm_modes = nearby.elastic.constraint_modes()
-    warm = solver._iterative.steps
+    warm = solver.iterative.steps
     assert warm < 0.8 * cold
-    assert solver._iterative.grid.setups == 1
+    assert isinstance(solver.iterative, BoxSolver) or solver.iterative.grid.setups == 1
     solver._solutions.clear()
     nearby.elastic.__dict__.pop("_constraint_modes")
     cold_modes = nearby.elastic.constraint_modes()
-    assert solver._iterative.steps > warm
+    assert solver.iterative.steps > warm
     assert np.allclose(warm_modes.stiffness, cold_modes.stiffness, rtol=1e-9, atol=1e-3)
 
 
@@ -99,22 +114,65 @@ def test_contrast(direct, iterative):
             for arm in (direct, iterative)
         )
         assert np.abs(found / right - 1.0).diagonal().max() < 1e-9
-        steps.append(solver._iterative.steps)
+        steps.append(solver.iterative.steps)
     assert max(steps) < 1.3 * steps[0]
 
 
 @pytest.mark.serial
-def test_smaller_aggregates(iterative, monkeypatch):
+@pytest.mark.parametrize("cells", [(7, 4, 5), (9, 3, 2), (8, 2, 2)])
+def test_grids_of_a_box(cells):
+    """All levels are P' K P of the assembled matrix, odd counts, too; the cycle is symmetric."""
+    scene = solid_scene(cells=cells)
+    static = scene.objective.model_copy(update={"kind": "static"})
+    arm = Arm(scene.model_copy(update={"objective": static}), 0, MPI.COMM_SELF, Profile())
+    substructure, rng = arm.substructure, np.random.default_rng(2)
+    young = 70e9 * 10.0 ** rng.uniform(-4.0, 0.0, arm.mesh.num_cells)
+    elastic = substructure.at(young, young)
+    extended = substructure.extended
+    for system, K in (
+        (substructure.interior, elastic.K),
+        (extended, substructure.extend(elastic.K)),
+    ):
+        solver = system._solver_of(system._box)
+        solver.update(young)
+        indptr, columns, values = system.stiffness(K).getValuesCSR()
+        order = np.argsort(solver._place)  # the multigrid's rows
+        A = sp.csr_matrix((values, columns, indptr)).toarray()[np.ix_(order, order)]
+        assert solver._grid.times(np.eye(len(A))) == pytest.approx(A, abs=1e-14 * np.abs(A).max())
+        P = np.eye(len(A))
+        for grid, step, _ in solver._grid.grids:
+            P = P @ step
+            coarse = P.T @ A @ P
+            found = grid.times(np.eye(grid.rows))
+            assert found == pytest.approx(coarse, abs=1e-14 * np.abs(coarse).max())
+        V = solver._grid.cycle(np.eye(len(A)))
+        assert np.abs(V - V.T).max() < 1e-12 * np.abs(V).max()
+        assert np.linalg.eigvalsh(0.5 * (V + V.T))[0] > 0.0
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("shape", "element"), [("hexahedron", "linear"), ("tetrahedron", "quadratic")]
+)
+def test_only_grids_are_boxes(shape, element):
+    box = elastic_link(element, link_mesh(shape, (4, 3, 2))).substructure.interior._box
+    assert (box is None) == (shape == "tetrahedron")
+    assert box is None or box.shape == (4, 2, 3)
+
+
+@pytest.mark.serial
+def test_smaller_aggregates(monkeypatch):
     """Where steps are many, the next design's hierarchy coarsens more gradually and takes fewer."""
+    iterative = by_aggregates(monkeypatch)
     solver, x = iterative.substructure.interior, hollow(iterative, 0.1)
     iterative.state(x).elastic.constraint_modes()
-    cold = solver._iterative.steps
+    cold = solver.iterative.steps
     monkeypatch.setattr(multigrid, "STEPS_A_DIGIT_LIMIT", 0.0)
     solver._solutions.clear()
     iterative.state(0.99 * x).elastic.constraint_modes()
-    grid = solver._iterative.grid
+    grid = solver.iterative.grid
     assert grid.gradual and grid.setups == 2
-    assert solver._iterative.steps < 0.8 * cold
+    assert solver.iterative.steps < 0.8 * cold
 
 
 @pytest.mark.serial
@@ -135,13 +193,13 @@ def test_tolerance_of_fields():
 @pytest.mark.parametrize(("method", "count"), [("craig-bampton", 9), ("modal", 3)])
 def test_gradient_of_modes_without_a_factor(monkeypatch, method, count):
     """As the direct one, in cycles of all modes at once: one after the other they take 5 times."""
-    cycles, cycle = [], Multigrid.cycle
+    cycles, cycle = [], BoxMultigrid.cycle
 
-    def counted(self: Multigrid, B: np.ndarray, level: int = 0) -> np.ndarray:
+    def counted(self: BoxMultigrid, B: np.ndarray, level: int = 0) -> np.ndarray:
         cycles.append(B.shape[1] * (level == 0))
         return cycle(self, B, level)
 
-    monkeypatch.setattr(Multigrid, "cycle", counted)
+    monkeypatch.setattr(BoxMultigrid, "cycle", counted)
     gradients, bodies = [], []
     for width in (10**9, 0):
         monkeypatch.setattr(interior, "WIDEST", width)
