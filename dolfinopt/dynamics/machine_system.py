@@ -60,9 +60,10 @@ class DenseLinearisation:
         return rows.reshape(len(q), len(wanted))
 
     def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradient of sum_n rows_n . residual_n by q, qd, qdd, each (n, S)."""
+        """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
         flat = self.matrix.reshape(*self.matrix.shape[:2], -1)
-        found = (rows[:, None] @ flat).reshape(len(rows), 3, -1)[:, :, self.keep]
+        found = rows.reshape(len(flat), -1, rows.shape[1]) @ flat
+        found = found.reshape(len(rows), 3, -1)[:, :, self.keep]
         return found[:, 0], found[:, 1], found[:, 2]
 
     def _part(self, rows: np.ndarray) -> np.ndarray:

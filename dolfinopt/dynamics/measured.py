@@ -50,11 +50,17 @@ FACTORS_BYTES = 256e6  # of the factors of steps that are solved together
 SLOW_ANGLES = (40.0, 120.0, np.inf)
 # Slowest coordinates with dense blocks as long as not all must be: on short steps nearly all would.
 DENSE_COORDINATES_LIMIT = 24
+# The same of matrices whose tangent is held over a step, which cost a tenth.
+HELD_COORDINATES_LIMIT = 48
 EXACT_COORDINATES_LIMIT = 12  # up to so many the exact matrix costs less than more iterations
 NEWTON_ROUNDING_ERROR = 1e-9  # relative steps and errors below it that do not fall are rounding
 # Step below which a poor contraction is blamed on the matrix, no more on the nonlinearity.
 NEWTON_SETTLED_STEP = 0.01
 INVERTED_MATRICES_CHUNK = 512  # matrices at a time: they stay in the processor's cache
+# Coordinates up to which complex matrices are inverted by a sweep over all steps, beyond one by one
+# in LAPACK: of 8 coordinates 1.4 to 1.8 microseconds a matrix either way, of 24 30 and 12, of 48
+# 250 and 59.
+SWEPT_COORDINATES_LIMIT = 8
 
 # -- radau: grids ----------------------------------------------------------------------------
 
@@ -151,8 +157,10 @@ ALPHA_AIM_SHARE = 0.6  # of the tolerance, aimed at by a new grid
 # -- adjoint ---------------------------------------------------------------------------------
 
 # Of the multipliers, that a correction may have left: their error is a tenth of it or less.
-ADJOINT_CORRECTION_SHARE = 1e-8
-ADJOINT_CONTRACTION_LIMIT = 0.3  # above it more coordinates are treated densely
+ADJOINT_CORRECTION_SHARE = 1e-9
+# Steps after which more coordinates are treated densely: of eight arms in space 10, and a matrix
+# that is dense in all of their 48 coordinates costs as much as 50.
+ADJOINT_CORRECTIONS_LIMIT = 20
 
 # -- build, simulation -----------------------------------------------------------------------
 

@@ -32,10 +32,12 @@ from dolfinopt.dynamics.measured import (
     DENSE_COORDINATES_LIMIT,
     EXACT_COORDINATES_LIMIT,
     FACTORS_BYTES,
+    HELD_COORDINATES_LIMIT,
     INVERTED_MATRICES_CHUNK,
     NEWTON_ROUNDING_ERROR,
     NEWTON_SETTLED_STEP,
     SLOW_ANGLES,
+    SWEPT_COORDINATES_LIMIT,
 )
 from dolfinopt.dynamics.system import Linearisation, State
 
@@ -62,22 +64,22 @@ def limits_for(stages: Stages) -> tuple[float, ...]:
 
 
 def next_slow_coordinates(
-    stages: Stages, limits: tuple[float, ...], more_than: int
+    stages: Stages, limits: tuple[float, ...], more_than: int, most: int = DENSE_COORDINATES_LIMIT
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return the first larger set of slow coordinates, ascending, and the limits beyond.
 
-    A coordinate is slow up to an angle w h in a median step; the slowest one always is. No limits
-    are left when all are.
+    A coordinate is slow up to an angle w h in a median step; the slowest one always is, and as long
+    as not all are, `most` of them. No limits are left when all are.
     """
     angles = stages.angles
     if not stages.preconditioner.guided:
         return np.arange(len(angles)), ()
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))
-    if limit < np.inf and len(slow) > DENSE_COORDINATES_LIMIT:
-        slow = np.sort(np.argsort(angles, kind="stable")[:DENSE_COORDINATES_LIMIT])
+    if limit < np.inf and len(slow) > most:
+        slow = np.sort(np.argsort(angles, kind="stable")[:most])
     if len(slow) <= more_than and beyond:
-        return next_slow_coordinates(stages, tuple(beyond), more_than)
+        return next_slow_coordinates(stages, tuple(beyond), more_than, most)
     return slow, tuple(beyond) if len(slow) < len(angles) else ()
 
 
@@ -476,7 +478,8 @@ class _Run:
     ) -> None:
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
         self.simplified = simplified and stages.preconditioner.guided
-        self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0)
+        most = HELD_COORDINATES_LIMIT if self.simplified else DENSE_COORDINATES_LIMIT
+        self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0, most)
         self.at = _point(stages, state, a)
         self.before, self.norm_before = np.inf, self.at.norm[0]
         self.converged, self.rate, self.iterations = False, 0.0, 0
@@ -705,6 +708,27 @@ class SimplifiedNewtonMatrix(NewtonMatrix):
         step = -self._applied(residual)
         return step, *stage_values(stages, q, qd, step)
 
+    def _slow_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        count, _, size = by_a.shape
+        stages, K = self.stages, self.jacobian[:, :, :size]
+        answered = self._applied_transposed(by_a)
+        late = stages.h[:, None] * (stages.method.c[:, None] * answered).sum(axis=1)
+        direct = by_y.reshape(count, -1)
+        direct = direct - (answered.sum(axis=1)[:, None] @ self.jacobian[:, :, : 2 * size])[:, 0]
+        direct[:, size:] -= (late[:, None] @ K)[:, 0]
+        direct[-1] += after.ravel() @ self.transfer[-1]
+        p = np.concatenate([bidiagonal_solve(self.band, direct, 1)[1:], after.reshape(1, -1)])
+        return -self._applied_transposed(by_a + _end_gradient(stages, p))
+
+    def _applied_transposed(self, by_a: np.ndarray) -> np.ndarray:
+        """Return the inverted blocks, transposed, times (n, s, S)."""
+        count, s, size = by_a.shape
+        m = len(self.into)
+        by_stage = np.ascontiguousarray(by_a.swapaxes(0, 1)).reshape(s, -1)
+        both = ((self.out[:, :m] - 1j * self.out[:, m:]).T @ by_stage).reshape(m, count, 1, size)
+        found = (both @ self.parts).reshape(m, -1)
+        return (self.into.T @ found).real.reshape(s, count, size).swapaxes(0, 1)
+
     def _applied(self, residual: np.ndarray) -> np.ndarray:
         """Return the inverted blocks times a residual (n, s, S)."""
         count, s, size = residual.shape
@@ -755,23 +779,27 @@ def _eigenvectors(method: Collocation) -> tuple[np.ndarray, np.ndarray]:
 
 def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: bool) -> np.ndarray:
     """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of the derivative by q, qd, qdd."""
-    # Without pivots where M and K are definite, which takes a third of the time.
+    # Few coordinates are swept without pivots where M and K are definite, all steps at once.
     values = np.linalg.eigvals(method.A)
     values = values[values.imag >= -1e-12]
     count, size = jacobian.shape[:2]
     parts = np.empty((len(values), count, size, size), dtype=complex)
-    K, D, M = np.split(jacobian.transpose(1, 2, 0), 3, axis=1)
-    for first in range(0, count, INVERTED_MATRICES_CHUNK):
-        part = slice(first, first + INVERTED_MATRICES_CHUNK)
-        hl = values[:, None] * h[part]
-        each_sum = M[:, :, None, part] + hl * (D[:, :, None, part] + hl * K[:, :, None, part])
-        if definite:
-            parts[:, part] = _inverted(each_sum).transpose(2, 3, 0, 1)
-            continue
+    if definite and size <= SWEPT_COORDINATES_LIMIT:
+        last = np.ascontiguousarray(jacobian.transpose(1, 2, 0))
+        K, D, M = np.split(last[:, :, None], 3, axis=1)
+        for first in range(0, count, INVERTED_MATRICES_CHUNK):
+            part = np.s_[..., first : first + INVERTED_MATRICES_CHUNK]
+            hl = values[:, None] * h[part]
+            swept = _inverted(M[part] + hl * (D[part] + hl * K[part]))
+            parts[:, part[1]] = swept.transpose(2, 3, 0, 1)
+        return parts
+    K, D, M = np.split(jacobian, 3, axis=2)
+    for own, value in zip(parts, values, strict=True):
+        hl = (value * h)[:, None, None]
         try:
-            parts[:, part] = np.linalg.inv(each_sum.transpose(2, 3, 0, 1))
+            own[:] = np.linalg.inv(M + hl * (D + hl * K))
         except np.linalg.LinAlgError:
-            parts[:, part] = np.nan  # refused by whoever asked
+            own[:] = np.nan  # refused by whoever asked
     return parts
 
 

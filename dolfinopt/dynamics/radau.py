@@ -50,6 +50,7 @@ from dolfinopt.dynamics.measured import (
     FIRST_GRID_GROWTH_LIMIT,
     FIRST_GRID_ITERATIONS_LIMIT,
     FIRST_REFINEMENT_RATIO,
+    HELD_COORDINATES_LIMIT,
     LATER_REFINEMENT_RATIO,
     LEAST_STEP_SHARE,
     LONGEST_WINDOW_STEPS,
@@ -426,7 +427,7 @@ def estimated_errors(
     a = values @ a
     q, qd = stage_values(richer, *begin, a)
     residual = residual_at(richer, q, qd, a)
-    slow, _ = next_slow_coordinates(richer, limits, 0)
+    slow, _ = next_slow_coordinates(richer, limits, 0, HELD_COORDINATES_LIMIT)
     error, sure = np.full(richer.runs, np.inf), np.zeros(richer.runs, dtype=bool)
     if richer.preconditioner.guided:
         matrix = _simplified(richer, begin, a, slow)
