@@ -32,6 +32,8 @@ VIBRATION_ROUNDING_ERROR = 1e-14  # of the stability function R, growing with th
 
 # -- elastic_system, machine_system ----------------------------------------------------------
 
+# Contraction that keeps the stiffness found at first: of spatial_arm.toml it is 1e-5.
+EQUILIBRIUM_KEPT_CONTRACTION = 1e-3
 EQUILIBRIUM_ROUNDING_ERROR = 1e-14  # relative step at t = 0 below which nothing changes
 MACHINE_EQUILIBRIUM_ROUNDING_ERROR = 1e-13  # the same of machines, beside the coordinates
 # A relative step below it that is not half of the one before is rounding of an ill-conditioned

@@ -378,6 +378,8 @@ class Tuning:
         limits: angles w h up to which coordinates are slow, tried in turn.
         least_rate: contraction that is believed when the error left is foretold.
         keep: least contraction that keeps a simplified matrix, and one that follows the stages.
+        keep_mixed: the same as long as steps are mixed, see `_Mixed`, of a matrix that is dense in
+            more than `DENSE_COORDINATES_LIMIT` coordinates and costs as much as many steps.
         near: of a matrix made within this distance of the solution, a new one would be no better:
         keep_near: it is kept with this contraction.
         shortest: of a damped step, as a share of Newton's; then it has failed.
@@ -388,6 +390,7 @@ class Tuning:
     limits: tuple[float, ...] = SLOW_ANGLES
     least_rate: float = 0.01
     keep: tuple[float, float] = (0.15, 0.3)  # half of it, or twice, take as long
+    keep_mixed: float = 0.7
     near: float = 0.0
     keep_near: float = 0.0
     shortest: float = 1.0 / 64.0
@@ -464,6 +467,37 @@ def newton(
     return Iterate(run.at.a, *found)
 
 
+class _Mixed:
+    """Steps of one matrix, mixed so that they leave least: Anderson's acceleration.
+
+    Source: Walker & Ni (2011), doi:10.1137/10078356X, in the norm of the changes of q.
+
+    Attributes:
+        serves: whether all mixed steps have lowered the residual.
+    """
+
+    def __init__(self) -> None:
+        self.serves = True
+        self._last: tuple[np.ndarray, ...] = ()  # a, its step, and the change of q
+        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []  # changes of these, orthonormal
+
+    def step(self, a: np.ndarray, step: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """Return the mixed step from an iterate a, its step and change of q, each (n, s, N)."""
+        if self._last:
+            old_a, old_step, old_shift = self._last
+            lost, moved = shift - old_shift, a - old_a + step - old_step
+            for other, other_moved in self._pairs:
+                share = np.vdot(other, lost)
+                lost, moved = lost - share * other, moved - share * other_moved
+            size = np.linalg.norm(lost)
+            if size > 0.0:
+                self._pairs.append((lost / size, moved / size))
+        self._last = a, step, shift
+        for lost, moved in self._pairs:
+            step = step - np.vdot(lost, shift) * moved
+        return step
+
+
 class _Run:
     """Newton's method at work on one run of steps."""
 
@@ -477,9 +511,13 @@ class _Run:
         simplified: bool,
     ) -> None:
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
-        self.simplified = simplified and stages.preconditioner.guided
+        # Of few coordinates the exact matrix costs less than the iterations that it saves, if it is
+        # made near the solution.
+        few = a.shape[2] <= EXACT_COORDINATES_LIMIT and bool(a.any())
+        self.simplified = simplified and stages.preconditioner.guided and not few
         most = HELD_COORDINATES_LIMIT if self.simplified else DENSE_COORDINATES_LIMIT
-        self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0, most)
+        limits = tuning.limits[-1:] if few else tuning.limits
+        self.slow, self.limits = next_slow_coordinates(stages, limits, 0, most)
         self.at = _point(stages, state, a)
         self.before, self.norm_before = np.inf, self.at.norm[0]
         self.converged, self.rate, self.iterations = False, 0.0, 0
@@ -488,8 +526,9 @@ class _Run:
         """Iterate with one matrix; return whether it is worth while to go on with another."""
         exact = len(self.slow) == self.at.a.shape[2] and not self.simplified
         matrix, rest = self._matrix(), np.zeros((2, self.at.a.shape[2]))
-        keep = self.tuning.keep[0 if self.simplified else 1]
-        self.rate, age = 0.0, 0
+        least = self.tuning.keep[0 if self.simplified else 1]
+        many = len(self.slow) > DENSE_COORDINATES_LIMIT
+        self.rate, age, mixed = 0.0, 0, _Mixed()
         while True:
             self.iterations += 1
             spend(float(self.stages.length))
@@ -507,8 +546,13 @@ class _Run:
                 self.at = replace(self.at, a=self.at.a + step)
                 self.converged = True
                 return False
-            poor = age > 0 and size > keep * self.before
-            if poor or not np.isfinite(size) or not self._damped(step):
+            keep = self.tuning.keep_mixed if many and mixed.serves else least
+            if (age > 0 and size > keep * self.before) or not np.isfinite(size):
+                return self._after_failure(size, age, exact)
+            better = mixed.step(self.at.a, step, shift) if mixed.serves else None
+            if better is not None and age > 0:
+                mixed.serves = self._damped(better, 1.0)
+            if (age == 0 or not mixed.serves) and not self._damped(step):
                 return self._after_failure(size, age, exact)
             self.before, age = size, age + 1
 
@@ -518,10 +562,10 @@ class _Run:
             return simplified_newton_matrix(self.stages, begin, self.at.a, self.slow)
         return factorise(self.stages, self.at.q, self.at.qd, self.at.a, self.slow)
 
-    def _damped(self, step: np.ndarray) -> bool:
+    def _damped(self, step: np.ndarray, shortest: float | None = None) -> bool:
         """Take the longest step that lowers the residual; return whether there is one."""
         length = 1.0
-        while length >= self.tuning.shortest:
+        while length >= (self.tuning.shortest if shortest is None else shortest):
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
                 new = _point(self.stages, self.state, self.at.a + length * step)
             if new.norm[0] <= (1.0 - 0.1 * length) * self.at.norm[0]:
