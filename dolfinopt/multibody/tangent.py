@@ -24,6 +24,7 @@ from dolfinopt.multibody.inverse_dynamics import (
     outward_pass,
 )
 from dolfinopt.multibody.kinematics import Interface
+from dolfinopt.multibody.measured import DERIVATIVES_BYTES, LEAST_INSTANTS
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
@@ -41,7 +42,8 @@ class BodyTangent:
         kept: (k,) those of its coordinates that have a column.
         K, D: (n, q, k).
         M: (n, q, k), or (q, k) of a body whose mass is the same in every shape.
-        factors: pairs left_f (n, q, r) and right_f (n, r, 3 S), a load or a motion each.
+        factors: pairs left_f (n, q, r) and right_f (n, r, 3 S), a load or a motion each; of fewer
+            rows than those of all right_f one, their sum, with no left_f.
     """
 
     rows: slice
@@ -50,13 +52,15 @@ class BodyTangent:
     K: np.ndarray
     D: np.ndarray
     M: np.ndarray
-    factors: tuple[tuple[np.ndarray, np.ndarray], ...]
+    factors: tuple[tuple[np.ndarray | None, np.ndarray], ...]
 
     def at(self, part: slice) -> BodyTangent:
         """Return it at some of the instants."""
         M = self.M if self.M.ndim == 2 else self.M[part]
-        factors = tuple((left[part], right[part]) for left, right in self.factors)
-        return replace(self, K=self.K[part], D=self.D[part], M=M, factors=factors)
+        pairs = (
+            (None if left is None else left[part], right[part]) for left, right in self.factors
+        )
+        return replace(self, K=self.K[part], D=self.D[part], M=M, factors=tuple(pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +95,11 @@ class Tangent:
             if not part.factors:
                 rows[:] = 0.0
             for k, (left, right) in enumerate(part.factors):
+                own = right[:, kept] if left is None else left[:, kept] @ right
                 if k == 0:
-                    np.matmul(left[:, kept], right, out=rows)
+                    rows[:] = own
                 else:
-                    rows += left[:, kept] @ right
+                    rows += own
             blocks = (part.K[:, kept], part.D[:, kept], part.M[..., kept, :])
             for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
                 rows[:, :, columns] += block
@@ -118,7 +123,7 @@ class Tangent:
             e, ed, edd = (change[:, columns] for columns in _columns(part.columns, self.size))
             rows = part.K[:, own] @ e
             for left, right in part.factors:
-                rows += left[:, own] @ (right @ change)
+                rows += right[:, own] @ change if left is None else left[:, own] @ (right @ change)
             rows += part.D[:, own] @ ed
             rows += part.M[..., own, :] @ edd
             out.append(rows)
@@ -136,7 +141,7 @@ class Tangent:
         for part in self.bodies:
             y = every[:, :, part.rows]
             for left, right in part.factors:
-                gradient += (y @ left) @ right
+                gradient += (y if left is None else y @ left) @ right
             blocks = (part.K, part.D, part.M)
             for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
                 gradient[:, :, columns] += y @ block
@@ -198,9 +203,43 @@ def linearise(
         rigid: ascending joint coordinates (R,) that have columns and whose forces have rows; none
             by default.
     """
-    tree: Mechanism = mechanism
-    links = outward_pass(tree, motion, (q, qd, qdd))
-    places = _places(tree, keep, rigid)
+    places, count, dim = _places(mechanism, keep, rigid), len(q), mechanism.dim
+    # Of motion and load of a frame and of an interface of every body.
+    size = 8 * 3 * places.size * (4 * dim.d + 6 * dim.r) * len(mechanism.order)
+    chunks = max(1, round(count * size / DERIVATIVES_BYTES))
+    ends = np.linspace(0, count, min(chunks, max(count // LEAST_INSTANTS, 1)) + 1).astype(int)
+    if len(ends) == 2:
+        return _linearise(mechanism, motion, (q, qd, qdd), places)
+    return _joined(
+        [
+            _linearise(mechanism[part], motion[part], (q[part], qd[part], qdd[part]), places)
+            for part in (slice(a, b) for a, b in pairwise(ends))
+        ]
+    )
+
+
+def _joined(parts: list[Tangent]) -> Tangent:
+    """Return the tangents of instants that follow each other as one."""
+    bodies = []
+    for same in zip(*(one.bodies for one in parts), strict=True):
+        M = same[0].M if same[0].M.ndim == 2 else np.concatenate([one.M for one in same])
+        pairs = zip(*(one.factors for one in same), strict=True)
+        factors = tuple(
+            (
+                None if every[0][0] is None else np.concatenate([x for x, _ in every]),
+                np.concatenate([x for _, x in every]),
+            )
+            for every in pairs
+        )
+        K, D = (np.concatenate(x) for x in zip(*((one.K, one.D) for one in same), strict=True))
+        bodies.append(replace(same[0], K=K, D=D, M=M, factors=factors))
+    drives = np.concatenate([one.drives for one in parts])
+    return Tangent(tuple(bodies), parts[0].size, drives)
+
+
+def _linearise(tree: Mechanism, motion: RigidMotion, rates: Rates, places: _Places) -> Tangent:
+    """Return the derivative at some of the instants."""
+    links = outward_pass(tree, motion, rates)
     loads = inward_pass(tree, links, driven=len(places.rigid) > 0)
     motions, ends = _outward_derivatives(tree, links, places)
     found = _inward_derivatives(tree, links, loads, places, motions, ends)
@@ -376,7 +415,7 @@ def _body_tangent(
     """Return the derivative of body i's rows."""
     part, body, kept = tree.slices[i], link.body, places.kept[i]
     K, D, M = body.rows_by_rates(kept, interface_pushes(link, loads.outboard[i]))
-    factors: list[tuple[np.ndarray, np.ndarray]] = []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
     for s, interface in link.interfaces.items():
         turning = interface.pushes_by_e(loads.outboard[i][s], kept)
         if turning is not None:
@@ -385,14 +424,20 @@ def _body_tangent(
         by_load = _by_instant(interface.rows_by_load.swapaxes(0, 1))
         turned = interface.load_by_rates(carried_load(link, loads.outboard[i], s), kept)
         K = K + by_load @ _by_instant(turned)
-        factors.append((_by_instant(interface.rows_by_own_load.swapaxes(0, 1)), outboard[s]))
+        pairs.append((_by_instant(interface.rows_by_own_load.swapaxes(0, 1)), outboard[s]))
         if s in given:
-            factors.append((by_load, np.pad(given[s], ((0, 0), (0, 0), (0, 2 * places.size)))))
+            pairs.append((by_load, np.pad(given[s], ((0, 0), (0, 0), (0, 2 * places.size)))))
     if moved is not None:
-        factors.append((_by_instant(body.rows_by_motion.swapaxes(0, 1)), moved))
+        pairs.append((_by_instant(body.rows_by_motion.swapaxes(0, 1)), moved))
+    factors: tuple[tuple[np.ndarray | None, np.ndarray], ...] = tuple(pairs)
+    if pairs and body.constants.num_modes <= sum(right.shape[1] for _, right in pairs):
+        whole = pairs[0][0] @ pairs[0][1]
+        for left, right in pairs[1:]:
+            whole += left @ right
+        factors = ((None, whole),)
     first = len(places.rigid)
     rows = slice(first + part.start, first + part.stop)
-    return BodyTangent(rows, places.bodies[i], kept, K, D, M, tuple(factors))
+    return BodyTangent(rows, places.bodies[i], kept, K, D, M, factors)
 
 
 def _by_instant(x: np.ndarray) -> np.ndarray:
