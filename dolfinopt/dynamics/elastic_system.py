@@ -121,6 +121,12 @@ class ElasticSystem:
         squares = np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass)))
         return float(np.sqrt(1.0 / squares.max()))
 
+    def prescribed(self, t: np.ndarray) -> np.ndarray:
+        """Return the rigid coordinates' motion and the forces at instants t, see `System`."""
+        motion = self.motion(t)
+        forces = [] if motion.applied is None else [motion.applied.reshape(len(t), -1)]
+        return np.hstack([motion.q, motion.qd, motion.qdd, *forces])
+
     def preconditioner(self: Own) -> Modes[Own]:
         """Return the arms' vibrations; simulation and adjoint ask for the same."""
         return self._modes

@@ -497,6 +497,9 @@ class MachineSystem:
         rigid = np.sqrt(squares).max(axis=-1)
         return np.concatenate([rigid[..., None], arms], axis=-1)
 
+    def prescribed(self, t: np.ndarray) -> None:
+        """Return nothing: drives give way, and joints that follow have vibrations of their own."""
+
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration with rigid coordinates held, rad/s."""
         return self.elastic.slowest_frequency()

@@ -17,6 +17,17 @@ KEPT_MATRICES_BYTES = 64e6  # of what is kept for further functions of the same 
 
 STEPS_PER_PERIOD = 8.0  # of the slowest vibration, on a first grid
 FIRST_GRID_STEPS_LIMIT = 20_000  # more are asked for by estimated errors alone
+# Even steps that are tried for what the loads of stiff arms need, the ratio from one number to the
+# next, and the share of eight steps a period that they may be at first: fewer gain too little.
+FEWEST_STEPS = 20
+FOLLOWED_STEPS_RATIO = 1.5
+FOLLOWED_STEPS_SHARE = 0.25
+# Error over the tolerance up to which more steps than that are tried, up to half of those: from
+# 1e-3 down to the tolerance of 1e-4 it falls within three to five numbers of steps.
+FEW_STEPS_ERROR_RATIO = 100.0
+# Of the tolerance, accepted of them: the estimate is 0.23 to 1.7 times the error, as what tables
+# excite between the breakpoints is not seen.
+FEW_STEPS_ESTIMATE_SHARE = 0.25
 RESPONSE_INTERVAL = 1e-3  # s, the longest from one instant of the responses to the next
 RESPONSE_INSTANTS_LIMIT = 1_000_000  # at `RESPONSE_INTERVAL`: they take 1 GB and 3 s
 LONG_MOTION_INSTANTS = 100_000  # of a motion beyond that limit, unless it bends faster

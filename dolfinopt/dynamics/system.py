@@ -136,6 +136,13 @@ class System(Protocol):
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration, rad/s: eight steps a period are tried first."""
 
+    def prescribed(self, t: np.ndarray) -> np.ndarray | None:
+        """Return all that makes it move (n, k) at instants t (n,); None: there is more to it.
+
+        Motions and forces as functions of time, which fewer steps may do for: see
+        `radau.integrate`.
+        """
+
     def describe(self, q: np.ndarray) -> str:
         """Say how far a motion q (n, N) goes, for a message: "the arms' ends turn by 2 rad"."""
 

@@ -22,6 +22,7 @@ from dolfinopt.dynamics.collocation import (
     at_stages,
     counted,
     even_steps,
+    first_num_steps,
     residual_at,
     stages_of,
 )
@@ -772,6 +773,39 @@ def test_long_chain_takes_held_matrices(monkeypatch: pytest.MonkeyPatch) -> None
         for name in ("C", "M", "G", "K", "outboard"):
             # Multipliers are corrected to 1e-9, largest component.
             assert_close(getattr(a, name), getattr(b, name), 1e-9)
+
+
+# -- stiff arms ------------------------------------------------------------------------------
+
+
+def waves(number: int) -> Motion:
+    """Return motions of so many waves within 2 s, from rest to rest."""
+    ends = np.polynomial.Polynomial([0.0, 0.0, 0.0, 8.0, -12.0, 6.0, -1.0])  # (t (2 - t))^3
+
+    def motion(t: np.ndarray) -> RigidMotion:
+        w = np.pi * number
+        sine = [np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)]
+        window = [ends.deriv(k)(t) if k else ends(t) for k in range(3)]
+        first = window[1] * sine[0] + window[0] * sine[1]
+        second = window[2] * sine[0] + 2.0 * window[1] * sine[1] + window[0] * sine[2]
+        size = np.array([0.05, 0.6, -0.4])  # m, rad
+        return RigidMotion(*(np.outer(x, size) for x in (window[0] * sine[0], first, second)))
+
+    return motion
+
+
+@pytest.mark.parametrize("damping", [0.0, 2e-4])
+@pytest.mark.parametrize("number", [2, 16])
+def test_steps_of_stiff_arms_follow_the_motion(number: int, damping: float) -> None:
+    """Far fewer than eight steps a period, where vibrations are below the tolerance."""
+    stiff = {"bending": 4e5, "axial": 1.2e7, "damping": damping}
+    problem, _ = two_arms(waves(number), (0.0, 2.0), **stiff)
+    usual = first_num_steps(problem)
+    fine = radau.on_grid(problem, even_steps(problem, 2 * usual), 1e-8, 5)
+    for tolerance, most in ((1e-3, usual / 10), (1e-4, usual / 3), (1e-6, np.inf)):
+        found = radau.integrate(problem, tolerance, 4, Profile())
+        assert distance(problem, found, fine) <= tolerance
+        assert len(found.a) <= most
 
 
 # -- warm start, counts, sampling ------------------------------------------------------------
