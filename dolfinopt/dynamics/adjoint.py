@@ -28,8 +28,9 @@ from dolfinopt.dynamics.collocation import (
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
-    ADJOINT_CONTRACTION_LIMIT,
     ADJOINT_CORRECTION_SHARE,
+    ADJOINT_CORRECTIONS_LIMIT,
+    HELD_COORDINATES_LIMIT,
     KEPT_MATRICES_BYTES,
 )
 from dolfinopt.dynamics.newton import (
@@ -37,6 +38,7 @@ from dolfinopt.dynamics.newton import (
     factorise,
     limits_for,
     next_slow_coordinates,
+    simplified_newton_matrix,
     windows,
 )
 from dolfinopt.dynamics.system import Linearisation
@@ -58,12 +60,12 @@ class Adjoint:
         method, self._modes = radau_iia(len(solution.nodes)), system.preconditioner()
         self._stages = stages_of(self._modes, method, solution.time_grid)
         z, zd, a = (self._modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
-        self._at = (*stage_values(self._stages, z, zd, a), a)
+        self._begin, self._at = (z, zd), (*stage_values(self._stages, z, zd, a), a)
         q, qd = stage_values(self._stages, solution.q, solution.qd, solution.a)
         steps = np.diff(solution.time_grid)[:, None]
         self._times = (solution.time_grid[:-1, None] + steps * method.c).ravel()
         self._rates = tuple(x.reshape(-1, q.shape[2]) for x in (q, qd, solution.a))
-        self._kept: dict[bytes, _Factors] = {}
+        self._kept: dict[tuple[bool, bytes], _Factors] = {}
 
     def gradient(self, t: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
         """Return dJ/d(constants) of every body through the trajectory's coordinates.
@@ -85,32 +87,49 @@ class Adjoint:
 
     def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,)."""
-        # Newton's matrix is not the derivative where coordinates are treated as fast: what its
-        # answer leaves, by the exact derivative, is answered again until nothing is left.
-        stages = self._stages
-        slow, limits = next_slow_coordinates(stages, limits_for(stages), 0)
-        while True:
-            multipliers, after = np.empty_like(by_a), np.zeros_like(by_y[0])
-            for part in reversed(windows(stages, slow)):
-                matrix, exact = self._factorised(part, slow)
-                answer = _answered(matrix, exact, by_a[part], by_y[part], after)
-                if answer is None:
-                    break
-                multipliers[part], after = answer
-            else:
-                return multipliers, after[0]
+        # Newton's matrix is not the derivative where coordinates are treated as fast, or tangents
+        # as held over a step: what its answer leaves, by the exact derivative, is answered again
+        # until nothing is left.
+        stages, limits = self._stages, limits_for(self._stages)
+        if stages.preconditioner.guided and len(limits) > 1:
+            slow, _ = next_slow_coordinates(stages, limits, 0, HELD_COORDINATES_LIMIT)
+            if (answer := self._answer(by_a, by_y, slow, True)) is not None:
+                return answer
+        slow, limits = next_slow_coordinates(stages, limits, 0)
+        while (answer := self._answer(by_a, by_y, slow, False)) is None:
             slow, limits = next_slow_coordinates(stages, limits, len(slow))
+        return answer
 
-    def _factorised(self, part: slice, slow: np.ndarray) -> _Factors:
+    def _answer(
+        self, by_a: np.ndarray, by_y: np.ndarray, slow: np.ndarray, simplified: bool
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return what `_backwards` does by one kind of matrix, or None, see `_answered`."""
+        multipliers, after = np.empty_like(by_a), np.zeros_like(by_y[0])
+        for part in reversed(windows(self._stages, slow)):
+            factors = self._factorised(part, slow, simplified)
+            found = _answered(*factors, by_a[part], by_y[part], after)
+            if found is None:
+                return None
+            multipliers[part], after = found
+        return multipliers, after[0]
+
+    def _factorised(self, part: slice, slow: np.ndarray, simplified: bool) -> _Factors:
         """Return Newton's matrix of some steps, and the exact derivative; kept if they are all."""
-        key = slow.tobytes()
+        key = (simplified, slow.tobytes())
         if key in self._kept:
             return self._kept[key]
         window = self._stages.window(part.start, part.stop)
         q, qd, a = (x[part] for x in self._at)
-        matrix = factorise(window, q, qd, a, slow)
-        exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
-        if len(window.h) == len(self._stages.h) and matrix.inverse.nbytes <= KEPT_MATRICES_BYTES:
+        if simplified:
+            begin = self._begin[0][part], self._begin[1][part]
+            matrix = simplified_newton_matrix(window, begin, a, slow)
+        else:
+            matrix = factorise(window, q, qd, a, slow)
+        exact = matrix.tangent
+        if simplified or len(matrix.fast):
+            exact = tangent_at(window, q, qd, a)
+        size = matrix.transfer.nbytes + matrix.inverse.nbytes
+        if len(window.h) == len(self._stages.h) and size <= KEPT_MATRICES_BYTES:
             self._kept = {key: (matrix, exact)}
         return matrix, exact
 
@@ -152,23 +171,38 @@ def _answered(
     after: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return a window's multipliers and dJ by the state (2, N) at its beginning, or None."""
-    # None where corrections do not shrink by `ADJOINT_CONTRACTION_LIMIT`.
-    multipliers = matrix.solve_transposed(by_a, by_y, after)
-    size = np.abs(multipliers).max()
-    enough = ADJOINT_CORRECTION_SHARE * size
-    while True:
-        gradient = exact.transposed(multipliers.reshape(-1, by_a.shape[2]))
-        more_a, more_y = vector_jacobian_product(
-            matrix.stages, *(x.reshape(by_a.shape) for x in gradient)
-        )
-        left_a, left_y = by_a + more_a, by_y + more_y
-        if len(matrix.fast) == 0 or size <= enough:
-            return multipliers, _before(matrix.stages, left_y, after)
-        step = matrix.solve_transposed(left_a, left_y, after)
-        before, size = size, np.abs(step).max()
-        if not size <= ADJOINT_CONTRACTION_LIMIT * before:
-            return None
-        multipliers += step
+    # Where the matrix is not the derivative, its answer to what is left is a step, and the sum of
+    # steps is the one that leaves least: generalised conjugate residuals (Eisenstat, Elman &
+    # Schultz 1983, doi:10.1137/0720023). None where that takes `ADJOINT_CORRECTIONS_LIMIT` steps.
+    found, stages = matrix.solve_transposed(by_a, by_y, after), matrix.stages
+    if exact is matrix.tangent:
+        return found, _before(stages, by_y + _gradient(stages, exact, found)[1], after)
+    enough = ADJOINT_CORRECTION_SHARE * np.abs(found).max()
+    left, by_first, rest = found, by_y, np.zeros_like(after)
+    found = np.zeros_like(left)
+    steps: list[tuple[np.ndarray, ...]] = []  # with what they take away, and dJ by first states
+    for _ in range(ADJOINT_CORRECTIONS_LIMIT):
+        more_a, more_y = _gradient(stages, exact, left)
+        new = [left, -matrix.solve_transposed(more_a, more_y, rest), more_y]
+        for old in steps:
+            share = np.vdot(old[1], new[1])
+            new = [x - share * y for x, y in zip(new, old, strict=True)]
+        steps.append(tuple(x / np.linalg.norm(new[1]) for x in new))
+        step, lost, more_y = steps[-1]
+        share = np.vdot(lost, left)
+        found, left = found + share * step, left - share * lost
+        by_first = by_first + share * more_y
+        if np.abs(left).max() <= enough:
+            return found, _before(stages, by_first, after)
+    return None
+
+
+def _gradient(
+    stages: Stages, exact: Linearisation, multipliers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradient of sum multipliers . residual by accelerations and first states."""
+    by_rates = exact.transposed(multipliers.reshape(-1, multipliers.shape[2]))
+    return vector_jacobian_product(stages, *(x.reshape(multipliers.shape) for x in by_rates))
 
 
 def _before(stages: Stages, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -351,6 +351,9 @@ class BatchSystem:
         """Return that of the first system, rad/s."""
         return self.members[0].slowest_frequency()
 
+    def prescribed(self, t: np.ndarray) -> None:
+        """Return nothing: members that fewer steps do for are solved first by themselves."""
+
     def describe(self, q: np.ndarray) -> str:
         """Say how far the first system's arms' ends turn in a motion q (n, N) of it."""
         return self.members[0].describe(q)

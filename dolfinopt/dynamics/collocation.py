@@ -15,7 +15,10 @@ from dolfinopt.dynamics.measured import (
     COMPARED_STEP_COUNTS,
     EVEN_STEPS_ROUNDING,
     EXTREME_EXCESS_SHARE,
+    FEWEST_STEPS,
     FIRST_GRID_STEPS_LIMIT,
+    FOLLOWED_STEPS_RATIO,
+    FOLLOWED_STEPS_SHARE,
     LONG_MOTION_INSTANTS,
     RESPONSE_INSTANTS_LIMIT,
     RESPONSE_INTERVAL,
@@ -323,6 +326,38 @@ def first_num_steps(system: System) -> int:
     smooth = 20 * min(pieces, 4) + 5 * max(pieces - 4, 0)  # many pieces are short ones
     wanted = STEPS_PER_PERIOD * horizon * slowest / (2.0 * np.pi)
     return int(np.clip(wanted, smooth, FIRST_GRID_STEPS_LIMIT))
+
+
+def followed_steps(
+    system: System, time_grid: np.ndarray, tolerance: float, stages: int
+) -> np.ndarray | None:
+    """Return even steps (m + 1,) on which polynomials follow what makes the system move, s.
+
+    Stiff arms take their loads' shape in time, and their vibrations are small: what the loads need
+    is enough, not eight steps a period. Polynomials through the stages' values must give those at
+    the nodes of the steps for vibrations `time_grid` (n + 1,) to the tolerance, over the largest.
+    None: this takes more than `FOLLOWED_STEPS_SHARE` of these, or there is more to the motion.
+    """
+    method, count = radau_iia(stages), len(time_grid) - 1
+    places = (time_grid[:-1, None] + np.diff(time_grid)[:, None] * method.c).ravel()
+    wanted = system.prescribed(places)
+    if wanted is None:
+        return None
+    size = np.abs(wanted).max(axis=0, initial=0.0)
+    size = np.where(size > 0.0, size, 1.0)
+    few = FEWEST_STEPS
+    while FOLLOWED_STEPS_SHARE * count >= few:
+        grid = even_steps(system, few)
+        steps = np.diff(grid)
+        known = system.prescribed((grid[:-1, None] + steps[:, None] * method.c).ravel())
+        assert known is not None
+        at = np.clip(np.searchsorted(grid, places, side="left") - 1, 0, len(steps) - 1)
+        weights, _, _ = lagrange_integrals(method.c, (places - grid[at]) / steps[at])
+        found = np.einsum("nj,njk->nk", weights, known.reshape(len(steps), stages, -1)[at])
+        if (np.abs(found - wanted).max(axis=0) <= tolerance * size).all():
+            return grid
+        few = int(FOLLOWED_STEPS_RATIO * few)
+    return None
 
 
 def divided(system: System, time_grid: np.ndarray, count: int) -> np.ndarray:

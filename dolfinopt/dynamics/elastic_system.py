@@ -12,6 +12,7 @@ from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
 
 from dolfinopt.dynamics.measured import (
     EQUILIBRIUM_ITERATIONS,
+    EQUILIBRIUM_KEPT_CONTRACTION,
     EQUILIBRIUM_ROUNDING_ERROR,
     EQUILIBRIUM_STALLED_ERROR,
     IDENTITY_ROUNDING_ERROR,
@@ -120,6 +121,12 @@ class ElasticSystem:
         squares = np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass)))
         return float(np.sqrt(1.0 / squares.max()))
 
+    def prescribed(self, t: np.ndarray) -> np.ndarray:
+        """Return the rigid coordinates' motion and the forces at instants t, see `System`."""
+        motion = self.motion(t)
+        forces = [] if motion.applied is None else [motion.applied.reshape(len(t), -1)]
+        return np.hstack([motion.q, motion.qd, motion.qdd, *forces])
+
     def preconditioner(self: Own) -> Modes[Own]:
         """Return the arms' vibrations; simulation and adjoint ask for the same."""
         return self._modes
@@ -174,13 +181,14 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
     instants, size = system.at(np.zeros(system.runs)), system.num_coordinates
     q = rest = np.zeros((system.runs, size))
     before = np.full(system.runs, np.inf)
-    found = np.zeros(system.runs, dtype=bool)
+    found, kept = np.zeros((2, system.runs), dtype=bool)
     for _ in range(EQUILIBRIUM_ITERATIONS):
         residual = instants.residual(q, rest, rest)
         found |= ~residual.any(axis=1)  # mostly at once: nothing loads the arms before they move
         if found.all():
             break
-        stiffness = instants.linearise(q, rest, rest).dense()[:, :, :size]
+        if not kept.all():
+            stiffness = instants.linearise(q, rest, rest).dense()[:, :, :size]
         try:
             step = np.linalg.solve(stiffness, -residual[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
@@ -189,6 +197,7 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
         size_of_step = relative_errors(system, step[:, None], q[:, None])
         stalled = (size_of_step <= EQUILIBRIUM_STALLED_ERROR) & (size_of_step >= 0.5 * before)
         found |= (size_of_step <= EQUILIBRIUM_ROUNDING_ERROR) | stalled
+        kept = found | (size_of_step <= EQUILIBRIUM_KEPT_CONTRACTION * np.minimum(before, 1.0))
         before = size_of_step
     return q, found
 

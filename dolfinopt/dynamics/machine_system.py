@@ -60,9 +60,10 @@ class DenseLinearisation:
         return rows.reshape(len(q), len(wanted))
 
     def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradient of sum_n rows_n . residual_n by q, qd, qdd, each (n, S)."""
+        """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
         flat = self.matrix.reshape(*self.matrix.shape[:2], -1)
-        found = (rows[:, None] @ flat).reshape(len(rows), 3, -1)[:, :, self.keep]
+        found = rows.reshape(len(flat), -1, rows.shape[1]) @ flat
+        found = found.reshape(len(rows), 3, -1)[:, :, self.keep]
         return found[:, 0], found[:, 1], found[:, 2]
 
     def _part(self, rows: np.ndarray) -> np.ndarray:
@@ -495,6 +496,9 @@ class MachineSystem:
         squares += np.square(scale[joints] * y[..., self.ends[2] :]).sum(axis=-1)
         rigid = np.sqrt(squares).max(axis=-1)
         return np.concatenate([rigid[..., None], arms], axis=-1)
+
+    def prescribed(self, t: np.ndarray) -> None:
+        """Return nothing: drives give way, and joints that follow have vibrations of their own."""
 
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration with rigid coordinates held, rad/s."""

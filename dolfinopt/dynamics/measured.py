@@ -17,6 +17,17 @@ KEPT_MATRICES_BYTES = 64e6  # of what is kept for further functions of the same 
 
 STEPS_PER_PERIOD = 8.0  # of the slowest vibration, on a first grid
 FIRST_GRID_STEPS_LIMIT = 20_000  # more are asked for by estimated errors alone
+# Even steps that are tried for what the loads of stiff arms need, the ratio from one number to the
+# next, and the share of eight steps a period that they may be at first: fewer gain too little.
+FEWEST_STEPS = 20
+FOLLOWED_STEPS_RATIO = 1.5
+FOLLOWED_STEPS_SHARE = 0.25
+# Error over the tolerance up to which more steps than that are tried, up to half of those: from
+# 1e-3 down to the tolerance of 1e-4 it falls within three to five numbers of steps.
+FEW_STEPS_ERROR_RATIO = 100.0
+# Of the tolerance, accepted of them: the estimate is 0.23 to 1.7 times the error, as what tables
+# excite between the breakpoints is not seen.
+FEW_STEPS_ESTIMATE_SHARE = 0.25
 RESPONSE_INTERVAL = 1e-3  # s, the longest from one instant of the responses to the next
 RESPONSE_INSTANTS_LIMIT = 1_000_000  # at `RESPONSE_INTERVAL`: they take 1 GB and 3 s
 LONG_MOTION_INSTANTS = 100_000  # of a motion beyond that limit, unless it bends faster
@@ -32,6 +43,8 @@ VIBRATION_ROUNDING_ERROR = 1e-14  # of the stability function R, growing with th
 
 # -- elastic_system, machine_system ----------------------------------------------------------
 
+# Contraction that keeps the stiffness found at first: of spatial_arm.toml it is 1e-5.
+EQUILIBRIUM_KEPT_CONTRACTION = 1e-3
 EQUILIBRIUM_ROUNDING_ERROR = 1e-14  # relative step at t = 0 below which nothing changes
 MACHINE_EQUILIBRIUM_ROUNDING_ERROR = 1e-13  # the same of machines, beside the coordinates
 # A relative step below it that is not half of the one before is rounding of an ill-conditioned
@@ -50,11 +63,17 @@ FACTORS_BYTES = 256e6  # of the factors of steps that are solved together
 SLOW_ANGLES = (40.0, 120.0, np.inf)
 # Slowest coordinates with dense blocks as long as not all must be: on short steps nearly all would.
 DENSE_COORDINATES_LIMIT = 24
+# The same of matrices whose tangent is held over a step, which cost a tenth.
+HELD_COORDINATES_LIMIT = 48
 EXACT_COORDINATES_LIMIT = 12  # up to so many the exact matrix costs less than more iterations
 NEWTON_ROUNDING_ERROR = 1e-9  # relative steps and errors below it that do not fall are rounding
 # Step below which a poor contraction is blamed on the matrix, no more on the nonlinearity.
 NEWTON_SETTLED_STEP = 0.01
 INVERTED_MATRICES_CHUNK = 512  # matrices at a time: they stay in the processor's cache
+# Coordinates up to which complex matrices are inverted by a sweep over all steps, beyond one by one
+# in LAPACK: of 8 coordinates 1.4 to 1.8 microseconds a matrix either way, of 24 30 and 12, of 48
+# 250 and 59.
+SWEPT_COORDINATES_LIMIT = 8
 
 # -- radau: grids ----------------------------------------------------------------------------
 
@@ -151,8 +170,10 @@ ALPHA_AIM_SHARE = 0.6  # of the tolerance, aimed at by a new grid
 # -- adjoint ---------------------------------------------------------------------------------
 
 # Of the multipliers, that a correction may have left: their error is a tenth of it or less.
-ADJOINT_CORRECTION_SHARE = 1e-8
-ADJOINT_CONTRACTION_LIMIT = 0.3  # above it more coordinates are treated densely
+ADJOINT_CORRECTION_SHARE = 1e-9
+# Steps after which more coordinates are treated densely: of eight arms in space 10, and a matrix
+# that is dense in all of their 48 coordinates costs as much as 50.
+ADJOINT_CORRECTIONS_LIMIT = 20
 
 # -- build, simulation -----------------------------------------------------------------------
 

@@ -32,10 +32,12 @@ from dolfinopt.dynamics.measured import (
     DENSE_COORDINATES_LIMIT,
     EXACT_COORDINATES_LIMIT,
     FACTORS_BYTES,
+    HELD_COORDINATES_LIMIT,
     INVERTED_MATRICES_CHUNK,
     NEWTON_ROUNDING_ERROR,
     NEWTON_SETTLED_STEP,
     SLOW_ANGLES,
+    SWEPT_COORDINATES_LIMIT,
 )
 from dolfinopt.dynamics.system import Linearisation, State
 
@@ -62,22 +64,22 @@ def limits_for(stages: Stages) -> tuple[float, ...]:
 
 
 def next_slow_coordinates(
-    stages: Stages, limits: tuple[float, ...], more_than: int
+    stages: Stages, limits: tuple[float, ...], more_than: int, most: int = DENSE_COORDINATES_LIMIT
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Return the first larger set of slow coordinates, ascending, and the limits beyond.
 
-    A coordinate is slow up to an angle w h in a median step; the slowest one always is. No limits
-    are left when all are.
+    A coordinate is slow up to an angle w h in a median step; the slowest one always is, and as long
+    as not all are, `most` of them. No limits are left when all are.
     """
     angles = stages.angles
     if not stages.preconditioner.guided:
         return np.arange(len(angles)), ()
     limit, *beyond = limits
     slow = np.flatnonzero(angles <= max(limit, angles.min()))
-    if limit < np.inf and len(slow) > DENSE_COORDINATES_LIMIT:
-        slow = np.sort(np.argsort(angles, kind="stable")[:DENSE_COORDINATES_LIMIT])
+    if limit < np.inf and len(slow) > most:
+        slow = np.sort(np.argsort(angles, kind="stable")[:most])
     if len(slow) <= more_than and beyond:
-        return next_slow_coordinates(stages, tuple(beyond), more_than)
+        return next_slow_coordinates(stages, tuple(beyond), more_than, most)
     return slow, tuple(beyond) if len(slow) < len(angles) else ()
 
 
@@ -376,6 +378,8 @@ class Tuning:
         limits: angles w h up to which coordinates are slow, tried in turn.
         least_rate: contraction that is believed when the error left is foretold.
         keep: least contraction that keeps a simplified matrix, and one that follows the stages.
+        keep_mixed: the same as long as steps are mixed, see `_Mixed`, of a matrix that is dense in
+            more than `DENSE_COORDINATES_LIMIT` coordinates and costs as much as many steps.
         near: of a matrix made within this distance of the solution, a new one would be no better:
         keep_near: it is kept with this contraction.
         shortest: of a damped step, as a share of Newton's; then it has failed.
@@ -386,6 +390,7 @@ class Tuning:
     limits: tuple[float, ...] = SLOW_ANGLES
     least_rate: float = 0.01
     keep: tuple[float, float] = (0.15, 0.3)  # half of it, or twice, take as long
+    keep_mixed: float = 0.7
     near: float = 0.0
     keep_near: float = 0.0
     shortest: float = 1.0 / 64.0
@@ -462,6 +467,37 @@ def newton(
     return Iterate(run.at.a, *found)
 
 
+class _Mixed:
+    """Steps of one matrix, mixed so that they leave least: Anderson's acceleration.
+
+    Source: Walker & Ni (2011), doi:10.1137/10078356X, in the norm of the changes of q.
+
+    Attributes:
+        serves: whether all mixed steps have lowered the residual.
+    """
+
+    def __init__(self) -> None:
+        self.serves = True
+        self._last: tuple[np.ndarray, ...] = ()  # a, its step, and the change of q
+        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []  # changes of these, orthonormal
+
+    def step(self, a: np.ndarray, step: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """Return the mixed step from an iterate a, its step and change of q, each (n, s, N)."""
+        if self._last:
+            old_a, old_step, old_shift = self._last
+            lost, moved = shift - old_shift, a - old_a + step - old_step
+            for other, other_moved in self._pairs:
+                share = np.vdot(other, lost)
+                lost, moved = lost - share * other, moved - share * other_moved
+            size = np.linalg.norm(lost)
+            if size > 0.0:
+                self._pairs.append((lost / size, moved / size))
+        self._last = a, step, shift
+        for lost, moved in self._pairs:
+            step = step - np.vdot(lost, shift) * moved
+        return step
+
+
 class _Run:
     """Newton's method at work on one run of steps."""
 
@@ -475,8 +511,13 @@ class _Run:
         simplified: bool,
     ) -> None:
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
-        self.simplified = simplified and stages.preconditioner.guided
-        self.slow, self.limits = next_slow_coordinates(stages, tuning.limits, 0)
+        # Of few coordinates the exact matrix costs less than the iterations that it saves, if it is
+        # made near the solution.
+        few = a.shape[2] <= EXACT_COORDINATES_LIMIT and bool(a.any())
+        self.simplified = simplified and stages.preconditioner.guided and not few
+        most = HELD_COORDINATES_LIMIT if self.simplified else DENSE_COORDINATES_LIMIT
+        limits = tuning.limits[-1:] if few else tuning.limits
+        self.slow, self.limits = next_slow_coordinates(stages, limits, 0, most)
         self.at = _point(stages, state, a)
         self.before, self.norm_before = np.inf, self.at.norm[0]
         self.converged, self.rate, self.iterations = False, 0.0, 0
@@ -485,8 +526,9 @@ class _Run:
         """Iterate with one matrix; return whether it is worth while to go on with another."""
         exact = len(self.slow) == self.at.a.shape[2] and not self.simplified
         matrix, rest = self._matrix(), np.zeros((2, self.at.a.shape[2]))
-        keep = self.tuning.keep[0 if self.simplified else 1]
-        self.rate, age = 0.0, 0
+        least = self.tuning.keep[0 if self.simplified else 1]
+        many = len(self.slow) > DENSE_COORDINATES_LIMIT
+        self.rate, age, mixed = 0.0, 0, _Mixed()
         while True:
             self.iterations += 1
             spend(float(self.stages.length))
@@ -504,8 +546,13 @@ class _Run:
                 self.at = replace(self.at, a=self.at.a + step)
                 self.converged = True
                 return False
-            poor = age > 0 and size > keep * self.before
-            if poor or not np.isfinite(size) or not self._damped(step):
+            keep = self.tuning.keep_mixed if many and mixed.serves else least
+            if (age > 0 and size > keep * self.before) or not np.isfinite(size):
+                return self._after_failure(size, age, exact)
+            better = mixed.step(self.at.a, step, shift) if mixed.serves else None
+            if better is not None and age > 0:
+                mixed.serves = self._damped(better, 1.0)
+            if (age == 0 or not mixed.serves) and not self._damped(step):
                 return self._after_failure(size, age, exact)
             self.before, age = size, age + 1
 
@@ -515,10 +562,10 @@ class _Run:
             return simplified_newton_matrix(self.stages, begin, self.at.a, self.slow)
         return factorise(self.stages, self.at.q, self.at.qd, self.at.a, self.slow)
 
-    def _damped(self, step: np.ndarray) -> bool:
+    def _damped(self, step: np.ndarray, shortest: float | None = None) -> bool:
         """Take the longest step that lowers the residual; return whether there is one."""
         length = 1.0
-        while length >= self.tuning.shortest:
+        while length >= (self.tuning.shortest if shortest is None else shortest):
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
                 new = _point(self.stages, self.state, self.at.a + length * step)
             if new.norm[0] <= (1.0 - 0.1 * length) * self.at.norm[0]:
@@ -705,6 +752,27 @@ class SimplifiedNewtonMatrix(NewtonMatrix):
         step = -self._applied(residual)
         return step, *stage_values(stages, q, qd, step)
 
+    def _slow_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        count, _, size = by_a.shape
+        stages, K = self.stages, self.jacobian[:, :, :size]
+        answered = self._applied_transposed(by_a)
+        late = stages.h[:, None] * (stages.method.c[:, None] * answered).sum(axis=1)
+        direct = by_y.reshape(count, -1)
+        direct = direct - (answered.sum(axis=1)[:, None] @ self.jacobian[:, :, : 2 * size])[:, 0]
+        direct[:, size:] -= (late[:, None] @ K)[:, 0]
+        direct[-1] += after.ravel() @ self.transfer[-1]
+        p = np.concatenate([bidiagonal_solve(self.band, direct, 1)[1:], after.reshape(1, -1)])
+        return -self._applied_transposed(by_a + _end_gradient(stages, p))
+
+    def _applied_transposed(self, by_a: np.ndarray) -> np.ndarray:
+        """Return the inverted blocks, transposed, times (n, s, S)."""
+        count, s, size = by_a.shape
+        m = len(self.into)
+        by_stage = np.ascontiguousarray(by_a.swapaxes(0, 1)).reshape(s, -1)
+        both = ((self.out[:, :m] - 1j * self.out[:, m:]).T @ by_stage).reshape(m, count, 1, size)
+        found = (both @ self.parts).reshape(m, -1)
+        return (self.into.T @ found).real.reshape(s, count, size).swapaxes(0, 1)
+
     def _applied(self, residual: np.ndarray) -> np.ndarray:
         """Return the inverted blocks times a residual (n, s, S)."""
         count, s, size = residual.shape
@@ -755,23 +823,27 @@ def _eigenvectors(method: Collocation) -> tuple[np.ndarray, np.ndarray]:
 
 def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: bool) -> np.ndarray:
     """Return the inverted M + h l D + h^2 l^2 K (m, n, S, S) of the derivative by q, qd, qdd."""
-    # Without pivots where M and K are definite, which takes a third of the time.
+    # Few coordinates are swept without pivots where M and K are definite, all steps at once.
     values = np.linalg.eigvals(method.A)
     values = values[values.imag >= -1e-12]
     count, size = jacobian.shape[:2]
     parts = np.empty((len(values), count, size, size), dtype=complex)
-    K, D, M = np.split(jacobian.transpose(1, 2, 0), 3, axis=1)
-    for first in range(0, count, INVERTED_MATRICES_CHUNK):
-        part = slice(first, first + INVERTED_MATRICES_CHUNK)
-        hl = values[:, None] * h[part]
-        each_sum = M[:, :, None, part] + hl * (D[:, :, None, part] + hl * K[:, :, None, part])
-        if definite:
-            parts[:, part] = _inverted(each_sum).transpose(2, 3, 0, 1)
-            continue
+    if definite and size <= SWEPT_COORDINATES_LIMIT:
+        last = np.ascontiguousarray(jacobian.transpose(1, 2, 0))
+        K, D, M = np.split(last[:, :, None], 3, axis=1)
+        for first in range(0, count, INVERTED_MATRICES_CHUNK):
+            part = np.s_[..., first : first + INVERTED_MATRICES_CHUNK]
+            hl = values[:, None] * h[part]
+            swept = _inverted(M[part] + hl * (D[part] + hl * K[part]))
+            parts[:, part[1]] = swept.transpose(2, 3, 0, 1)
+        return parts
+    K, D, M = np.split(jacobian, 3, axis=2)
+    for own, value in zip(parts, values, strict=True):
+        hl = (value * h)[:, None, None]
         try:
-            parts[:, part] = np.linalg.inv(each_sum.transpose(2, 3, 0, 1))
+            own[:] = np.linalg.inv(M + hl * (D + hl * K))
         except np.linalg.LinAlgError:
-            parts[:, part] = np.nan  # refused by whoever asked
+            own[:] = np.nan  # refused by whoever asked
     return parts
 
 

@@ -29,6 +29,7 @@ from dolfinopt.dynamics.collocation import (
     divided,
     even_steps,
     first_num_steps,
+    followed_steps,
     lagrange_integrals,
     radau_iia,
     residual_at,
@@ -45,11 +46,15 @@ from dolfinopt.dynamics.measured import (
     ESTIMATE_CORRECTION_SHARE,
     ESTIMATE_CORRECTIONS_LIMIT,
     FAILED_STEP_RATIO,
+    FEW_STEPS_ERROR_RATIO,
+    FEW_STEPS_ESTIMATE_SHARE,
     FINER_GRID_ITERATIONS,
     FIRST_GRID_ERROR,
     FIRST_GRID_GROWTH_LIMIT,
     FIRST_GRID_ITERATIONS_LIMIT,
     FIRST_REFINEMENT_RATIO,
+    FOLLOWED_STEPS_RATIO,
+    HELD_COORDINATES_LIMIT,
     LATER_REFINEMENT_RATIO,
     LEAST_STEP_SHARE,
     LONGEST_WINDOW_STEPS,
@@ -121,6 +126,11 @@ def integrate(
     time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages)
     progress = SlowWork("simulation")
     most = _most_steps(preconditioner, stages)
+    if guess is None and (few := _on_few_steps(preconditioner, time_grid, tolerance, stages)):
+        if few.error <= FEW_STEPS_ESTIMATE_SHARE * tolerance:
+            profile.counts.newton_iterations += few.iterations
+            return few
+        guess = few
     work = max(RADAU_WORK_LIMIT, FIRST_GRID_ITERATIONS_LIMIT * (len(time_grid) - 1))
     iterations = stalled = coarse = 0
     before, marched = np.inf, False
@@ -169,6 +179,29 @@ def integrate(
         f"the simulation reaches an error of {guess.error:.2g} with {len(guess.a)} steps, not the "
         f"simulation.tolerance of {tolerance:g}; raise it, or simulation.stages"
     )
+
+
+def _on_few_steps(
+    preconditioner: Preconditioner, time_grid: np.ndarray, tolerance: float, stages: int
+) -> Solution | None:
+    """Return what steps find that the loads alone need, where these are few; None: nothing."""
+    # The estimated error counts vibrations that the steps do not resolve: without damping, those of
+    # 1e-3 of the deflection need steps of their own at a tolerance of 1e-4.
+    grid, found = None, None
+    if preconditioner.guided:
+        grid = followed_steps(preconditioner.system, time_grid, tolerance, stages)
+    while grid is not None and 2 * len(grid) <= len(time_grid):
+        try:
+            found = _on_grid(preconditioner, grid, tolerance, stages, found)
+        except GivenUp:
+            raise
+        except ConvergenceError:
+            return None
+        over = found.error / tolerance
+        if not FEW_STEPS_ESTIMATE_SHARE < over <= FEW_STEPS_ERROR_RATIO:
+            break
+        grid = even_steps(preconditioner.system, int(FOLLOWED_STEPS_RATIO * (len(grid) - 1)))
+    return found
 
 
 def _least_growth(found: Solution, before: float, coarse: int, tolerance: float) -> float:
@@ -426,7 +459,7 @@ def estimated_errors(
     a = values @ a
     q, qd = stage_values(richer, *begin, a)
     residual = residual_at(richer, q, qd, a)
-    slow, _ = next_slow_coordinates(richer, limits, 0)
+    slow, _ = next_slow_coordinates(richer, limits, 0, HELD_COORDINATES_LIMIT)
     error, sure = np.full(richer.runs, np.inf), np.zeros(richer.runs, dtype=bool)
     if richer.preconditioner.guided:
         matrix = _simplified(richer, begin, a, slow)

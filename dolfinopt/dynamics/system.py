@@ -26,7 +26,10 @@ State = tuple[np.ndarray, np.ndarray]  # q, qd
 
 
 class Linearisation(Protocol):
-    """Derivative of the residual by S of the coordinates and their rates at n instants."""
+    """Derivative of the residual by S of the coordinates and their rates at n instants.
+
+    Of m rows or changes, a multiple of n, each instant stands for as many in turn.
+    """
 
     def window(self, first: int, last: int) -> Linearisation:
         """Return it at the instants first..last - 1."""
@@ -40,7 +43,7 @@ class Linearisation(Protocol):
         """Return the change of the W rows `wanted` (m, W) by one of the S coordinates, (m, S)."""
 
     def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradient of sum_n rows_n . residual_n by q, qd, qdd, each (n, S)."""
+        """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
 
 
 class Instants(Protocol):
@@ -132,6 +135,13 @@ class System(Protocol):
 
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration, rad/s: eight steps a period are tried first."""
+
+    def prescribed(self, t: np.ndarray) -> np.ndarray | None:
+        """Return all that makes it move (n, k) at instants t (n,); None: there is more to it.
+
+        Motions and forces as functions of time, which fewer steps may do for: see
+        `radau.integrate`.
+        """
 
     def describe(self, q: np.ndarray) -> str:
         """Say how far a motion q (n, N) goes, for a message: "the arms' ends turn by 2 rad"."""

@@ -369,8 +369,8 @@ class BodyMotion:
         by_w, by_wd = self.dim.contracted_by_spin(self.w, self.Y, self.Yd)
         return self._of_mass(np.concatenate([self.V[: self.dim.d], by_w, by_wd]))
 
-    def load_by_rates(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of (F, T) by those e, e', e'' kept (d + r, k, n)."""
+    def load_by_rates(self, kept: np.ndarray) -> np.ndarray:
+        """Return the derivatives of (F, T) by those e, e', e'' kept (d + r, 3, k, n)."""
         dim, P = self.dim, len(self.constants.T)
         d, across = dim.d, slice(dim.d, dim.d + dim.g)
         C, Y, Yd = self.V[:d, kept], self.Y[:, kept], self.Yd[:, kept]
@@ -394,11 +394,10 @@ class BodyMotion:
         T_ed = dim.torque(self.beta, turned)
         if moved is not None:
             T_ed += 2.0 * dim.axial(moved)
-        return (
-            self._of_mass(np.concatenate([by_e, T_e])),
-            self._of_mass(np.concatenate([by_ed, T_ed])),
-            self._of_mass(np.concatenate([C, dim.axial(turned)])),
-        )
+        out = np.empty((d + dim.r, 3, *C.shape[1:]))
+        out[:d, 0], out[:d, 1], out[:d, 2] = by_e, by_ed, C
+        out[d:, 0], out[d:, 1], out[d:, 2] = T_e, T_ed, dim.axial(turned)
+        return self._of_mass(out)
 
     def rows_by_rates(
         self, kept: np.ndarray, outboard: dict[int, np.ndarray]

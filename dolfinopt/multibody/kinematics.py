@@ -14,6 +14,7 @@ import numpy as np
 from dolfinopt.multibody.body_motion import BodyMotion, Constants, Load, Motion
 from dolfinopt.multibody.dimension import (
     DIMENSIONS,
+    Dimension,
     PlaneTurning,
     Turning,
     compose,
@@ -25,6 +26,45 @@ from dolfinopt.multibody.motion import RigidMotion
 
 if TYPE_CHECKING:
     from dolfinopt.multibody.mechanism import Joint
+
+
+class Passage:
+    """Derivative of one frame's motion by that of the one that carries it, at n instants.
+
+    Attributes:
+        matrix: (n, d + 2 r, d + 2 r), or one.
+        of_loads: (n, d + r, d + r), or one: what carries a load on the one frame, in its
+            components, to the origin of the other.
+    """
+
+    def __init__(
+        self,
+        dim: Dimension,
+        turn: np.ndarray,
+        by_w: np.ndarray | None,
+        by_wd: np.ndarray | None,
+        turned: np.ndarray | None = None,
+    ) -> None:
+        """Take the blocks (., ., n), or some of them alike at all instants; None: zero.
+
+        Args:
+            dim: plane or space.
+            turn: the rotation (d, d, n) or (d, d) into the components of the one carried.
+            by_w, by_wd: of its acceleration (d, r, n).
+            turned: of its angular acceleration by w (r, r, n).
+        """
+        d, r = dim.d, dim.r
+        counts = {x.shape[2] for x in (turn, by_w, by_wd, turned) if x is not None and x.ndim == 3}
+        out = np.zeros((max(counts, default=1), d + 2 * r, d + 2 * r))
+        a, w, wd = slice(0, d), slice(d, d + r), slice(d + r, d + 2 * r)
+        rotated = turn if r == d else np.ones((1, 1))
+        blocks = (a, a, turn), (w, w, rotated), (wd, wd, rotated), (wd, w, turned)
+        for rows, columns, block in (*blocks, (a, w, by_w), (a, wd, by_wd)):
+            if block is not None:
+                out[:, rows, columns] = block if block.ndim == 2 else block.transpose(2, 0, 1)
+        self.matrix = out
+        forces = np.r_[a, wd]  # work on displacements as accelerations go
+        self.of_loads = np.ascontiguousarray(out[:, forces[:, None], forces].swapaxes(1, 2))
 
 
 class Interface:
@@ -121,16 +161,16 @@ class Interface:
         out = dim.centripetal_by_spin(body.w, self.place)
         return out + 2.0 * dim.by_spin(self.u[:, 1]) if body.is_flexible else out
 
-    def moved_by_body(self, motion: np.ndarray) -> np.ndarray:
-        """Return the derivative of its motion, not turned yet, from that of the body's."""
-        dim, d, r = self.dim, self.dim.d, self.dim.r
-        w, wd = motion[d : d + r], motion[d + r :]
-        out = motion.copy()
-        out[:d] += dim.velocity(wd, self.place)
-        out[:d] += product(self._by_spin, w)
-        if self.body.is_flexible and r > 1:
-            out[d + r :] -= dim.commutator(self.turning.velocity, w)
-        return out
+    @cached_property
+    def passage(self) -> Passage:
+        """From the body's motion to its own, in its own components."""
+        dim, by_w, by_wd = self.dim, self._by_spin, self.dim.by_spin(self.place)
+        if not self.body.is_flexible:
+            return Passage(dim, np.eye(dim.d), by_w, by_wd)
+        back, turned = self.turning.R.swapaxes(0, 1), None
+        if dim.r > 1:
+            turned = -product(back, dim.skew(self.turning.velocity))
+        return Passage(dim, back, product(back, by_w), product(back, by_wd), turned)
 
     @cached_property
     def _by_theta(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -142,15 +182,16 @@ class Interface:
         of_wd = dim.commutator(w, by_theta) + turning.acceleration_by_theta
         return by_theta, of_wd, dim.commutator(w, turning.J) + turning.acceleration_by_rate
 
-    def moved_by_rates(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of its motion, not turned yet, by those e, e', e'' kept.
+    def moved_by_rates(self, kept: np.ndarray) -> np.ndarray:
+        """Return the derivatives of its motion by those e, e', e'' kept (d + 2 r, 3, k, n).
 
         What turns with the interface is counted: the derivatives are those of its components.
         """
         body, dim, d, r = self.body, self.dim, self.dim.d, self.dim.r
         B = body.V[self.places][:, kept]
         u, theta = B[:d], B[d:]
-        by_e, by_ed, by_edd = np.zeros((3, d + 2 * r, *u.shape[1:]))
+        out = np.zeros((d + 2 * r, 3, *u.shape[1:]))
+        by_e, by_ed, by_edd = out.swapaxes(0, 1)
         phi = self.turning.pushed(theta)
         a, w, wd = self._unturned
         by_e[:d] = dim.apply(body.alpha, u) - dim.velocity(phi, a)
@@ -171,15 +212,9 @@ class Interface:
             by_ed[d + r :] += 2.0 * turned
             if by_theta is not None:
                 by_e[d + r :] += product(by_theta[2], Bd[d:])
-        return by_e, by_ed, by_edd
-
-    def turned(self, motion: np.ndarray) -> np.ndarray:
-        """Return the derivative of its motion in its own components."""
-        d, r, back = self.dim.d, self.dim.r, self.turning.R.swapaxes(0, 1)
-        parts = motion[:d], motion[d : d + r], motion[d + r :]
-        a, w, wd = parts
-        rotated = self.dim.rotated
-        return np.concatenate([product(back, a), rotated(back, w), rotated(back, wd)])
+        back = self.turning.R.swapaxes(0, 1)
+        parts = out[:d], out[d : d + r], out[d + r :]
+        return np.concatenate([product(back, parts[0]), *(dim.rotated(back, x) for x in parts[1:])])
 
     def pulled_back(self, by: Motion) -> tuple[Motion, Motion]:
         """Return derivatives by the body's motion from those by the interface's (n).
@@ -227,6 +262,12 @@ class Interface:
         """Derivative of the rows by a load of `in_body` (d + r, q, n)."""
         B, d = self.body.V[self.places], self.dim.d
         return np.concatenate([B[:d], self.turning.pushed(B[d:])])
+
+    @cached_property
+    def rows_by_own_load(self) -> np.ndarray:
+        """Derivative of the rows by a load in its own components (d + r, q, n)."""
+        d = self.dim.d
+        return np.concatenate(self.in_interface((self.rows_by_load[:d], self.rows_by_load[d:])))
 
 
 class MovingJoint:
@@ -318,19 +359,22 @@ class MovingJoint:
 
     # -- derivatives -------------------------------------------------------------------------
 
-    def moved_by_interface(self, motion: np.ndarray) -> np.ndarray:
-        """Return the derivative of the motion from that of the interface's (d + 2 r, ..., n)."""
-        dim, d, r, back = self.dim, self.dim.d, self.dim.r, self.R.swapaxes(0, 1)
-        a, w, wd = motion[:d], motion[d : d + r], motion[d + r :]
+    @cached_property
+    def passage(self) -> Passage:
+        """From the interface's motion to that of the body's frame."""
+        dim, back = self.dim, self.R.swapaxes(0, 1)
+        by_w = by_wd = turned = None
         if self.is_offset:
-            a = a + dim.velocity(wd, self.r)
-            a += product(dim.centripetal_by_spin(self.inner[1], self.r), w)
-        a, w, wd = product(back, a), dim.rotated(back, w), dim.rotated(back, wd)
+            by_w = product(back, dim.centripetal_by_spin(self.inner[1], self.r))
+            by_wd = product(back, dim.by_spin(self.r))
         if self.rates is not None and self.slides:
-            a = a + 2.0 * dim.velocity(w, self._rate)
-        elif self.rates is not None and r > 1:
-            wd = wd - dim.commutator(self._rate, w)
-        return np.concatenate([a, w, wd])
+            spun = 2.0 * dim.by_spin(self._rate)
+            if dim.r > 1:
+                spun = product(spun, back[..., None] if back.ndim == 2 else back)
+            by_w = spun if by_w is None else by_w + spun
+        elif self.rates is not None and dim.r > 1:
+            turned = -product(dim.skew(self._rate), back)
+        return Passage(dim, back, by_w, by_wd, turned)
 
     def pulled_back(self, by: Motion) -> Motion:
         """Return derivatives by the interface's motion from those by the body's."""

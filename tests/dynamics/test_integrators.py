@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -21,6 +22,7 @@ from dolfinopt.dynamics.collocation import (
     at_stages,
     counted,
     even_steps,
+    first_num_steps,
     residual_at,
     stages_of,
 )
@@ -61,9 +63,8 @@ def still(t: np.ndarray) -> RigidMotion:
 def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMotion:
     """Return a quintic motion of that size over 0.6 s, then rest."""
     s, sd, sdd = quintic(t, ENDS[1])
-    return RigidMotion(
-        HOMES[: len(size)] + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size)
-    )
+    home = np.resize(HOMES, len(size))
+    return RigidMotion(home + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size))
 
 
 def two_arms(
@@ -740,6 +741,71 @@ def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limits) -
         for name in ("C", "M", "G", "K", "outboard"):
             # Multipliers are corrected to 1e-8, largest component.
             assert_close(getattr(a, name), getattr(b, name), 1e-8)
+
+
+def test_long_chain_takes_held_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight arms: no matrix of all stages for the last grid and the adjoint, which is exact."""
+    tip = np.array([0.2, 0.5, *[0.3, -0.3] * 3, 0.3])  # m, rad
+    arms = [fine_beam(3, 1) for _ in range(8)]
+    stiff = tuple(replace(arm, K=40.0 * (8 - k) ** 3 * arm.K) for k, arm in enumerate(arms))
+    mechanism = Chain(stiff, 0.5, 0.01, (0.0, -9.81), 0.0).mechanism()
+    problem = ElasticSystem(mechanism, lambda t: reach(t, tuple(tip)), ENDS)
+    dense: list[int] = []
+
+    def spy(stages: Stages, *others: np.ndarray) -> NewtonMatrix:
+        dense.append(len(stages.h))
+        return factorise(stages, *others)
+
+    for module in (factors, radau, adjoint):
+        monkeypatch.setattr(module, "factorise", spy)
+    tracemalloc.start()
+    found = radau.integrate(problem, 1e-4, 4, Profile())
+    t = np.linspace(0.0, 1.0, 31)
+    by_q = found.sample(t) @ mechanism.stiffness()
+    slopes = Adjoint(problem, found).gradient(t, by_q)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert max(dense, default=0) < len(found.a)
+    assert peak < 160e6  # bytes: 133e6, and 193e6 with matrices of all stages
+    monkeypatch.setattr(adjoint, "ADJOINT_CORRECTIONS_LIMIT", 0)
+    slow_up_to(monkeypatch, (np.inf,))
+    for a, b in zip(slopes, Adjoint(problem, found).gradient(t, by_q), strict=True):
+        for name in ("C", "M", "G", "K", "outboard"):
+            # Multipliers are corrected to 1e-9, largest component.
+            assert_close(getattr(a, name), getattr(b, name), 1e-9)
+
+
+# -- stiff arms ------------------------------------------------------------------------------
+
+
+def waves(number: int) -> Motion:
+    """Return motions of so many waves within 2 s, from rest to rest."""
+    ends = np.polynomial.Polynomial([0.0, 0.0, 0.0, 8.0, -12.0, 6.0, -1.0])  # (t (2 - t))^3
+
+    def motion(t: np.ndarray) -> RigidMotion:
+        w = np.pi * number
+        sine = [np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)]
+        window = [ends.deriv(k)(t) if k else ends(t) for k in range(3)]
+        first = window[1] * sine[0] + window[0] * sine[1]
+        second = window[2] * sine[0] + 2.0 * window[1] * sine[1] + window[0] * sine[2]
+        size = np.array([0.05, 0.6, -0.4])  # m, rad
+        return RigidMotion(*(np.outer(x, size) for x in (window[0] * sine[0], first, second)))
+
+    return motion
+
+
+@pytest.mark.parametrize("damping", [0.0, 2e-4])
+@pytest.mark.parametrize("number", [2, 16])
+def test_steps_of_stiff_arms_follow_the_motion(number: int, damping: float) -> None:
+    """Far fewer than eight steps a period, where vibrations are below the tolerance."""
+    stiff = {"bending": 4e5, "axial": 1.2e7, "damping": damping}
+    problem, _ = two_arms(waves(number), (0.0, 2.0), **stiff)
+    usual = first_num_steps(problem)
+    fine = radau.on_grid(problem, even_steps(problem, 2 * usual), 1e-8, 5)
+    for tolerance, most in ((1e-3, usual / 10), (1e-4, usual / 3), (1e-6, np.inf)):
+        found = radau.integrate(problem, tolerance, 4, Profile())
+        assert distance(problem, found, fine) <= tolerance
+        assert len(found.a) <= most
 
 
 # -- warm start, counts, sampling ------------------------------------------------------------

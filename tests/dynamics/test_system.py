@@ -65,6 +65,9 @@ class Pendulum:
     def slowest_frequency(self) -> float:
         return float(np.sqrt(GRAVITY))
 
+    def prescribed(self, t: np.ndarray) -> None:
+        return None
+
     def describe(self, q: np.ndarray) -> str:
         return "it moves"
 

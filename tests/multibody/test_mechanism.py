@@ -20,6 +20,8 @@ from bodies import (
 )
 from runs import ROOT
 
+from dolfinopt.multibody import measured
+from dolfinopt.multibody import tangent as tangents
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.kinematics import (
     Posed,
@@ -186,6 +188,18 @@ def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
         found = tangent.times(*change, wanted).reshape(expected.shape)
         assert_close(found, expected, DIFFERENCES, 10.0 * scale)
         assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
+    """The same as of all at once."""
+    one = machine_of(kind, 3 * measured.LEAST_INSTANTS)
+    rigid = np.arange(one.rigid)
+    whole = one.tangent(None, rigid)
+    monkeypatch.setattr(tangents, "DERIVATIVES_BYTES", 1.0)
+    parts = one.tangent(None, rigid)
+    assert_close(parts.dense(), whole.dense(), ROUNDING)
+    assert_close(parts.drives, whole.drives, ROUNDING)
 
 
 @pytest.mark.parametrize("name", CONSTANTS)
