@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import runs
+import shapely
 from cutter import deepest_left
 from parts import folder_with, frame, write_run
 from runs import refusal, refused, run
@@ -20,7 +21,8 @@ from dolfinopt.part.part import Curves, make_parts
 from dolfinopt.part.plane.curves import MIRROR, Arc, Spline, direction
 from dolfinopt.part.plane.free_outline import free_outline
 from dolfinopt.part.plane.layouts import trusses_of
-from dolfinopt.part.plane.part import make_part
+from dolfinopt.part.plane.part import cut, make_part
+from dolfinopt.part.widths import narrowest_within
 from dolfinopt.responses.constraints import EXCESS
 
 pytestmark = pytest.mark.serial
@@ -164,6 +166,26 @@ def test_interrupted_search_keeps_the_best(made):
     found = optimize_parts(scene, parts, STEPS, tell)
     assert found.interrupted and found.best.ending == "interrupted"
     assert found.best.iterations == 2 and found.best.value < found.before
+
+
+def test_what_is_cut_has_wide_necks_and_round_corners(design):
+    """A notch of 20 x 5 mm in a flange of 15 mm leaves 10 mm; 12 mm are asked for, and a tool."""
+    part = make_part(design(frame), Curves(0.003))
+    drawn = part.outline.polygon
+    top = max(drawn.interiors[0].coords, key=lambda place: place[1])[1]
+    x = sum(drawn.interiors[0].bounds[::2]) / 2.0
+    notched = drawn.difference(shapely.box(x - 0.01, top - 0.005, x + 0.01, top + 0.005))
+    outline = replace(part.outline, polygon=notched)
+    assert narrowest_within(notched, 0.005).size == pytest.approx(0.010, abs=2e-4)
+    found = cut(outline, [], 0.012)
+    assert narrowest_within(found.polygon, 0.005).size >= 0.99 * 0.012
+    assert found.polygon.covers(notched) and found.area < notched.area + 20.0 * 3.0 * 1e-6
+
+    def left(polygon):  # by a disc of the tool's size from without, 10 um deep and more
+        closed = polygon.buffer(0.003, quad_segs=64).buffer(-0.003, quad_segs=64)
+        return closed.difference(polygon).buffer(-5e-6).area
+
+    assert left(found.polygon) == 0.0 < left(notched)
 
 
 def test_short_free_curves_stay(design):

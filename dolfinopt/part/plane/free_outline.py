@@ -13,6 +13,7 @@ them: moves are smooth over the length r. Source: Lazarov & Sigmund (2011), doi:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -36,7 +37,9 @@ from dolfinopt.part.plane.curves import (
     direction,
     joined,
 )
-from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.plane.part import NARROW, PlanePart, cut
+from dolfinopt.part.plane.trace import make_shape
+from dolfinopt.part.widths import thinnest_member, tight_places
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -65,6 +68,7 @@ AREA_STEPS = 3  # Newton's, for the area of the part that an outline was fitted 
 STEEP = 0.2  # most that curvature counts above the tool's in one rounding, times the spacing
 EVENLY = 20  # roundings after which control points are looked at for crowds
 PEAKS = 4  # places for every control point where curvature is looked at
+FINER = 0.5  # of the tolerance, for curves of what the tool has cut: it is round by all of it
 BESIDE = 2  # control points to either side whose room counts: as far as the filter reaches
 Tangents = tuple[np.ndarray | None, ...]  # directions at both ends of a line
 _GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(4), (1.0, 0.0)))
@@ -269,17 +273,24 @@ class FreeOutline:
 
     @property
     def made(self) -> PlanePart:
-        """The part with this outline, and what is measured of it."""
+        """The part with this outline, and what is measured of it; as the tool would cut it."""
         import shapely
 
-        part, chord = self.part, CHORD * self.part.domain.cell
+        part, chord = self.part, self.part.outline.chord
         outer, *holes = self.shape.polygons(chord)
-        polygon = shapely.Polygon(outer, holes)
-        drawn = replace(part.outline, polygon=polygon)
+        drawn = replace(part.outline, polygon=shapely.Polygon(outer, holes))
+        shape = joined(self.shape)
+        tool, least = drawn.tool_radius, part.domain.minimum_member
+        thin = thinnest_member(shape, part.domain.cell) or np.inf
+        if thin < NARROW * least or tight_places(shape, tool, part.tolerance):
+            arcs = [one for one in self.shape.curves if isinstance(one, Arc)]
+            drawn = cut(drawn, [one.centre for one in arcs if one.radius == drawn.rounding], least)
+            with suppress(InputError):  # what is left is told of
+                shape = make_shape(drawn, FINER * part.tolerance, area=drawn.area)
         old, *gaps = part.shape.polygons(chord)
-        apart = polygon.boundary.hausdorff_distance(shapely.Polygon(old, gaps).boundary)
-        shape = replace(joined(self.shape), apart=float(apart))
-        return replace(part, shape=shape, outline=drawn)
+        before = shapely.Polygon(old, gaps).boundary
+        apart = drawn.polygon.boundary.hausdorff_distance(before)
+        return replace(part, shape=replace(shape, apart=float(apart)), outline=drawn)
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:

@@ -15,11 +15,17 @@ from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, GRAY, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
+from dolfinopt.part.plane.outline import (
+    Outline,
+    default_tool,
+    draw_outline,
+    polygons_of,
+    rounded,
+)
 from dolfinopt.part.plane.simplify import simple_shape
 from dolfinopt.part.plane.trace import make_shape
 from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
-from dolfinopt.part.widths import TightPlace, thinnest_member, tight_places
+from dolfinopt.part.widths import TightPlace, narrowest_within, thinnest_member, tight_places
 from dolfinopt.part.workshop_files import (
     MM,
     dxf_text,
@@ -40,6 +46,9 @@ if TYPE_CHECKING:
 TOLD = 5  # tight places that a sentence names
 SIMPLE = 0.25  # distance of simplified outlines by default, cells
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
+DISCS, ROUND = 20, 64  # that widen necks, at most; sides of a quarter of one
+ROUGH = 0.002  # distance of polygons in which necks are looked for, cells
+NARROW = 0.99  # share of the smallest member below which a neck is widened
 TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
 
 
@@ -239,6 +248,36 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
             return PlanePart(domain, outline, shape, fine)
     shape = make_shape(outline, fine, curves.arcs)
     return PlanePart(domain, outline, shape, fine, curves.simplify)
+
+
+def cut(outline: Outline, centres: Sequence[np.ndarray], least: float) -> Outline:
+    """Return an outline whose necks are wide enough, and its concave corners round, by material.
+
+    Necks get discs as wide as the smallest member, corners that the tool does not reach are filled.
+
+    Args:
+        outline: as drawn.
+        centres: of arcs of the tool that it has already, m.
+        least: smallest width of members, m.
+    """
+    import shapely
+
+    domain, chord = outline.domain, outline.chord
+    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
+    polygon, inner = outline.polygon, arm.buffer(-0.5 * least)
+    for _ in range(DISCS):
+        rough = polygon.simplify(ROUGH * domain.cell)
+        narrow = narrowest_within(rough, domain.cell, NARROW * least)
+        if narrow is None or inner.is_empty:
+            break
+        middle = shapely.shortest_line(inner, shapely.Point(narrow.place)).coords[0]
+        disc = shapely.Point(middle).buffer(0.5 * least, quad_segs=ROUND)
+        polygon = polygon.union(disc)
+        if domain.symmetric:
+            polygon = polygon.union(shapely.affinity.scale(disc, yfact=-1.0, origin=(0.0, 0.0)))
+    closed, new = rounded(polygon, outline.rounding, chord)
+    polygon = max(polygons_of(closed.intersection(arm)), key=lambda one: one.area)
+    return replace(outline, polygon=polygon, centres=np.vstack([*centres, new]))
 
 
 def simplified(part: PlanePart, tolerance: float | None = None) -> PlanePart:
