@@ -147,7 +147,6 @@ def export(
 
 
 STATE_SPACE = ("state_space.npz", "state_space.mat")
-POLES_SHOWN = 5  # on the screen
 
 
 def _export_state_space(
@@ -225,7 +224,7 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
         f"{len(model.outputs)} outputs; in {npz}, {mat.name}"
     )
     poles = [pole for pole in model.poles if pole.imag >= 0.0]
-    for pole in poles[:POLES_SHOWN]:
+    for pole in poles[:5]:
         size = abs(pole)
         damping = -pole.real / size if size > 0.0 else 0.0
         click.echo(f"  pole {pole:.5g} 1/s: {size / (2.0 * np.pi):.4g} Hz, damping {damping:.3g}")

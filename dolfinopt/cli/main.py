@@ -79,8 +79,6 @@ def init(name: Path, template: str) -> None:
 
 # -- `dolfinopt keys` ----------------------------------------------------------------------------
 
-WIDTH = 92
-
 
 @click.command()
 @click.argument("pattern", required=False)
@@ -138,7 +136,7 @@ def _explained(info: KeyInfo) -> str:
     default = "required" if not info.default else f"default {info.default}"
     rows = [f"{info.key}{unit}: {info.allowed}; {default}", meaning]
     return "\n".join(
-        textwrap.fill(row, WIDTH, initial_indent=indent, subsequent_indent="    ")
+        textwrap.fill(row, 92, initial_indent=indent, subsequent_indent="    ")
         for row, indent in zip(rows, ("", "    "))
     )
 

@@ -539,7 +539,6 @@ def end_before_start(error: BaseException) -> int:
 
 
 WIDE = 110  # characters a line
-EVERY = 5.0  # s between two lines where there is no terminal
 
 
 def _words(row: HistoryRow, iterations: int) -> str:
@@ -558,7 +557,7 @@ def _words(row: HistoryRow, iterations: int) -> str:
 
 
 @contextmanager
-def plain_lines(iterations: int, every: float = EVERY) -> Iterator[Callable[[HistoryRow], None]]:
+def plain_lines(iterations: int, every: float = 5.0) -> Iterator[Callable[[HistoryRow], None]]:
     """Yield a function that takes a history row; print the last one every few seconds.
 
     A thread prints, so that a single long iteration is not silent either.

@@ -664,9 +664,6 @@ def versions() -> dict[str, str]:
 # -- table of the deflection's budget --------------------------------------------------------
 
 
-BUDGET_FILE = "budget.csv"
-
-
 def budget_of(trajectory: Trajectory | None) -> dict[str, Any] | None:
     """Return the budget as summary.json has it; None without a motion or a deviation."""
     found = None if trajectory is None else deflection_budget(trajectory)
@@ -681,4 +678,4 @@ def write_budget(folder: Path, budget: Mapping[str, Any] | None) -> None:
         f"{one['kind']},{one['name']},{one['deflection']:.10g},{one['share']:.10g}\n"
         for one in budget["parts"]
     ]
-    write_text(folder / BUDGET_FILE, "".join(["kind,part,deflection [m],share [-]\n", *rows]))
+    write_text(folder / "budget.csv", "".join(["kind,part,deflection [m],share [-]\n", *rows]))

@@ -13,8 +13,10 @@ from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.trajectory import drive_units, free_drives
 from dolfinopt.plots.style import (
     BLUE,
+    FEW_POINTS,
     INITIAL,
     LINE_WIDTH,
+    MILLI,
     OPTIMISED,
     ORANGE,
     log_scale,
@@ -36,11 +38,7 @@ if TYPE_CHECKING:
     from dolfinopt.scene.load import Scene
 
 DEVIATION = "Deviation of the end-effector from the rigid path"
-OF_CONTROL = "Deviation of the end-effector from the desired path"
-OF_SLIDER = "Deviation of the slider from that of rigid arms"
 LIMIT = "0.35"  # colour of limits
-FEW = 40  # points a line that get markers
-MILLI = 1e3
 
 
 def panel_grid(used: np.ndarray, title: str, abscissa: str) -> tuple[Figure, np.ndarray]:
@@ -170,7 +168,7 @@ def _draw_history_panel(
     positive = values > 0.0
     if not linear:  # nothing has changed yet at the first row; zero has no logarithm
         values = np.where(positive, values, np.nan) if positive.any() else values
-    marker = "o" if len(values) <= FEW else ""
+    marker = "o" if len(values) <= FEW_POINTS else ""
     axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, lw=LINE_WIDTH, clip_on=False)
     finite, ends = values[np.isfinite(values)], ""
     if limit is not None:
@@ -201,9 +199,9 @@ def deviation_of(trajectory: Trajectory, initial: np.ndarray | None) -> Figure:
 def deviation_title(trajectory: Trajectory) -> str:
     """Return what of a motion deviates from what."""
     if trajectory.closure is not None:
-        return OF_SLIDER
+        return "Deviation of the slider from that of rigid arms"
     controlled = trajectory.is_machine and (trajectory.scene.control or not trajectory.loops)
-    return OF_CONTROL if controlled else DEVIATION
+    return "Deviation of the end-effector from the desired path" if controlled else DEVIATION
 
 
 def deviation_figure(

@@ -16,6 +16,7 @@ from dolfinopt.plots.style import (
     COLOURS,
     DENSITY,
     GREY,
+    MILLI,
     ORANGE,
     Box,
     colour_scale,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 REGION = {"solid": ORANGE, "void": BLUE}  # borders of what stays solid and void
 STRESS_COLOURS = "YlOrRd"  # nothing is light, the largest dark
 STRESS = "largest von Mises stress along the motion [MPa]"
-MILLI, MEGA = 1e3, 1e-6
+MEGA = 1e-6
 LOW = 0.45  # inches, least height of an arm's axes
 PLATE = 1.0  # inches, likewise of a plate
 FOOT = 1.35  # inches, for the label of x and the scale of colours

@@ -245,7 +245,6 @@ def _slender(view: ArmView, size: float) -> ArmView:
 
 
 POSES = 5
-LOOP_POSES = 4  # of one turn
 PALE = 0.3  # share of its colour
 BASE = "#c9c9c9"  # carts, pedestals and sliders
 UNDESIGNED = "#8a8a8a"  # arms without a design
@@ -356,7 +355,7 @@ def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str)
     whole = plane_motion(views, mechanism, closure, q_r if closed is None else closed, rigid)
     at = poses_along(whole.place[:, -1], POSES)
     if closure is not None:
-        at = poses_of_turn(whole.place[:, 1], q_r[:, 1], LOOP_POSES)
+        at = poses_of_turn(whole.place[:, 1], q_r[:, 1], 4)
     motion, size = whole[at], reach(mechanism)
     paths = _paths(whole, trajectory)
     # Room for the instants, which stand beyond ends that may be anywhere.

@@ -18,14 +18,22 @@ from dolfinopt.output.views import AROUND, ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
 from dolfinopt.plots.design import (
     MEGA,
-    MILLI,
     STRESS,
     STRESS_COLOURS,
     draw_ring,
     known_stress,
     scale_marks,
 )
-from dolfinopt.plots.style import DPI, GREY, Box, colour_scale, new_figure, stacked_axes, ticks
+from dolfinopt.plots.style import (
+    DPI,
+    GREY,
+    MILLI,
+    Box,
+    colour_scale,
+    new_figure,
+    stacked_axes,
+    ticks,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.multibody.closures import Loops
 
-POSES = 4
 MOST = (10.0, 8.0)  # inches, of the picture
 ABOVE, BELOW, SIDE = 0.55, 0.3, 0.2  # inches
 FILM_MOST = (7.5, 6.5)  # inches, of a film
@@ -144,7 +143,7 @@ def solid_machine_figure(
     return figure
 
 
-def path_poses(path: np.ndarray, count: int = POSES) -> np.ndarray:
+def path_poses(path: np.ndarray, count: int = 4) -> np.ndarray:
     """Return the indices of `count` points (n, 3), evenly spaced along their path."""
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     return poses_along(np.concatenate([[0.0], np.cumsum(steps)]) + 0j, count)

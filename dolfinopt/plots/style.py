@@ -33,6 +33,8 @@ INITIAL, OPTIMISED = "initial design", "optimised design"
 KNOWN = {OPTIMISED: 0, INITIAL: 1}  # the same in all pictures of all runs
 LOOKS = len(PALETTE) * len(DASHES)
 LONGEST = 60  # characters of a name in a legend
+FEW_POINTS = 40  # of a line, which gets markers
+MILLI = 1e3
 SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
 PathLike = str | os.PathLike[str]

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FEW = 40  # points a line that get markers
-NARROW = 5.4  # inches, of a column
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
 LEGEND: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9, "handlelength": 5.0}
@@ -87,7 +85,7 @@ def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     panels = figure.panels
     styles = styles or common_looks([figure])
     heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
-    drawn = style.new_figure(NARROW, sum(heights), 160)
+    drawn = style.new_figure(5.4, sum(heights), 160)
     grid = drawn.subplots(len(panels), 1, squeeze=False, height_ratios=[1.0] * len(panels))[:, 0]
     for axes, panel in zip(grid, panels, strict=True):
         _draw_panel(axes, panel, styles)
@@ -103,7 +101,7 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
 
     for line in panel.lines:
         look = dict(styles[line.label])
-        if len(line.x) > FEW:
+        if len(line.x) > style.FEW_POINTS:
             look["marker"] = ""
         axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **look)
     y = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
@@ -119,7 +117,7 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
         style.log2_scale(axes)
     elif len(x) and (x % 1 == 0).all() and not panel.log:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if any(len(line.x) > FEW for line in panel.lines):
+    if any(len(line.x) > style.FEW_POINTS for line in panel.lines):
         axes.set_xlim(x.min(), x.max())
     _label(axes, panel.title, panel.x_label, panel.y_label)
     axes.grid(True, alpha=0.3)

@@ -34,11 +34,9 @@ def flexibility(section: str, size: tuple[float, float, float], cells) -> np.nda
 
 
 def box(size: tuple[float, float, float]) -> np.ndarray:
-    """Return the same by Timoshenko, and Bredt with both ends held from warping (Benscoter).
-
-    mu = ((h - b) / (h + b))^2, k^2 = mu G J / (E I_w): the ends take 2 mu / k tanh(k L / 2) of the
-    length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
-    """
+    """Return the same by Timoshenko, and Bredt with both ends held from warping (Benscoter)."""
+    # mu = ((h - b) / (h + b))^2, k^2 = mu G J / (E I_w): the ends take 2 mu / k tanh(k L / 2) of
+    # the length. Source: Kollbrunner & Basler, Torsion in Structures, Springer 1969.
     L, h, b = size
     t = min(h, b) / 40.0
     hi, bi, hm, bm = h - 2.0 * t, b - 2.0 * t, h - t, b - t
@@ -117,10 +115,8 @@ def box_of_solids(size: tuple[float, float, float], along: int) -> np.ndarray:
     [((0.6, 0.16, 0.08), (20, 6, 4), 0.012), ((0.5, 0.2, 0.05), (20, 8, 4), 0.045)],
 )
 def test_short_wide_boxes(size, cells, lag):
-    """Solids are met to 0.3 % where wide sides lag behind the theory of beams (shear lag).
-
-    With cells half as large the solids are 0.3 % softer, and within 0.13 % of these boxes.
-    """
+    """Solids are met to 0.3 % where wide sides lag behind the theory of beams (shear lag)."""
+    # With cells half as large the solids are 0.3 % softer, and within 0.13 % of these boxes.
     solids = box_of_solids(size, 20)
     assert np.abs(solids / box(size) - 1.0).max() > lag
     assert flexibility("box", size, cells) == pytest.approx(solids, rel=3e-3)

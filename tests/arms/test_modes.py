@@ -188,11 +188,9 @@ def stubby() -> Arm:
 
 @cache
 def coinciding() -> RigidIntegrals:
-    """Return what the stubby arm carries when its two lowest frequencies are equal.
-
-    They repel each other unless two numbers are right, by Newton's method: a change dM gives the
-    pair's matrix -lambda phi' dM phi, which has to close the gap and must not mix them.
-    """
+    """Return what the stubby arm carries when its two lowest frequencies are equal."""
+    # They repel each other unless two numbers are right, by Newton's method: a change dM gives the
+    # pair's matrix -lambda phi' dM phi, which has to close the gap and must not mix them.
     arm, moment, inertia = stubby(), -0.15 * MASS, 2.5 + 0.15**2 * MASS
     for _ in range(20):
         carried = RigidIntegrals(MASS, complex(moment, 0.0), inertia)
@@ -301,10 +299,8 @@ def test_first_frequency_of_a_solid_arm() -> None:
 
 
 def euler_value(mass: float, inertia: float, height: float) -> float:
-    """Return the lowest squared frequency of Euler's beam, 1 m long, with a tip body.
-
-    w = A (cosh bx - cos bx) + B (sinh bx - sin bx), EI w_xx = s^2 J w_x, EI w_xxx = -s^2 m w.
-    """
+    """Return the lowest squared frequency of Euler's beam, 1 m long, with a tip body."""
+    # w = A (cosh bx - cos bx) + B (sinh bx - sin bx), EI w_xx = s^2 J w_x, EI w_xxx = -s^2 m w.
     bending, line = 70e9 * 0.01 * height**3 / 12.0, 2700.0 * 0.01 * height  # N m2, kg/m
 
     def determinant(b: float) -> float:

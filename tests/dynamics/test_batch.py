@@ -87,13 +87,7 @@ def test_scales_are_those_of_scaled_bodies():
     payload = rng.uniform(0.5, 2.0, (4, 4))
     q, qd, qdd = rng.normal(size=(3, 4, 6))
     motion = RigidMotion(*rng.normal(size=(3, 4, 3)))
-    many = plane_chain(
-        tuple(bodies),
-        payload[:, 0],
-        payload[:, 1],
-        (payload[:, 2], payload[:, 3]),
-        0.0,
-    )
+    many = plane_chain(tuple(bodies), *payload.T[:2], tuple(payload.T[2:]), 0.0)
     many = replace(many, scales=tuple(Scale(*factors[:, k].T.copy()) for k in range(2)))
     rows, drives = inverse_dynamics(many, motion, q, qd, qdd)
     slopes = linearise(many, motion, q, qd, qdd)

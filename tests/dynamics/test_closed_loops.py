@@ -51,10 +51,8 @@ def test_slider_crank_of_exact_beams(name, height, cells, bending, guide) -> Non
 
 
 def test_more_coordinates_and_a_finer_tolerance_converge() -> None:
-    """A compressed rod: axial coordinates keep a positive mass while soft ones deflect.
-
-    Theory of first order fails with 8 coordinates and 1e-5. Four coordinates are off by 0.5 %.
-    """
+    """A compressed rod: axial coordinates keep a positive mass while soft ones deflect."""
+    # Theory of first order fails with 8 coordinates and 1e-5. Four coordinates are off by 0.5 %.
     largest = {}
     for q in (4, 8):
         for tolerance in (1e-3, 1e-5):

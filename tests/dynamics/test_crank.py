@@ -32,11 +32,9 @@ STATE = {
 
 
 def test_forces_of_its_state() -> None:
-    """Its end state fulfils the equations to rounding, with its multipliers, to all its digits.
-
-    The ground's force on the rod is -lambda_1 of the closure's -G' lambda; the crank's moment
-    -lambda_3.
-    """
+    """Its end state fulfils the equations to rounding, with its multipliers, to all its digits."""
+    # The ground's force on the rod is -lambda_1 of the closure's -G' lambda; the crank's moment
+    # -lambda_3.
     system, t = crank(rod()), np.array([END])
     rigid = desired(t)
     parts = []
@@ -55,14 +53,12 @@ def test_forces_of_its_state() -> None:
 
 
 def test_motion() -> None:
-    """All digits of the reference that its start leaves to it, positions and multipliers.
-
-    Axial vibrations of 2.5e4 rad/s, undamped, must be resolved: of 200 N, 1e-3 N are theirs, which
-    800 steps of 5 stages damp away. What is left: the file's slider starts 2.0e-10 m off the
-    closure and stays there; q1 differs by 4.3e-11 m, as it does from `STATE`, another solver's.
-    Multipliers cannot be had much better: rounding of the closure grows in them as 1 / step^2, to
-    1.5e-6 with 6400 steps.
-    """
+    """All digits of the reference that its start leaves to it, positions and multipliers."""
+    # Axial vibrations of 2.5e4 rad/s, undamped, must be resolved: of 200 N, 1e-3 N are theirs,
+    # which 800 steps of 5 stages damp away. What is left: the file's slider starts 2.0e-10 m off
+    # the closure and stays there; q1 differs by 4.3e-11 m, as it does from `STATE`, another
+    # solver's. Multipliers cannot be had much better: rounding of the closure grows in them as 1 /
+    # step^2, to 1.5e-6 with 6400 steps.
     system = crank(rod())
     solution = solved(system, 3200, 5)
     y, yd, ydd = unknowns(system, solution)
@@ -114,11 +110,9 @@ def fitted_orders(body: ShapeIntegrals, stages: int, counts: tuple[int, ...]) ->
     ("stages", "counts"), [(2, (100, 200, 400)), (3, (40, 80, 160)), (4, (20, 40, 80))]
 )
 def test_orders(stages: int, counts: tuple[int, ...]) -> None:
-    """With s stages: positions 2 s - 1, velocities s, multipliers s - 1, at the steps' ends.
-
-    Of a rod a thousand times as soft, so that the steps resolve its vibrations. Source: Hairer,
-    Lubich & Roche (1989), doi:10.1007/BFb0093947, theorem 6.4.
-    """
+    """With s stages: positions 2 s - 1, velocities s, multipliers s - 1, at the steps' ends."""
+    # Of a rod a thousand times as soft, so that the steps resolve its vibrations. Source: Hairer,
+    # Lubich & Roche (1989), doi:10.1007/BFb0093947, theorem 6.4.
     soft = replace(rod(), K=1e-3 * rod().K)
     found = fitted_orders(soft, stages, counts)
     # Measured: 3.00 1.96 1.01; 4.99 2.98 2.03; 6.99 4.01 3.16.

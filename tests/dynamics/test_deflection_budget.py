@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 from machines import Tree, fork, loop_tree, simulated, two_arm, with_keys
-from runs import TWO_ARM, demo, overrides, run
+from runs import TWO_ARM, demo, overrides, run, summary_of
 
 from dolfinopt.dynamics.budget import Budget, deflection_budget
 
@@ -21,9 +19,7 @@ LENGTHS = (0.6, 0.4)  # m
 
 def budget_of(tree: Tree) -> Budget:
     """Return the budget of a scene's initial design."""
-    trajectory = simulated(tree).trajectory
-    assert trajectory is not None
-    found = deflection_budget(trajectory)
+    found = deflection_budget(simulated(tree).trajectory)
     assert found is not None
     return found
 
@@ -36,8 +32,7 @@ def by_part(budget: Budget) -> dict[tuple[str, str], float]:
 def held_level(tmp_path, **changes) -> Tree:
     """Return a level, rigid beam and a level arm at its end, weightless, that hold a payload."""
     file = tmp_path / "still.csv"
-    file.write_text("t,beam,arm\n0,0,0\n"
-                    "0.2,0,0\n")  # fmt: skip
+    file.write_text("t,beam,arm\n0,0,0\n0.2,0,0\n")
     bar = {"height": 0.05, "thickness": 0.02, "passive": 0.0, "density": 1e-3}
     tree = two_arm()
     tree["arms"] = [
@@ -125,10 +120,8 @@ def test_statics_in_space(tmp_path) -> None:
 
 def test_of_a_slider_and_of_a_pin(tmp_path) -> None:
     """A slider's deviation is that of its rod; a pinned end has none."""
-    trajectory = simulated(loop_tree("slider")).trajectory
-    assert trajectory is not None
-    budget = deflection_budget(trajectory)
-    assert budget is not None and list(budget.shares) == ["links"]
+    budget = budget_of(loop_tree("slider"))
+    assert list(budget.shares) == ["links"]
     assert budget.linear == pytest.approx(budget.deviation, rel=0.05)
     assert deflection_budget(simulated(loop_tree("pin")).trajectory) is None
 
@@ -163,7 +156,7 @@ def test_budget_is_the_first_thing_told(tmp_path, capsys) -> None:
     run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "run", *overrides(
         "arms.cells=[16,3]", "motion.horizon=1.9", "simulation.tolerance=1e-3",
         "arms.gear_stiffness=1e4"))  # fmt: skip
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "run")
     found = summary["deflection_budget"]
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"links hold {100.0 * found['shares']['links']:.3g} % of the defl")

@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 from machines import (
-    GAINS,
     Tree,
     apart,
-    energies,
+    check_energy,
     fork,
-    imbalance,
     machine,
     reference,
     simulated,
+    small_two_arm,
     two_arm,
     with_keys,
 )
@@ -98,12 +97,8 @@ def test_elastic_joints_of_another_program(kind, most, tmp_path) -> None:
 
 
 def small(joints: Tree, **changes: Any) -> Tree:
-    """Return the controlled machine on few cells, its arms with keys of their joints."""
-    cells = ("arms.cells=[16,3]", "reduction.coordinates=3", "motion.horizon=1.9")
-    tree = two_arm(*cells, control=GAINS, simulation={"stiffening": True, "tolerance": 1e-5})
-    for arm in tree["arms"]:
-        arm |= joints
-    return with_keys(tree, {"motion": EARTH, **changes})
+    """Return the controlled machine under gravity."""
+    return small_two_arm(joints, **{"motion": EARTH, **changes})
 
 
 def forked(tmp_path, parts: Tree, **changes: Any) -> Tree:
@@ -138,12 +133,7 @@ SCENES = {
 @pytest.mark.parametrize("kind", SCENES)
 def test_work_is_energy(kind, tmp_path) -> None:
     """Drive work = kinetic + strain + potential energy + what dampers and friction took."""
-    result = simulated(SCENES[kind](tmp_path))
-    trajectory = result.trajectory
-    assert trajectory is not None
-    parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
-    assert min(parts) > 1e-4 * max(parts)  # each of them counts
-    assert imbalance(result) < 1e-7  # measured 3e-10 at most
+    check_energy(simulated(SCENES[kind](tmp_path)), 1e-7)  # measured 3e-10 at most
 
 
 def test_stiff_bearings_hold() -> None:
@@ -174,9 +164,8 @@ def test_friction_of_prescribed_joints_is_the_drives() -> None:
     v = free.desired.qd[:, 1:]
     expected = 5.0 * v + 10.0 * np.tanh(v / 0.1)
     change = (rubbed.joint_forces - free.joint_forces)[:, 1:]
-    np.testing.assert_allclose(
-        change, expected, rtol=0, atol=1e-12 * np.abs(free.joint_forces).max()
-    )
+    size = np.abs(free.joint_forces).max()
+    np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
 
 
 @pytest.mark.parametrize("kind", ["plane", "space"])
@@ -219,11 +208,9 @@ def test_bearings_stand_in_files(tmp_path) -> None:
 
 
 def frame(angle: float, springs: tuple[float, float], masses: tuple[float, float]) -> np.ndarray:
-    """Return the lowest three frequencies of two links as Timoshenko beams on springs, Hz.
-
-    Each of 20 elements, 0.5 and 0.54 x 0.03 x 0.01 m of aluminium, the second turned by `angle`,
-    rotational springs inboard of both, point masses at both outboard ends.
-    """
+    """Return the lowest three frequencies of two links as Timoshenko beams on springs, Hz."""
+    # Each of 20 elements, 0.5 and 0.54 x 0.03 x 0.01 m of aluminium, the second turned by `angle`,
+    # rotational springs inboard of both, point masses at both outboard ends.
     E, G, rho, h, b, count = 70e9, 70e9 / 2.66, 2700.0, 0.03, 0.01, 20
     A, inertia = b * h, b * h**3 / 12.0
     size = 3 * (2 * count + 1) + 2  # the joints' own rotations stand last: ground and elbow
@@ -308,11 +295,9 @@ TWO_LINKS = {
 
 @pytest.mark.parametrize(("slenderness", "elbow"), TWO_LINKS)
 def test_frequencies_of_two_links_with_lumped_masses(slenderness, elbow, tmp_path) -> None:
-    """Against published ones, with the masses and sections that belong to them.
-
-    Those are known from its Euler-Bernoulli columns, seven numbers by least squares from 96
-    frequencies, which a frame of beams then meets to 2e-4.
-    """
+    """Against published ones, with the masses and sections that belong to them."""
+    # Those are known from its Euler-Bernoulli columns, seven numbers by least squares from 96
+    # frequencies, which a frame of beams then meets to 2e-4.
     height = 0.5 / slenderness
     bar = {"thickness": 0.025, "passive": 0.0, "element": "quadratic"}
     cells = [40, 4]

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import energies, fork, two_arm, with_keys
+from machines import energies, fork, trajectory_of, two_arm, with_keys
 from runs import scene
 
 import dolfinopt as do
-from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.dynamics.simulation import simulate_batch
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -38,12 +38,6 @@ def held(folder: Path, *forces: dict, **changes) -> Scene:
     return scene_from_dict(with_keys(tree, changes), str(folder / "held.toml"))
 
 
-def trajectory_of(one: Scene) -> Trajectory:
-    found = do.Model(one).simulate().trajectory
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize(
     ("force", "moment", "frame"),
     [((0.0, 2.0), 0.0, "arm"), ((0.0, 0.0), 1.5, "world"), ((0.0, -3.0), 1.0, "world")],
@@ -66,9 +60,8 @@ def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path) -> 
 
 
 def test_force_along_the_arm_stiffens_it(tmp_path) -> None:
-    """Pulled by P, a cantilever bends by F / P (L - tanh(kL) / k), k^2 = P / EI; source:
-    Timoshenko & Gere, Theory of Elastic Stability (1961), sec. 1.11.
-    """
+    """Pulled by P, a cantilever bends by F / P (L - tanh(kL) / k), k^2 = P / EI."""
+    # Timoshenko & Gere, Theory of Elastic Stability (1961), sec. 1.11.
     pull, across = 400.0, 1.0
     forces = {"arm": "arm", "force": [pull, across], "frame": "arm"}
     changes = {"simulation": {"stiffening": True}, "reduction": {"coordinates": 8}}

@@ -45,9 +45,6 @@ HOMES = np.array([0.0, 0.6, 0.8, -0.5])  # m, rad: where the motions begin
 ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
 
-# -- problems --------------------------------------------------------------------------------
-
-
 def swing(t: np.ndarray, size: tuple[float, ...] = (0.1, 0.5, -0.4)) -> RigidMotion:
     """Return harmonic motions that start without speed, smooth for ever."""
     w = np.array([3.0, 4.0, 5.0])  # rad/s
@@ -106,16 +103,12 @@ def pushed(t: np.ndarray) -> RigidMotion:
 
 
 def solve(
-    integrator: str, problem: ElasticSystem, tolerance: float, profile: Profile | None = None
+    integrator: str, problem: ElasticSystem, tolerance: float, profile=None, stages: int = 3
 ) -> Solution:
     """Run one of the two integrators."""
-    profile = profile or Profile()
     if integrator == "radau":
-        return radau.integrate(problem, tolerance, 3, profile)
-    return generalized_alpha.integrate(problem, tolerance, 0.8, profile)
-
-
-# -- coefficients ----------------------------------------------------------------------------
+        return radau.integrate(problem, tolerance, stages, profile or Profile())
+    return generalized_alpha.integrate(problem, tolerance, 0.8, profile or Profile())
 
 
 @pytest.mark.parametrize("stages", [1, 2, 3, 4, 5])
@@ -143,9 +136,6 @@ def test_generalized_alpha_weights(rho_inf: float) -> None:
         assert radius <= 1.0 + 1e-7  # coinciding eigenvalues move by the root of rounding
     # The limit's triple eigenvalue (rho_inf = 0) is off by the cube root of 1 / frequency^2.
     assert radius == pytest.approx(rho_inf, abs=2e-4)
-
-
-# -- closed forms ----------------------------------------------------------------------------
 
 
 @BOTH
@@ -182,9 +172,6 @@ def test_rest_under_gravity_is_static_equilibrium(integrator: str) -> None:
     t = np.linspace(0.0, 0.5, 51)
     # Rounding of the forces sets off vibrations of its own size.
     assert_close(solution.sample(t), np.broadcast_to(q, (51, 6)), 1e-9)
-
-
-# -- order -----------------------------------------------------------------------------------
 
 
 def fitted_order(
@@ -247,9 +234,6 @@ def test_order_of_generalized_alpha(rho_inf: float) -> None:
         assert order == pytest.approx(2.0, abs=0.1)
 
 
-# -- error control ---------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 @pytest.mark.parametrize("stages", [2, 4])
 def test_radau_meets_the_tolerance(stages: int, damping: float) -> None:
@@ -297,8 +281,6 @@ def test_relative_error_is_of_the_worst_arm() -> None:
     nothing = relative_error(mechanism, error, 0.0 * q)  # to compare with: the error itself
     assert nothing == pytest.approx(0.2 * np.sqrt(K), rel=1e-14)
 
-
-# -- robustness ------------------------------------------------------------------------------
 
 Answer = Callable[[int, Callable[[], Solution], np.ndarray], Solution]
 
@@ -384,10 +366,7 @@ def folded_arms() -> ElasticSystem:
 )
 def test_what_cannot_be_solved_is_a_named_error(integrator, problem, tolerance, stages, words):
     with pytest.raises(ConvergenceError, match=words):
-        if integrator == "radau":
-            radau.integrate(problem(), tolerance, stages, Profile())
-        else:
-            solve(integrator, problem(), tolerance)
+        solve(integrator, problem(), tolerance, stages=stages)
 
 
 @pytest.mark.parametrize("failing", [0, 1, 3])
@@ -514,10 +493,8 @@ def test_motion_that_every_grid_finds_otherwise_is_given_up(monkeypatch, on_grid
 
 
 def test_steps_follow_a_motion_with_a_short_event() -> None:
-    """A third of the length: for some milliseconds steps are 50 times shorter than elsewhere.
-
-    Even steps over 3 s, 100 x 6 cells, were 10 969.
-    """
+    """A third of the length: for some milliseconds steps are 50 times shorter than elsewhere."""
+    # Even steps over 3 s, 100 x 6 cells, were 10 969.
     trajectory = arms_of_a_scene("motion.duration=0.7")
     steps = np.diff(trajectory.solution.time_grid)
     assert len(steps) < 600
@@ -546,15 +523,10 @@ def test_nothing_moves_without_loads(integrator: str) -> None:
     assert not solution.sample(np.linspace(0.0, 1.0, 11)).any()
 
 
-# -- many coordinates ------------------------------------------------------------------------
-
-
 def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
-    """Return a cantilever of many coordinates, frequencies from 1.4 Hz to their squares.
-
-    v_k = 1 - cos(p_k u), w_k = sin(p_k u), p_k = (k - 1/2) pi, u = x / length: the second and first
-    derivatives are orthogonal, the stiffness is diagonal in closed form.
-    """
+    """Return a cantilever of many coordinates, frequencies from 1.4 Hz to their squares."""
+    # v_k = 1 - cos(p_k u), w_k = sin(p_k u), p_k = (k - 1/2) pi, u = x / length: the second and
+    # first derivatives are orthogonal, the stiffness is diagonal in closed form.
     length, count = 0.5, 8 * max(bending, axial)
     u = (np.arange(count) + 0.5) / count
     p, r = (np.arange(n) * np.pi + 0.5 * np.pi for n in (bending, axial))
@@ -576,9 +548,9 @@ def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> Elasti
     return ElasticSystem(chain.mechanism(), reach, ENDS)
 
 
-def some_stages(problem: ElasticSystem, count: int = 5) -> Stages:
-    """Return the stages of a few steps of two lengths, in modal coordinates."""
-    edges = np.concatenate([[0.0], 0.02 * np.cumsum(1.0 + np.arange(count) % 2)])
+def some_stages(problem: ElasticSystem) -> Stages:
+    """Return the stages of five steps of two lengths, in modal coordinates."""
+    edges = np.concatenate([[0.0], 0.02 * np.cumsum(1.0 + np.arange(5) % 2)])
     return stages_of(modes_of(problem), radau.radau_iia(3), edges)
 
 
@@ -665,10 +637,8 @@ def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> Non
 @pytest.mark.parametrize("stages", [3, 4])
 @pytest.mark.parametrize("steps", [8, 20])
 def test_estimate_of_vibrations_that_are_not_resolved(bending, stages, steps) -> None:
-    """Undamped arms, steps from a fifth of the slowest period to five of them.
-
-    Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
-    """
+    """Undamped arms, steps from a fifth of the slowest period to five of them."""
+    # Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
     problem, _ = two_arms(payload=0.0, bending=bending, damping=0.0)
     fine = radau.on_grid(problem, even_steps(problem, 800), 1e-7, 5)
     found = radau.on_grid(problem, even_steps(problem, steps), 1e-6, stages)
@@ -775,9 +745,6 @@ def test_long_chain_takes_held_matrices(monkeypatch: pytest.MonkeyPatch) -> None
             assert_close(getattr(a, name), getattr(b, name), 1e-9)
 
 
-# -- stiff arms ------------------------------------------------------------------------------
-
-
 def waves(number: int) -> Motion:
     """Return motions of so many waves within 2 s, from rest to rest."""
     ends = np.polynomial.Polynomial([0.0, 0.0, 0.0, 8.0, -12.0, 6.0, -1.0])  # (t (2 - t))^3
@@ -806,9 +773,6 @@ def test_steps_of_stiff_arms_follow_the_motion(number: int, damping: float) -> N
         found = radau.integrate(problem, tolerance, 4, Profile())
         assert distance(problem, found, fine) <= tolerance
         assert len(found.a) <= most
-
-
-# -- warm start, counts, sampling ------------------------------------------------------------
 
 
 def test_warm_start_saves_iterations() -> None:

@@ -76,10 +76,8 @@ def free_motion(
 
 @pytest.mark.serial
 def test_double_four_bar(tmp_path) -> None:
-    """All bars turn as one pendulum does, through positions where the linkage is singular.
-
-    Of Exudyn's table positions are off by its steps, 5e-7 m; here 500 steps leave 1e-7.
-    """
+    """All bars turn as one pendulum does, through positions where the linkage is singular."""
+    # Of Exudyn's table positions are off by its steps, 5e-7 m; here 500 steps leave 1e-7.
     tree, bodies = double_four_bar()
     table = f"t,joint0\n0,{0.5 * np.pi}\n1,1.5\n"
     system = started(free(tmp_path, tree, table, bodies), -1.0)

@@ -28,10 +28,8 @@ def plane_motion(t):
 
 @pytest.mark.parametrize("controlled", [False, True])
 def test_plane_machine_in_space(controlled):
-    """The two-arm machine of beams, posed in space, has the plane's trajectory; under control, too.
-
-    There positions alone are compared to 1e-9 and the feed-forward is that of the rigid machine.
-    """
+    """The two-arm machine of beams, posed in space, has the plane's trajectory."""
+    # Under control positions alone are compared to 1e-9, with the rigid machine's feed-forward.
     bodies = tuple(beam(damping=1e-3).body() for _ in range(2))
     plane = plane_chain(bodies, 0.5, 0.01, (0.0, -9.81), -0.3)
     ends = (0.0, 0.5)

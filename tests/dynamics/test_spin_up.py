@@ -30,10 +30,8 @@ RUN_UP = 15.0  # s
 def beam(
     length: float, area: float, bending: float, axial: float, line_mass: float
 ) -> ShapeIntegrals:
-    """Return a beam of EI (N m2), EA (N), rho A (kg/m) as a floating body of plane cells, nu = 0.
-
-    Its section is a rectangle whose height follows from EI / EA.
-    """
+    """Return a beam of EI (N m2), EA (N), rho A (kg/m) as a floating body of plane cells."""
+    # Its section is a rectangle whose height follows from EI / EA; nu = 0.
     height = np.sqrt(12.0 * bending / axial)
     size = (length, height, area / height)
     arm = substructure(size, (100, 2), element="incompatible", poisson_ratio=0.0)
@@ -87,10 +85,8 @@ def test_wu_and_haug(slender: ShapeIntegrals) -> None:
 
 
 def test_simo_and_vu_quoc() -> None:
-    """Least tip deflection -0.574 m near 6.76 s, steady stretch 5.14e-4 m.
-
-    Simo & Vu-Quoc (1987), doi:10.1016/0045-7825(87)90170-6, six modes of an Euler-Bernoulli beam.
-    """
+    """Least tip deflection -0.574 m near 6.76 s, steady stretch 5.14e-4 m."""
+    # Simo & Vu-Quoc (1987), doi:10.1016/0045-7825(87)90170-6, six modes of an Euler-Bernoulli beam.
     body = beam(10.0, 1.0, 1.4e4, 2.8e7, 1.2)
     t = np.linspace(0.0, 25.0, 5001)
     found = tip(body, 6.0, t)

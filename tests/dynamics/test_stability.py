@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import scipy.sparse
 from machines import distance, energies
 from mpi4py import MPI
 from remainders import Built, Field, arm_of, build, built_of, taylor, uneven, wave
-from runs import TWO_ARM, overrides, run, scene
+from runs import TWO_ARM, overrides, run, scene, summary_of
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -68,11 +67,9 @@ def windows(arm: Arm, count: int, density: float) -> np.ndarray:
 
 
 def quadrilateral(a: float, b: float, nu: float) -> np.ndarray:
-    """Return the plane stress matrix (8, 8) of a rectangle a by b, E = t = 1, in long double.
-
-    Incompatible modes (QM6), which are orthogonal on a rectangle. Nodes (0, 0), (a, 0), (0, b),
-    (a, b); its null space is that of a rigid body to 1e-19.
-    """
+    """Return the plane stress matrix (8, 8) of a rectangle a by b, E = t = 1, in long double."""
+    # Incompatible modes (QM6), which are orthogonal on a rectangle. Nodes (0, 0), (a, 0), (0, b),
+    # (a, b); its null space is that of a rigid body to 1e-19.
     one = np.longdouble(1.0)
     nu, a, b = one * nu, one * a, one * b
     C = np.array([[1, nu, 0], [nu, 1, 0], [0, 0, (1 - nu) / 2]], dtype=np.longdouble) / (1 - nu**2)
@@ -133,11 +130,9 @@ def compliance_error(arm: Arm) -> float:
 @EXTENDED
 @pytest.mark.parametrize("name", DESIGNS)
 def test_contrast(name: str) -> None:
-    """Voids of 1e-3 to 1e-24 of solid: right to 1e-3, or an error that names the remedy.
-
-    Nothing that hangs together, or floats in a void of 1e-9 and more, is refused. Where solids
-    float, the estimate of rounding exceeds the error.
-    """
+    """Voids of 1e-3 to 1e-24 of solid: right to 1e-3, or an error that names the remedy."""
+    # Nothing that hangs together, or floats in a void of 1e-9 and more, is refused. Where solids
+    # float, the estimate of rounding exceeds the error.
     for law, power in (("two-material", 1.0), ("simp", 2.0)):
         for floor in (1e-3, 1e-9, 1e-10, 1e-12):
             arm = one_arm(f"interpolation.law={law}", f"interpolation.floor={floor}")
@@ -161,11 +156,9 @@ def test_contrast(name: str) -> None:
 @pytest.mark.parametrize("name", ["checkerboard", "gap", "islands"])
 @pytest.mark.parametrize("cells", [(12, 3), (60, 4)])
 def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
-    """The estimate is proportional to 1 / contrast up to where it refuses, to 5 %.
-
-    So it does not itself depend on rounding, which differs from machine to machine. Beyond, every
-    contrast is refused, whatever rounding makes of it.
-    """
+    """The estimate is proportional to 1 / contrast up to where it refuses, to 5 %."""
+    # So it does not itself depend on rounding, which differs from machine to machine. Beyond, every
+    # contrast is refused, whatever rounding makes of it.
     estimates = []
     for floor in 10.0 ** (-0.5 * np.arange(6.0, 17.0)):  # SIMP: its square to solid
         arm = one_arm("interpolation.law=simp", f"interpolation.floor={floor}", cells=cells)
@@ -249,12 +242,10 @@ def test_a_stiffness_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, wron
     ],
 )
 def test_shapes(height: float, cells: tuple[int, int]) -> None:
-    """Arms of aspect 1/2 to 1e4, cells of 1/50 to 200: statics right to what K's digits allow.
-
-    Bending stiffness is (height / length)^2 of the axial one: 1e-8 at 1e4. A cell that bends has
-    (height / length)^2 of the stiffness to its shear, which its matrix is the difference of. At an
-    aspect of 1e4 one digit is left: 0.02 to 0.18 of error, by the rounding of the design.
-    """
+    """Arms of aspect 1/2 to 1e4, cells of 1/50 to 200: statics right to what K's digits allow."""
+    # Bending stiffness is (height / length)^2 of the axial one: 1e-8 at 1e4. A cell that bends has
+    # (height / length)^2 of the stiffness to its shear, which its matrix is the difference of. At
+    # an aspect of 1e4 one digit is left: 0.02 to 0.18 of error, by the rounding of the design.
     arm = one_arm(f"arms.height={height}", "reduction.coordinates=3", cells=cells)
     arm.set_design(np.full(arm.mesh.num_cells, 0.7))
     slender = height / cells[1] * cells[0]  # height over length of a cell
@@ -340,10 +331,8 @@ def test_motions(overrides: list[str]) -> None:
     ids=" ".join,
 )
 def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> None:
-    """By the deflection and what to change, in one line, whether Newton's method converges or not.
-
-    The lightest of them bends an arm by 54 % of its length before Newton's method fails.
-    """
+    """By the deflection and what to change, in one line, whether Newton's method converges."""
+    # The lightest of them bends an arm by 54 % of its length before Newton's method fails.
     with pytest.raises(ConvergenceError) as refusal:
         moved(*overrides)
     said = str(refusal.value)
@@ -466,7 +455,7 @@ def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
         changes = overrides("arms.cells=[12,2]", *more)
         run("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / name, *changes)
         printed = capsys.readouterr().err
-        warnings = json.loads((tmp_path / name / "summary.json").read_text())["warnings"]
+        warnings = summary_of(tmp_path / name)["warnings"]
         assert [f"dolfinopt: warning: {w}" for w in warnings] == printed.splitlines()
         assert warnings or name == "small"
     trajectory = moved(*heavy, field=lambda k, x, y: 0.5 * np.ones_like(x))
@@ -528,11 +517,10 @@ def drawn(rng: np.random.Generator, folder: Path) -> dict:
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("seed", range(24))  # 24 takes 90 s
 def test_any_scene(seed: int, tmp_path: Path) -> None:
-    """Finite, and of second-order remainders along all directions; or a named error of one line.
-
-    From finer steps than the command's: at random designs of undamped arms the remainder's cubic
-    part outweighs its square at 0.01. A direction whose remainders are all rounding shows nothing.
-    """
+    """Finite, and of second-order remainders along all directions; or a named error of one line."""
+    # From finer steps than the command's: at random designs of undamped arms the remainder's cubic
+    # part outweighs its square at 0.01. A direction whose remainders are all rounding shows
+    # nothing.
     rng = np.random.default_rng(seed)
     data = drawn(rng, tmp_path)
     crisp = rng.random() < 0.25

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import controlled, loop_tree, two_arm, with_keys
+from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
 from runs import refusal
 
 import dolfinopt as do
@@ -19,16 +19,10 @@ from dolfinopt.dynamics.state_space import (
     poles_of,
     state_space,
 )
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial
 MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
-
-
-def trajectory_of(scene: Scene) -> Trajectory:
-    found = do.Model(scene).simulate().trajectory
-    assert found is not None
-    return found
 
 
 def hanging(folder: Path, gravity: float = 9.81, **tables) -> Trajectory:
@@ -77,9 +71,6 @@ def test_stiff_drive_clamps_the_beam(tmp_path) -> None:
     exact *= np.sqrt(MODULUS * HEIGHT**2 / (12.0 * DENSITY)) / LENGTH**2
     assert found.closed
     assert found.arrays()["frequencies"][:6:2] == pytest.approx(exact, rel=5e-3)
-
-
-# -- the nonlinear equations -------------------------------------------------------------------
 
 
 def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
@@ -190,10 +181,8 @@ def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
 
 
 def test_inputs_and_outputs_answer_each_other() -> None:
-    """Places move by what forces there do: the gain from tool to tool is symmetric, and of drives.
-
-    Without control and motion the machine is conservative.
-    """
+    """Places move by what forces there do: the gains of tool and drives are symmetric."""
+    # Without control and motion the machine is conservative.
     found: StateSpace = state_space(open_two_arm(), 0.0)
     s = 3.0
     gain = found.C @ np.linalg.solve(s * np.eye(len(found.A)) - found.A, found.B)

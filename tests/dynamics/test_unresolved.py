@@ -5,12 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dolfinopt.dynamics.collocation import (
-    Stages,
-    _lost,
-    radau_iia,
-    unresolved,
-)
+from dolfinopt.dynamics.collocation import Stages, _lost, radau_iia, unresolved
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.system import Unchanged
 from dolfinopt.multibody.mechanism import plane_chain

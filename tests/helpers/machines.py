@@ -97,6 +97,35 @@ def two_arm(*overrides: str, **changes: Any) -> Tree:
     return with_keys(scene(*overrides).to_tree(), changes)
 
 
+def held_link(
+    folder: Path, link: Tree, gravity: list[float], changes: Sequence[str] = (), **tables: Any
+) -> Scene:
+    """Return one link of 1 m without weight that a joint holds, in space if its cells are."""
+    (folder / "table.csv").write_text("t,link\n0,0\n1,0.001\n")  # a static start
+    tree: Tree = {
+        "name": "link",
+        "material": {"young_modulus": 70e9, "poisson_ratio": 0.3, "density": 1e-3},
+        "arms": [{"name": "link", "length": 1.0} | link],
+        "motion": {"path": "joints", "file": "table.csv", "horizon": 1.0, "gravity": gravity},
+        "simulation": {"sample": 0.01},
+    }
+    if len(gravity) == 2:
+        tree["motion"] |= {"base": "fixed"}
+    else:
+        tree["joints"] = [{"name": "link", "type": "revolute", "parent": "ground",
+                           "child": "link", "axis": [0, 0, 1]}]  # fmt: skip
+    return do.scene_from_dict(with_keys(tree, tables), str(folder / "scene.toml"), changes)
+
+
+def small_two_arm(joints: Tree | None = None, **changes: Any) -> Tree:
+    """Return the controlled machine on few cells, its arms with keys of their joints."""
+    cells = ("arms.cells=[16,3]", "reduction.coordinates=3", "motion.horizon=1.9")
+    tree = two_arm(*cells, control=GAINS, simulation={"stiffening": True, "tolerance": 1e-5})
+    for arm in tree["arms"]:
+        arm |= joints or {}
+    return with_keys(tree, changes)
+
+
 def slider_crank(height: float, cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
     """Return the slider-crank of the reference: steel rod of `height`, m, 2 turns in 0.1 s."""
     tree = with_keys(LOOP, {
@@ -130,6 +159,13 @@ def four_bar(cells: tuple[int, int] = (60, 4), **changes: Any) -> Tree:
 def simulated(tree: Tree) -> SimulationResult:
     """Return the simulation of a scene's initial design."""
     return do.Model(scene_from_dict(tree)).simulate()
+
+
+def trajectory_of(one: Scene) -> Trajectory:
+    """Return what a scene's initial design does."""
+    found = do.Model(one).simulate().trajectory
+    assert found is not None
+    return found
 
 
 def machine(result: SimulationResult) -> tuple[Trajectory, MachineSystem]:
@@ -179,6 +215,15 @@ def imbalance(result: SimulationResult) -> float:
     work = np.cumsum((0.5 * h * weights * power.reshape(t.shape)).sum(axis=1))
     stored = sum(energies(trajectory, grid))
     return float(np.abs(work - (stored[1:] - stored[0])).max() / np.abs(stored).max())
+
+
+def check_energy(result: SimulationResult, most: float) -> None:
+    """Assert that the drives' work is energy, each kind of which counts."""
+    trajectory = result.trajectory
+    assert trajectory is not None
+    parts = [np.ptp(one) for one in energies(trajectory, trajectory.t)]
+    assert min(parts) > 1e-4 * max(parts)
+    assert imbalance(result) < most
 
 
 def states(

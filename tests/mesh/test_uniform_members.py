@@ -24,12 +24,10 @@ MESHED = {"rectangular tube": sections.RECTANGULAR_TUBE, "round tube": sections.
 
 
 def moments(kind, share):
-    """Return A, I_z, I_y, the shear areas along y and z, and the twist by a moment L / (G J).
-
-    Shear areas: walls that carry it, half of a thin ring, 5/6 of a rectangle. Twist: Bredt's
-    formula at the wall's middle, the circle's polar moment, Vlasov's with both ends held from
-    warping, the series of the rectangle (Timoshenko & Goodier, Theory of Elasticity, 109).
-    """
+    """Return A, I_z, I_y, the shear areas along y and z, and the twist by a moment L / (G J)."""
+    # Shear areas: walls that carry it, half of a thin ring, 5/6 of a rectangle. Twist: Bredt's
+    # formula at the wall's middle, the circle's polar moment, Vlasov's with both ends held from
+    # warping, the series of the rectangle (Timoshenko & Goodier, Theory of Elasticity, 109).
     h, b, L = HEIGHT, THICKNESS, LENGTH
     if kind == "solid bar":
         h, b = share * h, share * b

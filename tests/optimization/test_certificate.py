@@ -5,14 +5,13 @@ iterations with equivalent static loads may come to rest where the dynamic probl
 Their data were not at hand: the truss here is another one, whose points of rest have a closed form.
 """
 
-import json
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import QUICK, TWO_ARM, assert_same_bits, overrides, quick, run, shell
+from runs import QUICK, TWO_ARM, assert_same_bits, overrides, quick, run, shell, summary_of
 
 import dolfinopt as do
 from dolfinopt.optimization import certificate, iterate, loop
@@ -27,8 +26,6 @@ WORLD = MPI.COMM_WORLD
 ALONE = partial(sum_over_arms, Partition(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
 
 NO_ROWS = np.zeros(0, dtype=int)
-
-# -- two bars ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -171,10 +168,9 @@ def test_variables_at_bounds_have_no_part_in_the_angle():
 @pytest.mark.serial  # ranks have no part in it
 def test_best_of_what_keeps_the_constraints():
     def at(f0, met=True):
-        limit = Limit("mass", "", 1.0 if met else 2.0, 1.0, "kg")
-        return attempt(
-            Problem(f0, np.zeros(1), np.zeros(1), np.zeros((1, 1)), (limit,), np.zeros(1))
-        )
+        limits = (Limit("mass", "", 1.0 if met else 2.0, 1.0, "kg"),)
+        zero = np.zeros(1)
+        return attempt(Problem(f0, zero, zero, np.zeros((1, 1)), limits, zero))
 
     found = best_of(at(3.0), [at(1.0, met=False), at(2.0), at(2.5)])
     assert (found.objective, found.iterations, found.feasible) == (2.0, 3, True)
@@ -199,10 +195,7 @@ def test_best_of_what_keeps_the_constraints():
     assert best_of(at(3.0), failing()).iterations == 1
 
 
-# -- scenes ------------------------------------------------------------------------------------
-
 LIGHT = "payload.mass=0.2"
-
 
 POSED = {
     "plain": [],
@@ -290,10 +283,8 @@ def test_failing_gradient_does_not_lose_the_design(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.serial
 def test_light_payload_pays_for_frozen_loads():
-    """With 0.2 kg the loads are the arms' own: frozen, they end half as compliant again.
-
-    The design stays as it is, whatever is learnt of it.
-    """
+    """With 0.2 kg the loads are the arms' own: frozen, they end half as compliant again."""
+    # The design stays as it is, whatever is learnt of it.
     plain = do.optimize(quick(LIGHT, iterations=12))
     result = do.optimize(quick(LIGHT, "optimizer.exact_iterations=15", iterations=12))
     assert_same_bits(result, plain)
@@ -391,7 +382,7 @@ def test_summary_and_screen(shared_tmp_path):
         return
     done = shell("optimize", TWO_ARM, *words, "--no-plots", "--out", shared_tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    summary = json.loads((shared_tmp_path / "out" / "summary.json").read_text())
+    summary = summary_of(shared_tmp_path / "out")
     found = summary["certificate"]
     assert f"certificate: {found['sentence']}\n" in done.stdout
     assert found["feasible"] and found["missing"] == "" and found["exact_iterations"] == 2

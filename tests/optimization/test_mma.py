@@ -24,9 +24,6 @@ PENALTY = 1000.0
 Problem = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]  # df0dx, f, dfdx
 
 
-# Variables over the ranks
-
-
 def mine(values):
     """Return this rank's piece of the last axis."""
     return np.array_split(np.asarray(values), COMM.size, axis=-1)[COMM.rank]
@@ -37,26 +34,20 @@ def whole(piece):
     return np.concatenate(COMM.allgather(piece))
 
 
-def whole_state(state):
-    """Return the state of all variables."""
-    fields = {k: whole(getattr(state, k)) for k in ("x_old1", "x_old2", "low", "upp")}
-    return replace(state, **fields)
-
-
-def state_piece(state):
-    """Return this rank's piece of the state of all variables."""
-    fields = {k: mine(getattr(state, k)) for k in ("x_old1", "x_old2", "low", "upp")}
-    return replace(state, **fields)
+def of_variables(state, each):
+    """Return the state with `mine` or the `whole` of what it has of each variable."""
+    fields = ("x_old1", "x_old2", "low", "upp")
+    return replace(state, **{k: each(getattr(state, k)) for k in fields})
 
 
 def step(x, df0dx, f, dfdx, lo, hi, state, move=0.2):
     """Take one step with all variables given, over the ranks; return all of them again."""
     x_new, state = mma_step(
-        *(mine(x), mine(df0dx), f, mine(dfdx), mine(lo), mine(hi), state_piece(state)),
+        *(mine(x), mine(df0dx), f, mine(dfdx), mine(lo), mine(hi), of_variables(state, mine)),
         move=move,
         comm=COMM,
     )
-    return whole(x_new), whole_state(state)
+    return whole(x_new), of_variables(state, whole)
 
 
 def iterate(problem, x, lo, hi, steps, move=0.2):
@@ -89,19 +80,15 @@ def on_threads(size, run):
         return list(pool.map(lambda rank: run(Ranks(rank, slots, barrier)), range(size)))
 
 
-# Problems
-
-
 def cantilever(x):
     """Return Svanberg's beam of five boxes (1987, section 4.1): weight, tip deflection <= 1."""
     a = np.array([61.0, 37.0, 19.0, 7.0, 1.0])
     return np.full(5, 0.0624), np.array([(a / x**3).sum() - 1.0]), (-3.0 * a / x**4)[None]
 
 
-def two_arms(n, energies=None) -> Problem:
+def two_arms(n) -> Problem:
     """Return the compliance sum_j e_j / x_j with a volume <= 0.4 for each half of the variables."""
-    if energies is None:
-        energies = np.exp(3.0 * np.cos(np.arange(n)))
+    energies = np.exp(3.0 * np.cos(np.arange(n)))
     halves = np.array_split(np.arange(n), 2)
     volume = np.zeros((2, n))
     for row, half in zip(volume, halves):
@@ -109,13 +96,13 @@ def two_arms(n, energies=None) -> Problem:
     return lambda x: (-energies / x**2, volume @ x - 1.0, volume)
 
 
-def waves(seed, margin=0.1) -> tuple[Problem, np.ndarray]:
+def waves(seed) -> tuple[Problem, np.ndarray]:
     """Return a nonconvex problem with up to five constraints, and a start that meets them."""
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(2, 30)), int(rng.integers(1, 6))
     c, d = rng.standard_normal((2, 1 + m, n))
     x = rng.random(n)
-    limit = (c @ np.sin(3.0 * x) + d @ x**2)[1:] + margin * n * rng.random(m)
+    limit = (c @ np.sin(3.0 * x) + d @ x**2)[1:] + 0.1 * n * rng.random(m)
 
     def problem(x):
         values, slopes = c @ np.sin(3.0 * x) + d @ x**2, 3.0 * c * np.cos(3.0 * x) + 2.0 * d * x
@@ -151,9 +138,6 @@ def any_step(seed):
     return x, df0dx, f, dfdx, lo, hi, state, float(rng.choice([0.05, 0.2, 0.5]))
 
 
-# Svanberg's form of the subproblem, as in his papers
-
-
 class Subproblem:
     """Svanberg's p / (U - x) + q / (x - L) of the normalised functions, with its bounds."""
 
@@ -183,13 +167,12 @@ class Subproblem:
         return self.p / (self.upp - y) ** 2, self.q / (y - self.low) ** 2
 
 
-def mmapy_step(x, df0dx, f, dfdx, lo, hi, state, move, magnified=1e4):
-    """Return mmapy's design, asymptotes and final residual for the normalised problem.
-
-    Its interior point method stops at an absolute residual of 1e-7, to be seen in the design
-    divided by the curvature, which may be as low as raa0. All functions times `magnified`, with
-    the penalties to match, are the same problem and lower the residual by as much.
-    """
+def mmapy_step(x, df0dx, f, dfdx, lo, hi, state, move):
+    """Return mmapy's design, asymptotes and final residual for the normalised problem."""
+    # Its interior point method stops at an absolute residual of 1e-7, to be seen in the design
+    # divided by the curvature, which may be as low as raa0. All functions times this, with the
+    # penalties to match, are the same problem and lower the residual by as much.
+    magnified = 1e4
     width, m = hi - lo, f.size
     scale = np.abs(dfdx * width).max(axis=1)
 
@@ -212,12 +195,10 @@ def mmapy_step(x, df0dx, f, dfdx, lo, hi, state, move, magnified=1e4):
 
 
 def largest_difference_from_mmapy(problem, x, lo, hi, steps, move=0.2):
-    """Step from the same designs; return the largest differences of design and asymptotes.
-
-    The asymptotes of variables at rest are left out, because mmapy reads the sign of rounding, and
-    the designs that follow from them. Left out are also designs where mmapy gave up: after 200
-    iterations, without a word, once in about 2000 steps.
-    """
+    """Step from the same designs; return the largest differences of design and asymptotes."""
+    # The asymptotes of variables at rest are left out, because mmapy reads the sign of rounding,
+    # and the designs that follow from them. Left out are also designs where mmapy gave up: after
+    # 200 iterations, without a word, once in about 2000 steps.
     state, compared, of_design, of_asymptotes = initial_state(x), 0, 0.0, 0.0
     for _ in range(steps):
         inputs = (x, *problem(x), lo, hi, state, move)
@@ -232,9 +213,6 @@ def largest_difference_from_mmapy(problem, x, lo, hi, steps, move=0.2):
             compared += 1
     assert compared >= 0.5 * steps
     return of_design, of_asymptotes
-
-
-# Against known optima and mmapy
 
 
 def test_cantilever_reaches_the_optimum():
@@ -252,7 +230,7 @@ def test_two_volumes_reach_the_optimum():
     n, lo, hi = 40, 1e-3, 1.0
     energies = np.exp(3.0 * np.cos(np.arange(n)))
     bounds = np.full(n, lo), np.full(n, hi)
-    designs, _ = iterate(two_arms(n, energies), np.full(n, 0.4), *bounds, 150)
+    designs, _ = iterate(two_arms(n), np.full(n, 0.4), *bounds, 150)
     for half in np.array_split(np.arange(n), 2):
         few, much = 1e-6, 1e6
         for _ in range(200):
@@ -280,9 +258,6 @@ def test_steps_agree_with_mmapy(posed, bounds, steps, move, close):
     assert design < close and asymptotes < 1e-12
 
 
-# Optimality of a step
-
-
 @pytest.mark.parametrize("seed", range(60))
 def test_step_satisfies_the_optimality_conditions(seed):
     """Karush-Kuhn-Tucker in Svanberg's own form, to rounding, for whatever inputs."""
@@ -305,9 +280,6 @@ def test_step_satisfies_the_optimality_conditions(seed):
     assert (left >= -1e-10 * size)[new.multipliers > 1e-9].all()
     assert (new.multipliers >= 0.0).all()
     assert (new.multipliers[~felt] == 0.0).all()
-
-
-# Invariances
 
 
 def scaled(problem, objective, constraints) -> Problem:
@@ -397,9 +369,6 @@ def test_inputs_and_results_share_no_memory():
     np.testing.assert_array_equal(x, 0.4)
 
 
-# Robustness
-
-
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_constraint_given_twice_counts_once(factor):
     problem, x = waves(11)
@@ -417,9 +386,8 @@ def test_constraint_given_twice_counts_once(factor):
 def test_nothing_to_gain_means_no_step():
     n = 7
     x = np.linspace(0.0, 1.0, n)
-    y, _ = step(
-        x, np.zeros(n), -np.ones(1), np.ones((1, n)), np.zeros(n), np.ones(n), initial_state(x)
-    )
+    still = np.zeros(n), -np.ones(1), np.ones((1, n))
+    y, _ = step(x, *still, np.zeros(n), np.ones(n), initial_state(x))
     np.testing.assert_array_equal(y, x)
 
 
@@ -488,10 +456,8 @@ def test_unsolved_subproblem_is_an_error(monkeypatch):
         step(x, df0dx, f, dfdx, np.zeros(x.size), np.ones(x.size), initial_state(x))
 
 
-# Bad input, on one rank only: the error must reach all
-
-
 def bad_step(**changes):
+    """Take a step whose input is changed on one rank only: the error must reach all."""
     n = 8
     x = mine(np.full(n, 0.4))
     df0dx, f, dfdx = two_arms(n)(np.full(n, 0.4))
@@ -502,34 +468,36 @@ def bad_step(**changes):
     return mma_step(**inputs, comm=COMM)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["x", "df0dx", "f", "dfdx", "xmin", "xmax"])
-def test_number_that_is_not_finite_is_named(name, value):
+def spoilt(value):
     def spoil(array):
         array = array.copy()
         array[..., -1] = value
         return array
 
-    with pytest.raises(ValueError, match=rf"MMA: {name} is not finite, first at index .*{value}"):
-        bad_step(**{name: spoil})
+    return spoil
 
 
-@pytest.mark.parametrize("name", ["df0dx", "f", "dfdx", "xmin", "xmax"])
-def test_wrong_shape_is_named(name):
-    with pytest.raises(ValueError, match=r"MMA: \w+ has shape \(.*\), expected \("):
-        bad_step(**{name: lambda array: array[..., :-1]})
+def foreign(name, spoil):
+    return {"state": lambda s: replace(s, **{name: spoil(getattr(s, name))})}
 
 
-@pytest.mark.parametrize("name", ["x_old1", "x_old2", "low", "upp"])
-@pytest.mark.parametrize("spoil", [lambda v: v[:-1], lambda v: v * np.nan])
-def test_foreign_state_is_named(name, spoil):
-    with pytest.raises(ValueError, match=rf"MMA: state.{name} does not hold"):
-        bad_step(state=lambda s: replace(s, **{name: spoil(getattr(s, name))}))
+BAD = [
+    *(({name: spoilt(value)}, rf"{name} is not finite, first at index .*{value}")
+      for name in ("x", "df0dx", "f", "dfdx", "xmin", "xmax")
+      for value in (np.nan, np.inf, -np.inf)),
+    *(({name: lambda array: array[..., :-1]}, r"\w+ has shape \(.*\), expected \(")
+      for name in ("df0dx", "f", "dfdx", "xmin", "xmax")),
+    *((foreign(name, spoil), f"state.{name} does not hold")
+      for name in ("x_old1", "x_old2", "low", "upp")
+      for spoil in (lambda v: v[:-1], lambda v: v * np.nan)),
+    ({"xmin": lambda lo: lo + 0.499}, r"x\[0\] = 0.4 is not between 0.5 and 1.0"),
+]  # fmt: skip
 
 
-def test_design_outside_its_bounds_is_named():
-    with pytest.raises(ValueError, match=r"MMA: x\[0\] = 0.4 is not between 0.5 and 1.0"):
-        bad_step(xmin=lambda lo: lo + 0.499)
+@pytest.mark.parametrize(("changes", "words"), BAD)
+def test_bad_input_is_named(changes, words):
+    with pytest.raises(ValueError, match=f"MMA: {words}"):
+        bad_step(**changes)
 
 
 def test_piece_on_two_ranks_is_an_error():

@@ -4,12 +4,21 @@ import signal
 import subprocess
 import time
 from functools import partialmethod
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import TWO_ARM, assert_same_bits, command, environment, overrides, run, scene, shell
+from runs import (
+    TWO_ARM,
+    assert_same_bits,
+    by_root,
+    command,
+    environment,
+    overrides,
+    run,
+    scene,
+    shell,
+)
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
@@ -18,7 +27,6 @@ from dolfinopt.optimization.mma import Search
 from dolfinopt.output import checkpoint
 from dolfinopt.parallel import on_root
 
-ROOT = Path(__file__).parents[2]
 WORLD = MPI.COMM_WORLD
 
 
@@ -56,20 +64,18 @@ def test_volume_limits():
         result = do.optimize(small(*SMALLEST, *settings, iterations=25))
         mine = {k: arm.volume_fraction(result.x_phys[k]) for k, arm in result.arms.items()}
         fractions = list(do.gather_arms(result.partition, mine).values())
-        if WORLD.rank == 0:
-            assert np.mean(fractions) == pytest.approx(0.5, abs=2e-3)
-            if shared:
-                assert fractions[0] > 0.52 and fractions[1] < 0.48  # 0.594, 0.405
-            else:
-                assert fractions == pytest.approx([0.5, 0.5], abs=2e-3)
+        assert np.mean(fractions) == pytest.approx(0.5, abs=2e-3)
+        if shared:
+            assert fractions[0] > 0.52 and fractions[1] < 0.48  # 0.594, 0.405
+        else:
+            assert fractions == pytest.approx([0.5, 0.5], abs=2e-3)
 
 
 @pytest.mark.serial
 def test_stops_when_the_design_rests():
     result = do.optimize(small(*SMALLEST, "optimizer.tolerance=0.05", iterations=200))
     assert result.converged and result.iterations < 200
-    if WORLD.rank == 0:
-        assert result.history[-1].change <= 0.05 < result.history[-2].change
+    assert result.history[-1].change <= 0.05 < result.history[-2].change
 
 
 def test_no_iterations_evaluate_the_initial_design():
@@ -137,18 +143,12 @@ def test_a_design_that_cannot_be_simulated_any_more_loses_nothing(monkeypatch, l
         assert not asked.on and asked.neglected > 4e-3  # told, and left out
 
 
-# -- constraints and projections -------------------------------------------------------------
-
-
 @pytest.mark.slow
 # Between designs of nearly the same objective 1 to 5 % of the cells stay grey with one threshold.
 @pytest.mark.parametrize(("kind", "grayness"), [("heaviside", 0.06), ("robust", 0.02)])
 def test_projection_ends_crisp(kind, grayness):
-    """From all grey, with a filter of one and a half cells, to no grey: cut it is the same design.
-
-    But for cells that meet in corners alone: cut it is without them. Volume limits hold, and the
-    designs are as good as without a projection, or better.
-    """
+    """From all grey to no grey with volumes kept, and as good as without a projection or better."""
+    # Cut it is the same design, but for cells that meet in corners alone: cut it is without them.
     statics = ["objective.kind=static", "arms.cells=[60,8]", "design.filter_radius=0.025"]
     projected = ["design.continuation=15", f"design.projection={kind}"]
     result = do.optimize(small(*statics, *projected, iterations=250))
@@ -172,26 +172,18 @@ def test_bounds_out_of_reach_are_told():
     assert not result.converged
     value = 1e6 * max(result.evaluation.tip_deflections)
     assert value > 10.0
-    assert (
-        "tip deflection of arm1" in result.violated
-        and "at most 1e-06 m required" in result.violated
-    )
+    assert "tip deflection of arm1" in result.violated
+    assert "at most 1e-06 m required" in result.violated
     assert result.violated in result.stop_reason
     kept = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1.0"))
     assert kept.violated == "" and "not met" not in kept.stop_reason
-
-
-# -- resume ----------------------------------------------------------------------------------
 
 
 def test_resume_gives_the_same_bits(shared_tmp_path, monkeypatch):
     """Interrupted after any iteration, whatever was saved last: the same designs and history."""
     monkeypatch.setattr("dolfinopt.optimization.loop.CHECKPOINT_SECONDS", 0.0)
     folders = {name: shared_tmp_path / str(name) for name in ("whole", 0, 1, 4, 6)}
-    if WORLD.rank == 0:
-        for folder in folders.values():
-            folder.mkdir()
-    WORLD.barrier()
+    by_root(lambda: [folder.mkdir() for folder in folders.values()])
     whole = do.optimize(small(*SMALLEST), folders["whole"])
     for stop in (0, 1, 4, 6):
         folder = folders[stop]
@@ -243,8 +235,7 @@ def test_every_option_resumes_in_the_same_bits(overrides, shared_tmp_path):
     resumed = do.optimize(small(*settings, iterations=3), shared_tmp_path, resume=True)
     assert_same_bits(resumed, whole)
     assert str(resumed.evaluation) == str(whole.evaluation)
-    if WORLD.rank == 0:
-        np.testing.assert_array_equal(resumed.initial_deviation, whole.initial_deviation)
+    np.testing.assert_array_equal(resumed.initial_deviation, whole.initial_deviation)
 
 
 def optimized_alone(scene):
@@ -277,8 +268,7 @@ def rows_of(folder):
 def test_sigkill_and_resume(tmp_path):
     """Killed at any moment, a resumed run writes the same design to the last bit."""
     changes = [*QUICK, "arms.cells=[24,3]", "optimizer.max_iterations=20"]
-    line = ["optimize", TWO_ARM, *overrides(*changes)]
-    line += ["--no-plots", "--out"]
+    line = ["optimize", TWO_ARM, *overrides(*changes), "--no-plots", "--out"]
     run(*line, tmp_path / "whole")
     for rows in (1, 6):
         folder = tmp_path / str(rows)
@@ -296,14 +286,9 @@ def test_sigkill_and_resume(tmp_path):
 
 
 def test_damaged_checkpoint(shared_tmp_path):
-    if WORLD.rank == 0:
-        (shared_tmp_path / checkpoint.NAME).write_bytes(b"PK\x03\x04 no archive")
-    WORLD.barrier()
+    by_root(lambda: (shared_tmp_path / checkpoint.NAME).write_bytes(b"PK\x03\x04 no archive"))
     with pytest.raises(do.InputError, match="cannot read this checkpoint"):
         do.optimize(small(), shared_tmp_path, resume=True)
-
-
-# -- ranks -----------------------------------------------------------------------------------
 
 
 @pytest.mark.serial

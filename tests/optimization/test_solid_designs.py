@@ -23,11 +23,9 @@ def small(*settings, iterations):
 
 @pytest.mark.serial
 def test_resumes_where_it_was(tmp_path, monkeypatch):
-    """Eigenvectors, and what iterative solves set out from, are remembered.
-
-    To 1e-10: products of arrays round otherwise where these lie elsewhere in memory (1e-12 seen).
-    From other guesses, with this tolerance of the fields, designs differ by 1e-4.
-    """
+    """Eigenvectors, and what iterative solves set out from, are remembered."""
+    # To 1e-10: products of arrays round otherwise where these lie elsewhere in memory (1e-12 seen).
+    # From other guesses, with this tolerance of the fields, designs differ by 1e-4.
     monkeypatch.setattr(interior, "WIDEST", 0)
     # Loose, so that a guess is seen in what comes of it.
     monkeypatch.setattr("dolfinopt.arms.arm.FIELD_TOLERANCES", (1e-4, 1e-4))

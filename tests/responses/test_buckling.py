@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from machines import held_link
 from mpi4py import MPI
 from remainders import arm_of, build, built_of, wave
 from runs import scene
@@ -126,9 +127,6 @@ def test_void_in_a_closing_gap_does_not_buckle():
     assert share < 0.2 and spurious < 0.02 * empty
 
 
-# -- worst instants --------------------------------------------------------------------------
-
-
 def test_worst_instants_are_peaks():
     t = np.linspace(0.0, 5.0, 501)
     values = np.sin(np.pi * t) ** 2 * (1.0 + t)
@@ -153,41 +151,21 @@ def test_pressure_is_found_between_stronger_tension(bar):
     assert stiffer.modes.inverse[0] == pytest.approx(0.5 * found[0].modes.inverse[0])
 
 
-# -- the limit -------------------------------------------------------------------------------
-
 YOUNG, MASS, GRAVITY = 70e9, 3.7, 981.0  # SI; the arm has no weight
 SECTION = {"height": 0.04, "thickness": 0.02}
-COLUMNS = {
-    "plane": {
-        "arms": [SECTION | {"name": "link", "length": LENGTH, "cells": [30, 6]}],
-        "motion": {"base": "fixed", "gravity": [-GRAVITY, 0.0]},
-    },
-    "space": {
-        "arms": [SECTION | {"name": "link", "length": LENGTH, "cells": [20, 2, 2]}],
-        "joints": [{"name": "link", "type": "revolute", "parent": "ground", "child": "link",
-                    "axis": [0, 0, 1]}],
-        "motion": {"gravity": [-GRAVITY, 0.0, 0.0]},
-    },
-}  # fmt: skip
-STILL = {"path": "joints", "file": "table.csv", "horizon": 1.0}
+CELLS = {"plane": [30, 6], "space": [20, 2, 2]}
 
 
 def column(kind: str, folder, *changes: str) -> do.Scene:
     """Return a cantilever under a mass that presses it along its axis, held still."""
-    (folder / "table.csv").write_text("t,link\n0,0\n1,0.001\n")
-    tree = COLUMNS[kind] | {
-        "motion": COLUMNS[kind]["motion"] | STILL,
-        "name": kind,
-        "material": {"young_modulus": YOUNG, "poisson_ratio": 0.3, "density": 1e-3},
-        "payload": {"mass": MASS},
-        "simulation": {"sample": 0.01, "stiffening": False},
-        "constraints": {"buckling": 2.0},
-    }
-    return do.scene_from_dict(tree, str(folder / "scene.toml"), changes)
+    gravity = [-GRAVITY] + [0.0] * (len(CELLS[kind]) - 1)
+    tables = {"payload": {"mass": MASS}, "simulation": {"stiffening": False}}
+    return held_link(folder, SECTION | {"cells": CELLS[kind]}, gravity, changes,
+                     constraints={"buckling": 2.0}, **tables)  # fmt: skip
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("kind", COLUMNS)
+@pytest.mark.parametrize("kind", CELLS)
 def test_column_under_a_payload(kind, tmp_path):
     """pi^2 EI / (4 L^2) over m g; a plane arm in its plane, a solid across its thickness."""
     told = "design.initial=1.0", "design.volume_fraction=1.0", "design.filter_radius=0"

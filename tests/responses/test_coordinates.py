@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
 from remainders import Built, build, built_of, wave
-from runs import TWO_ARM, overrides, refused, run
+from runs import TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
@@ -90,10 +89,8 @@ def moved(built: Built, count: int, method: str):
     ],
 )
 def test_estimate_is_the_error(name, method, overrides):
-    """Node by node, the energy of what two motions differ by: against 48 coordinates.
-
-    Those that the estimate compares with, 24, leave less than a tenth of what 4 do.
-    """
+    """Node by node, the energy of what two motions differ by: against 48 coordinates."""
+    # Those that the estimate compares with, 24, leave less than a tenth of what 4 do.
     built = auto(f"reduction.method={method}", *overrides, cells=CELLS)
     x = built.fields(DESIGNS[name])
     estimate = error(built, x, 4)
@@ -258,7 +255,6 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
         assert written.summary["reduction"]["error_estimate"] == 0.02
         (warning,) = (w for w in written.summary["warnings"] if "filter" not in w)
         assert "estimated error of 0.02, above reduction.tolerance = 0.01" in warning
-    WORLD.barrier()
 
 
 @pytest.mark.serial  # ranks: test_any_number_of_ranks
@@ -280,7 +276,7 @@ def test_commands(tmp_path, capsys):
 
     sentence = 'reduction.coordinates = "auto": '
     assert sentence in said("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "s")
-    summary = json.loads((tmp_path / "s" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "s")
     found = summary["reduction"]
     assert found["error_estimate"] <= 1e-3 == summary["scene"]["reduction"]["tolerance"]
     assert summary["scene"]["reduction"]["coordinates"] == "auto"

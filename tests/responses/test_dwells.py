@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
-from runs import TWO_ARM, overrides, refused, run, scene, tomllib
+from runs import TWO_ARM, overrides, refused, run, scene, summary_of, tomllib
 
 import dolfinopt as do
 from dolfinopt.dynamics.build import rests_of
@@ -105,7 +103,7 @@ def test_the_summary_tells_the_same(tmp_path):
     told = ["motion.path=joints", f"motion.file={one.motion.file}", "motion.duration=1.6",
             "motion.horizon=2", *QUICK, delay]  # fmt: skip
     run("simulate", TWO_ARM, "--out", tmp_path / "run", "--no-plots", *overrides(*told))
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "run")
     _, trajectory = moved(one)
     inside = (trajectory.t >= 0.4 - 1e-9) & (trajectory.t <= 0.6 + 1e-9)
     assert summary["settling"] == trajectory.distance[inside].max()

@@ -22,10 +22,8 @@ SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
 
 
 def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
-    """Return the forces (n, 3) of cart, shoulder and elbow that move a point mass on the arc.
-
-    Newton's law of the payload alone: arms of 1 m without mass hand its force on.
-    """
+    """Return the forces (n, 3) of cart, shoulder and elbow that move a point mass on the arc."""
+    # Newton's law of the payload alone: arms of 1 m without mass hand its force on.
     s, sd, sdd = quintic(t, 1.9)
     place = np.exp(1j * np.pi * (1.0 - s))  # x + i y
     force = mass * ((-1j * np.pi * sdd - (np.pi * sd) ** 2) * place + 1j * gravity)

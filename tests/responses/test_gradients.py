@@ -8,14 +8,13 @@ from typing import get_args
 import numpy as np
 import pytest
 from machines import demo_machine
-from mpi4py import MPI
 from remainders import hold_instants, taylor, wave
+from runs import by_root
 
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, POLES, ObjectiveKind
 
-WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
 SHORT = ("arms.passive=0", "design.filter_radius=0", "motion.horizon=2.2", *ROUGHLY)
 LOOP = ("motion.speed=60", "motion.duration=0.05", "motion.horizon=0.1", "design.initial=0.5")
@@ -41,32 +40,29 @@ BASES = {
     ),
     "fork": ("", ROUGHLY[2:]),
 }  # fmt: skip
-DRIVES = "t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n"
-PUSH = "t,fx,fy,mz\n0,0,20,1\n0.7,40,-20,5\n1.4,-60,0,-2\n2.0,10,30,0\n"
-TWIST = "t,fx,fy,fz,mx,my,mz\n0,0,1,2,0,0.5,1\n0.1,10,-5,2,1,0,0\n0.2,0,5,0,-1,1,0.2\n"
-# Strokes with a stop between them.
-STROKES = "t,cart,arm1,arm2\n0,0,2,-1.5\n0.6,0.1,1.5,-1\n0.9,0.1,1.5,-1\n1.9,0,1,-0.8\n"
-SPATIAL_STROKES = "t,yaw,shoulder,elbow\n0,0,0.4,-1.9\n0.2,0.4,0.7,-1.5\n0.3,0.4,0.7,-1.5\n"
-SPATIAL_STROKES += "0.5,1,1,-1\n"
-SKEW = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
+FILES = {
+    "drives.csv": "t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n",
+    "push.csv": "t,fx,fy,mz\n0,0,20,1\n0.7,40,-20,5\n1.4,-60,0,-2\n2.0,10,30,0\n",
+    "twist.csv": "t,fx,fy,fz,mx,my,mz\n"
+                 "0,0,1,2,0,0.5,1\n0.1,10,-5,2,1,0,0\n0.2,0,5,0,-1,1,0.2\n",
+    # Strokes with a stop between them.
+    "strokes.csv": "t,cart,arm1,arm2\n"
+                   "0,0,2,-1.5\n0.6,0.1,1.5,-1\n0.9,0.1,1.5,-1\n1.9,0,1,-0.8\n",
+    "spatial.csv": "t,yaw,shoulder,elbow\n"
+                   "0,0,0.4,-1.9\n0.2,0.4,0.7,-1.5\n0.3,0.4,0.7,-1.5\n0.5,1,1,-1\n",
+    "skew.geo": """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
 Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
 Transfinite Curve {1} = 25 Using Progression 1.05; Transfinite Curve {3} = 25;
 Transfinite Curve {2, 4} = 4; Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
-"""
+""",
+}  # fmt: skip
 
 
 def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     """Return a scene of `BASES` with keys changed, FOLDER standing for the files' one."""
-    if WORLD.rank == 0:
-        for name, text in (("drives.csv", DRIVES), ("skew.geo", SKEW)):
-            (folder / name).write_text(text)
-        (folder / "strokes.csv").write_text(STROKES)
-        (folder / "push.csv").write_text(PUSH)
-        (folder / "twist.csv").write_text(TWIST)
-        (folder / "spatial.csv").write_text(SPATIAL_STROKES)
-    WORLD.barrier()
+    by_root(lambda: [(folder / file).write_text(text) for file, text in FILES.items()])
     name, quick = BASES[base]
     return demo_machine(name, (*quick, *changes), folder, one_arm=base == "one_arm")
 

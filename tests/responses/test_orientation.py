@@ -4,42 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from machines import held_link
 
 import dolfinopt as do
 from dolfinopt.responses.constraints import EXCESS
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 YOUNG, LENGTH, HEIGHT, THICKNESS, MASS, GRAVITY = 70e9, 1.0, 0.04, 0.02, 2.0, 9.81  # SI
-ARM = {"name": "link", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS}
-SWING = {"name": "swing", "type": "revolute", "parent": "ground", "child": "link",
-         "axis": [0, 0, 1]}  # fmt: skip
-# Nearly at rest: a static start, then a thousandth of a radian.
-MACHINES = {
-    "plane": {
-        "arms": [ARM | {"cells": [60, 4]}],
-        "motion": {"path": "joints", "base": "fixed", "file": "table.csv",
-                   "gravity": [0.0, -GRAVITY], "horizon": 1.0},
-    },
-    "space": {
-        "arms": [ARM | {"cells": [40, 2, 2]}],
-        "joints": [SWING],
-        "motion": {"path": "joints", "file": "table.csv", "gravity": [0.0, -GRAVITY, 0.0],
-                   "horizon": 1.0},
-    },
-}  # fmt: skip
+LINKS = {
+    kind: {"height": HEIGHT, "thickness": THICKNESS, "cells": cells}
+    for kind, cells in (("plane", [60, 4]), ("space", [40, 2, 2]))
+}
 
 
 def machine(kind: str, folder, *changes: str) -> do.Scene:
     """Return a solid cantilever of no weight with a payload, held still."""
-    column = "link" if kind == "plane" else "swing"
-    (folder / "table.csv").write_text(f"t,{column}\n0,0\n1,0.001\n")
-    tree = MACHINES[kind] | {
-        "name": kind,
-        "material": {"young_modulus": YOUNG, "poisson_ratio": 0.3, "density": 1e-3},
-        "payload": {"mass": MASS},
-        "simulation": {"sample": 0.01},
-    }
-    return do.scene_from_dict(tree, str(folder / "scene.toml"), changes)
+    gravity = [0.0, -GRAVITY] + [0.0] * (kind == "space")
+    return held_link(folder, LINKS[kind], gravity, changes, payload={"mass": MASS})
 
 
 SOLID = "design.initial=1.0", "design.volume_fraction=1.0"
@@ -47,7 +28,7 @@ SAGGING = "control={feed_forward='none', stiffness=[2e4], damping=[600.0]}"  # N
 
 
 @pytest.mark.parametrize("controlled", [False, True])
-@pytest.mark.parametrize("kind", MACHINES)
+@pytest.mark.parametrize("kind", LINKS)
 def test_cantilever_under_its_payload(kind, controlled, tmp_path):
     """theta = F L^2 / (2 E I) about z, and with control what the joint gives way, F L / k."""
     changes = (*SOLID, SAGGING) if controlled else SOLID

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from remainders import Built, beside_volume, build, rates, uneven, wave
-from runs import TWO_ARM
+from remainders import beside_volume, build, rates, uneven, wave
+from runs import TWO_ARM, minimising
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
@@ -91,19 +92,9 @@ def _registered() -> Iterator[None]:
         del registry._known[one.name]
 
 
-def minimised(scene: Scene, kind: str) -> Scene:
-    """Return the scene with an objective that the literal of its key does not have."""
-    objective = scene.objective.model_copy(update={"kind": kind})
-    return scene.model_copy(update={"objective": objective})
-
-
 def limited(scene: Scene, **limits: float) -> Scene:
     """Return the scene with other constraints."""
     return scene.model_copy(update={"constraints": MoreConstraints(**limits)})
-
-
-def rebuilt(built: Built, scene: Scene) -> Built:
-    return Built(scene, built.partition, built.arms, built.profile)
 
 
 QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
@@ -112,7 +103,7 @@ QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
 @pytest.mark.serial
 def test_a_new_response_is_minimised() -> None:
     """The optimiser finds what is known: x0 everywhere; nothing but the result is simulated."""
-    scene = minimised(do.load_scene(TWO_ARM, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
+    scene = minimising(do.load_scene(TWO_ARM, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
     result = do.optimize(scene)  # no limit is active: there is no gradient left to be balanced
     for k, x in result.x_phys.items():
         # The filter smooths away what is left at the solid ends, if any.
@@ -149,7 +140,7 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     """The same class on the other side: value over limit less 1, with the gradient of that."""
     built = build(*QUICK, "objective.kind=static", "objective.gradient=exact",
                   "motion.horizon=1.9", "simulation.tolerance=1e-7")  # fmt: skip
-    built = rebuilt(built, limited(built.scene, **{name: 0.01}))
+    built = replace(built, scene=limited(built.scene, **{name: 0.01}))
     assert needs(built.scene, "motion")
     x, d = built.fields(wave), built.fields(uneven)
     _, trajectory = built.evaluate(x)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from machines import demo_machine
 from moved_nodes import built_with, node_test, noise
-from mpi4py import MPI
 from remainders import hold_instants, rates, wave
+from runs import by_root, minimising
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -24,7 +24,6 @@ from dolfinopt.responses.evaluation import gradient
 from dolfinopt.responses.products import Products, by_nodes
 from dolfinopt.responses.sensitivity import esl_gradient
 
-WORLD = MPI.COMM_WORLD
 ROUGHLY = ("simulation.tolerance=1e-4", "simulation.sample=0.01", "objective.gradient=exact")
 TRIANGLES = ("arms.mesh='FOLDER/bar.geo'", "arms.cell_shape=triangle")
 QUADRILATERALS = ("arms.cells=[12,2]",)
@@ -37,7 +36,7 @@ ROD = ("arms.rod.height=0.008", "arms.rod.passive=0", "motion.speed=60", "motion
 BAR = """Point(1) = {0, -0.03, 0}; Point(2) = {1, -0.03, 0}; Point(3) = {1, 0.03, 0};
 Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 1};
 Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
-Transfinite Curve {1, 3} = CELLS; Transfinite Curve {2, 4} = 3; Transfinite Surface {1};
+Transfinite Curve {1, 3} = 13; Transfinite Curve {2, 4} = 3; Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
 BASES = {  # scene, what makes it small, size of a move (m), whether boxes are cut into tetrahedra
@@ -126,11 +125,9 @@ CASES = [
 ]  # fmt: skip
 
 
-def scene_of(base: str, changes: tuple[str, ...], folder: Path, cells: int = 12) -> do.Scene:
+def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     """Return a scene of `BASES` with keys changed, FOLDER standing for the files' one."""
-    if WORLD.rank == 0:
-        (folder / "bar.geo").write_text(BAR.replace("CELLS", str(cells + 1)))
-    WORLD.barrier()
+    by_root(lambda: (folder / "bar.geo").write_text(BAR))
     name, quick, _, _ = BASES[base]
     alone = base in ("one arm", "lone file")
     return demo_machine(name, (*quick, *changes), folder, one_arm=alone)
@@ -185,18 +182,12 @@ def test_height_of_a_bar_bent_by_a_moment(shared_tmp_path) -> None:
     scene = scene_of("triangles", (*told, f"objective.loads=[[0,0,{moment}]]"), shared_tmp_path)
     built = built_with(scene, lambda arm, x: np.zeros_like(x))
     built.evaluate(built.uniform(1.0))
-    (compliance, mass) = (_along_height(one, built) for one in (scene, _of_mass(scene)))
+    compliance, mass = (_along_height(one, built) for one in (scene, minimising(scene, "mass")))
     arm, material = scene.arms[0], scene.material
     bent = moment**2 * arm.length / (material.young_modulus * arm.thickness * arm.height**3 / 12.0)
     assert compliance == pytest.approx([-3.0 * bent] * 2, rel=1e-8)  # a step of h / h
     one = material.density * arm.length * arm.height * arm.thickness
     assert mass == pytest.approx([one] * 2, rel=1e-12)
-
-
-def _of_mass(scene: do.Scene) -> do.Scene:
-    return scene.model_copy(
-        update={"objective": scene.objective.model_copy(update={"kind": "mass"})}
-    )
 
 
 def _along_height(scene: do.Scene, built) -> list[float]:

@@ -45,10 +45,8 @@ class Analysed:
 
 
 def all_loads(arm, body, rates_at, outboard, n):
-    """Return all loads of an instant on nodes and outboard interface, from the frame's motion.
-
-    -M (a + S X wd - X w^2 + ...), and what `outboard` (3,) takes away.
-    """
+    """Return all loads of an instant on nodes and outboard interface, from the frame's motion."""
+    # -M (a + S X wd - X w^2 + ...), and what `outboard` (3,) takes away.
     V, X = arm.current.basis.V, arm.current.elastic.points
     u, ud, udd = (V @ x[n] for x in rates_at)
     a, w, wd = body.a[:, n], body.w[0, n], body.wd[0, n]
@@ -64,10 +62,8 @@ def all_loads(arm, body, rates_at, outboard, n):
 
 
 def geometric_matrix(arm, c):
-    """Return sum_p p K0_p of all nodal displacements, assembled from the loads' stress.
-
-    Of the loads -p = c of frame, outboard interface and modes at one instant.
-    """
+    """Return sum_p p K0_p of all nodal displacements, assembled from the loads' stress."""
+    # Of the loads -p = c of frame, outboard interface and modes at one instant.
     elastic, loads = arm.current.elastic, arm.current.stiffening_loads
     frame, outboard, modes = np.split(-c[: 7 + arm.coordinates], [4, 7])
     p = np.concatenate([frame, modes, outboard])
@@ -130,11 +126,9 @@ def analysed_arms(built: Built):
 @pytest.mark.parametrize("element", ["incompatible", "quadratic"])
 @pytest.mark.parametrize("method", ["craig-bampton", "modal"])
 def test_static_solution_of_all_loads(method: str, element: str) -> None:
-    """Without damping and stiffening mode acceleration is the full model's static solution.
-
-    The loads are those of the frame's motion, put together node by node. Mode displacement misses
-    it by what the modes cannot show.
-    """
+    """Without damping and stiffening mode acceleration is the full model's static solution."""
+    # The loads are those of the frame's motion, put together node by node. Mode displacement misses
+    # it by what the modes cannot show.
     built = build(
         "simulation.stiffening=false", f"reduction.method={method}", "simulation.tolerance=1e-7",
         "damping.stiffness_proportional=0", f"arms.element={element}", "motion.gravity=[0,-9.81]",
@@ -150,11 +144,9 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
 
 
 def test_static_solution_of_the_stiffened_arm() -> None:
-    """With stiffening, K less the geometric stiffness of the loads: 0.28 % of 1 % and more.
-
-    The assembled matrix knows nothing of the rotation of second order of the interface; without it
-    the reduced body agrees to 0.2 %.
-    """
+    """With stiffening, K less the geometric stiffness of the loads: 0.28 % of 1 % and more."""
+    # The assembled matrix knows nothing of the rotation of second order of the interface; without
+    # it the reduced body agrees to 0.2 %.
     built = build("simulation.stiffening=true", "simulation.tolerance=1e-5",
                   "motion.horizon=1.9", "damping.stiffness_proportional=0")  # fmt: skip
     effect = 0.0
@@ -219,10 +211,8 @@ def few_directions(*changes: str) -> Analysed:
 
 @pytest.mark.parametrize("stiffening", ["true", "false"])
 def test_directions_of_the_motion(stiffening: str) -> None:
-    """In space they are less than the loads, and make the same stress and gradient of it.
-
-    Directions that are left out have a share of 1e-9 of the loads, and less in what these do.
-    """
+    """In space they are less than the loads, and make the same stress and gradient of it."""
+    # Directions that are left out have a share of 1e-9 of the loads, and less in what these do.
     one = few_directions(f"simulation.stiffening={stiffening}", "objective.gradient=exact")
     for k, state in one.analysis.designs.items():
         before = state.elastic.profile.counts.solves

@@ -53,12 +53,10 @@ def stress_at(arm: Arm, trajectory: Trajectory, points: np.ndarray, sample: int)
 
 @pytest.mark.parametrize("when", [1.0, 1.3, 2.05])
 def test_beam(when: float) -> None:
-    """M y / I and N / A of payload and the arm's own inertia, a height away from the root.
-
-    At the clamped edge itself corners are singular. The motion takes long beside the vibration's
-    80 ms; speeding up at 1 s, up and round at 1.3 s, round alone at 2.05 s, where Saint-Venant's
-    rest of the clamping shows.
-    """
+    """M y / I and N / A of payload and the arm's own inertia, a height away from the root."""
+    # At the clamped edge itself corners are singular. The motion takes long beside the vibration's
+    # 80 ms; speeding up at 1 s, up and round at 1.3 s, round alone at 2.05 s, where Saint-Venant's
+    # rest of the clamping shows.
     length = 1.0
     entry = {"length": length, "cells": [100, 6], "element": "incompatible"}
     arm, trajectory = turned(entry, 12.0, 2.0, 2e-4)
@@ -99,11 +97,9 @@ Physical Surface("design") = {{1}};
 
 
 def test_hole(tmp_path: Path) -> None:
-    """The pull of a turning arm at a hole: 2 + (1 - d / H)^3 of the net section's mean.
-
-    Heywood, Designing by Photoelasticity (1952); within 2 % of Howland's exact series. Measured
-    0.7 % above on quadratic triangles, at their corners on the hole.
-    """
+    """The pull of a turning arm at a hole: 2 + (1 - d / H)^3 of the net section's mean."""
+    # Heywood, Designing by Photoelasticity (1952); within 2 % of Howland's exact series. Measured
+    # 0.7 % above on quadratic triangles, at their corners on the hole.
     length = 0.5
     path = tmp_path / "hole.geo"
     path.write_text(GEOMETRY.format(radius=0.5 * HOLE, middle=0.5 * length))

@@ -53,7 +53,6 @@ CENTRED = 0.04  # of height or thickness: offset of interfaces up to which nothi
 PASSIVE = 0.4  # of a solid's length: longest solid end
 SETTLING = 0.3  # of the motion's duration, simulated after it
 ROUNDING = 1e-15  # m, rad: less is written as zero
-TIME = "t"  # a column of tables
 INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, xz, yz
 LONGEST_NAME = 64
 
@@ -64,7 +63,7 @@ def scene_names(names: Iterable[str]) -> dict[str, str]:
     Letters, digits, _, - stay; what else there is becomes _.
     """
     found: dict[str, str] = {}
-    taken = {GROUND, TIME}
+    taken = {GROUND, "t"}
     for name in names:
         word = re.sub(r"[^A-Za-z0-9_-]", "_", name)[: LONGEST_NAME - 4].lstrip("-") or "_"
         word = f"_{word}" if word.isdigit() else word
@@ -425,7 +424,6 @@ def _one_line(text: str) -> str:
 # -- A robot's trajectory: columns for all its joints, checked against its limits ----------------
 
 LIMIT_ROUNDING = 1e-6  # of a limit, which files round
-SAMPLES = 2000  # at which a trajectory's rates are looked at
 
 
 def read_trajectory(
@@ -449,7 +447,7 @@ def read_trajectory(
     rows, held = _complete(robot, names, joints, loops.passive)
     _check_positions(robot, file, table.lines, rows)
     curve = curve_in_time(Table(file, table.lines, table.t, rows))
-    rates = curve(np.linspace(0.0, curve.end, SAMPLES))[1]
+    rates = curve(np.linspace(0.0, curve.end, 2000))[1]
     return table.t, np.hstack([rows, lengths]), [*held, *_too_fast(robot, file, rates)]
 
 

@@ -37,7 +37,6 @@ LIMITS = ("position_limits", "velocity_limit", "effort_limit")
 OF_MOTORS = ("rotor_inertia", "gear_ratio")
 OF_BEARINGS = ("bearing_stiffness", "bearing_damping")
 GROUND = "ground"
-TIME = "t"  # column of a table of joint coordinates
 PATHS = ("joints", "points", "line")  # of machines in space
 # What a machine in the plane has instead of joints.
 PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
@@ -45,7 +44,7 @@ PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbo
 
 def check_joint_name(name: str) -> str:
     """Return `name` if it can be the column of a table."""
-    if name == TIME:
+    if name == "t":
         raise Refusal('expected another name: a column "t" means the time')
     return check_arm_name(name)
 
