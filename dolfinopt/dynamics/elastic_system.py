@@ -197,7 +197,7 @@ def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
         size_of_step = relative_errors(system, step[:, None], q[:, None])
         stalled = (size_of_step <= EQUILIBRIUM_STALLED_ERROR) & (size_of_step >= 0.5 * before)
         found |= (size_of_step <= EQUILIBRIUM_ROUNDING_ERROR) | stalled
-        kept = found | (size_of_step <= EQUILIBRIUM_KEPT_CONTRACTION * np.minimum(before, 1.0))
+        kept = found | (size_of_step <= EQUILIBRIUM_KEPT_CONTRACTION * before)
         before = size_of_step
     return q, found
 

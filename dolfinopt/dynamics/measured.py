@@ -22,9 +22,11 @@ FIRST_GRID_STEPS_LIMIT = 20_000  # more are asked for by estimated errors alone
 FEWEST_STEPS = 20
 FOLLOWED_STEPS_RATIO = 1.5
 FOLLOWED_STEPS_SHARE = 0.25
-# Error over the tolerance up to which more steps than that are tried, up to half of those: from
-# 1e-3 down to the tolerance of 1e-4 it falls within three to five numbers of steps.
+# Error over the tolerance up to which more steps are tried: their growth, and where the error
+# stays, as of vibrations, at once the most of them, as a share of eight a period.
 FEW_STEPS_ERROR_RATIO = 100.0
+FEW_STEPS_GROWTH = 2
+MOST_FEW_STEPS_SHARE = 0.4
 # Of the tolerance, accepted of them: the estimate is 0.23 to 1.7 times the error, as what tables
 # excite between the breakpoints is not seen.
 FEW_STEPS_ESTIMATE_SHARE = 0.25

@@ -48,12 +48,12 @@ from dolfinopt.dynamics.measured import (
     FAILED_STEP_RATIO,
     FEW_STEPS_ERROR_RATIO,
     FEW_STEPS_ESTIMATE_SHARE,
+    FEW_STEPS_GROWTH,
     FINER_GRID_ITERATIONS,
     FIRST_GRID_ERROR,
     FIRST_GRID_GROWTH_LIMIT,
     FIRST_GRID_ITERATIONS_LIMIT,
     FIRST_REFINEMENT_RATIO,
-    FOLLOWED_STEPS_RATIO,
     HELD_COORDINATES_LIMIT,
     LATER_REFINEMENT_RATIO,
     LEAST_STEP_SHARE,
@@ -64,6 +64,7 @@ from dolfinopt.dynamics.measured import (
     MARCH_ANGLE_EXCESS,
     MARCH_ITERATIONS_LIMIT,
     MARCH_STEPS_LIMIT,
+    MOST_FEW_STEPS_SHARE,
     NEWTON_ROUNDING_ERROR,
     RADAU_AIM_SHARE,
     RADAU_BYTES_LIMIT,
@@ -187,10 +188,11 @@ def _on_few_steps(
     """Return what steps find that the loads alone need, where these are few; None: nothing."""
     # The estimated error counts vibrations that the steps do not resolve: without damping, those of
     # 1e-3 of the deflection need steps of their own at a tolerance of 1e-4.
-    grid, found = None, None
+    grid, found, before = None, None, np.inf
     if preconditioner.guided:
         grid = followed_steps(preconditioner.system, time_grid, tolerance, stages)
-    while grid is not None and 2 * len(grid) <= len(time_grid):
+    most = int(MOST_FEW_STEPS_SHARE * len(time_grid))
+    while grid is not None and len(grid) - 1 <= most:
         try:
             found = _on_grid(preconditioner, grid, tolerance, stages, found)
         except GivenUp:
@@ -198,9 +200,11 @@ def _on_few_steps(
         except ConvergenceError:
             return None
         over = found.error / tolerance
-        if not FEW_STEPS_ESTIMATE_SHARE < over <= FEW_STEPS_ERROR_RATIO:
+        if not FEW_STEPS_ESTIMATE_SHARE < over <= FEW_STEPS_ERROR_RATIO or len(grid) - 1 == most:
             break
-        grid = even_steps(preconditioner.system, int(FOLLOWED_STEPS_RATIO * (len(grid) - 1)))
+        # An error that does not fall is that of vibrations, which want steps of their own.
+        count = FEW_STEPS_GROWTH * (len(grid) - 1) if found.error < 0.5 * before else most
+        grid, before = even_steps(preconditioner.system, min(count, most)), found.error
     return found
 
 

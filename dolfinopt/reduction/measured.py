@@ -40,7 +40,7 @@ RAMP_SHARE = 1e-6
 # more.
 WARM_STEPS = 16
 
-# -- krylov, gramian -------------------------------------------------------------------------
+# -- methods: Krylov subspaces, Gramians -----------------------------------------------------
 
 # Blocks of a Krylov space: for a shift up to 40 times the first frequency 5 to 10 are the rule.
 KRYLOV_BLOCKS_LIMIT = 60

@@ -769,7 +769,7 @@ def test_steps_of_stiff_arms_follow_the_motion(number: int, damping: float) -> N
     problem, _ = two_arms(waves(number), (0.0, 2.0), **stiff)
     usual = first_num_steps(problem)
     fine = radau.on_grid(problem, even_steps(problem, 2 * usual), 1e-8, 5)
-    for tolerance, most in ((1e-3, usual / 10), (1e-4, usual / 3), (1e-6, np.inf)):
+    for tolerance, most in ((1e-3, usual / 10), (1e-4, usual / 2), (1e-6, np.inf)):
         found = radau.integrate(problem, tolerance, 4, Profile())
         assert distance(problem, found, fine) <= tolerance
         assert len(found.a) <= most

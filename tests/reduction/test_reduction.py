@@ -28,7 +28,7 @@ from dolfinopt.reduction.eigenproblem import (
     interior_pencil,
     lowest_eigenpairs,
 )
-from dolfinopt.reduction.gramian import quadrature
+from dolfinopt.reduction.methods import quadrature
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 LENGTH, HEIGHT, THICKNESS = 1.0, 0.06, 0.01  # m
