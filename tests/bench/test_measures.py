@@ -97,7 +97,7 @@ def test_elements_that_do_not_lock():
     [
         (iterations.plain_statics, (100, 12)),
         (iterations.pymoto_iteration, (100, 12)),
-        (iterations.pymoto_iteration, (100, 12, 4)),
+        pytest.param(iterations.pymoto_iteration, (100, 12, 4), marks=pytest.mark.slow),
     ],
 )
 def test_static_iterations(make, cells):
