@@ -8,6 +8,7 @@ from remainders import built_of
 from runs import TWO_ARM
 
 import dolfinopt as do
+from dolfinopt import solver
 from dolfinopt.fem import interior
 from dolfinopt.solver import BandCholesky, PetscFactor, direct_solver
 
@@ -36,11 +37,11 @@ def test_direct_solver(ordering):
     first, last = mat.getOwnershipRange()
     x.array = np.sin(np.arange(first, last))
     mat.mult(x, b)
-    solver = direct_solver(mat, ordering, "test_")
+    ksp = direct_solver(mat, ordering, "test_")
     found = x.duplicate()
-    solver.solve(b, found)
+    ksp.solve(b, found)
     assert np.abs(found.array_r - x.array_r).max(initial=0.0) < 1e-14 * 9.0  # the condition
-    kind = solver.getPC().getFactorSolverType()
+    kind = ksp.getPC().getFactorSolverType()
     assert kind == ("petsc" if COMM.size == 1 else "mumps")
 
 
@@ -65,9 +66,36 @@ def test_band_cholesky(bandwidth):
             assert np.array_equal(right, kept)
     dense[size // 2, size // 2] = -1.0
     assert not band.factorise(dense[rows, columns][band.taken])  # not positive definite
+<<<<<<< HEAD
     empty = BandCholesky(rows[:0], rows[:0], 0)
     assert empty.factorise(np.empty(0))
     assert empty.solve(np.empty((0, 3))).shape == (0, 3)
+=======
+
+
+@pytest.mark.parametrize(("size", "bandwidth"), [(700, 65), (389, 300), (130, 129)])
+def test_band_by_blocks(monkeypatch, size, bandwidth):
+    """Many right sides at once, as one after the other; a last block of any size."""
+    rng = np.random.default_rng(size)
+    rows, columns = np.divmod(np.arange(size**2), size)
+    inside = np.abs(rows - columns) <= bandwidth
+    band = BandCholesky(rows[inside], columns[inside], size)
+    taken = rows[inside] == columns[inside]
+    values = np.where(taken, 2.0 * bandwidth, rng.uniform(-1.0, 1.0, len(taken)))[band.taken]
+    assert band.factorise(values)
+    right = rng.normal(size=(size, 7))
+    one_by_one = np.column_stack([band.solve(column) for column in right.T])
+    monkeypatch.setattr(solver, "BLOCKED_BANDWIDTH", 65)
+    assert band.solve(right) == pytest.approx(one_by_one, rel=0.0, abs=1e-15)
+    assert band.solve(right[:, :4]) == pytest.approx(one_by_one[:, :4], rel=0.0, abs=1e-15)
+
+
+def test_an_empty_band():
+    none = np.empty(0, dtype=int)
+    band = BandCholesky(none, none, 0)
+    assert band.factorise(np.empty(0))
+    assert band.solve(np.empty((0, 3))).shape == (0, 3)
+>>>>>>> solid
 
 
 @pytest.mark.parametrize("pivot", [2.0, 0.0])
@@ -76,9 +104,20 @@ def test_mumps_solves_several_loads_at_once(pivot):
     size = 12
     mat = assembled(size, lambda row: ((row, pivot if row == 5 else 1.0 + row),))
     first, last = mat.getOwnershipRange()
+<<<<<<< HEAD
     solver = direct_solver(mat, "natural", "test_", own=False)
     solver.setUp()
     factor = PetscFactor(solver)
+=======
+    for row in range(first, last):
+        mat.setValue(row, row, pivot if row == 5 else 1.0 + row)
+    mat.assemble()
+    for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
+        mat.setOption(option, True)
+    ksp = direct_solver(mat, "natural", "test_", own=False)
+    ksp.setUp()
+    factor = PetscFactor(ksp)
+>>>>>>> solid
     right = np.arange(first, last)[:, None] + np.array([1.0, 2.0, 3.0])
     found = factor.solve(right)
     assert factor.failed == (pivot == 0.0)

@@ -1,18 +1,25 @@
-"""Seconds of a design iteration: against elements, on ranks, beside other programs."""
+"""Seconds of a design iteration: against elements, on ranks, beside plain DOLFINx and pyMOTO."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import perf_counter
+from typing import Any
 
 import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.fem import petsc
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from dolfinopt.bench.measure import Cells, Plan, in_processes, mpirun, timed
 from dolfinopt.bench.panel import Diagram, Rows, Steps
-from dolfinopt.bench.programs import PlainStatics, pymoto_iteration
-from dolfinopt.mesh.arm_mesh import arm_mesh
+from dolfinopt.fem.multigrid import with_rigid_motions
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.output.run_folder import optimize
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.variants import changed
@@ -95,3 +102,129 @@ DIAGRAM = Diagram(
     "least of the repeats. Memory is that of all ranks.",
     uses=("pymoto",),
 )
+
+
+# -- static iterations of other programs ---------------------------------------------------
+
+PENALTY, FLOOR = 3.0, 1e-6  # of the interpolation
+
+# Densities (n_cells,) -> compliance under a force across the end, N m, and its gradient.
+Iteration = Callable[[np.ndarray], tuple[float, np.ndarray]]
+
+
+class PlainStatics:
+    """Compliance of a cantilever as DOLFINx's own demos would find it (collective).
+
+    Linear elements, no filter. In the plane MUMPS' Cholesky factor, in space CG with GAMG from 0.
+    """
+
+    def __init__(
+        self, arm: ArmMesh, modulus: float, nu: float, area: float, tolerance: float = 1e-7
+    ) -> None:
+        """Compile the forms of an arm that is clamped at its inboard facets; 1 N over its end.
+
+        In the plane the modulus is times the thickness, and the area the height; CG's tolerance.
+        """
+        mesh, d, self.modulus, self.count = arm.mesh, arm.dim, modulus, arm.num_cells
+        self.space = space = compat.lagrange_space(mesh, 1, components=d)
+        cellwise = getattr(fem, "functionspace", fem.FunctionSpace)(mesh, ("DG", 0))
+        self.x, self.u, self.in_plane = fem.Function(cellwise), fem.Function(space), d == 2
+        a, b, w = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.TestFunction(cellwise)
+        # In the plane the law stands in the form, as one writes it; that doubles what an iteration
+        # takes: quadrature allows for x**3.0 as if x varied in a cell. In space x is E itself.
+        young = modulus * (FLOOR + (1.0 - FLOOR) * self.x**PENALTY) if d == 2 else self.x
+        slope = -modulus * PENALTY * (1.0 - FLOOR) * self.x ** (PENALTY - 1.0) if d == 2 else 1.0
+        shear, rest = 1.0 / (1.0 + nu), 1.0 - nu if d == 2 else 1.0 - 2.0 * nu
+
+        def energy(u: Any, v: Any) -> Any:  # of unit stiffness; plane stress in the plane
+            strain, other = ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))
+            stress = shear * strain + shear * nu / rest * ufl.tr(strain) * ufl.Identity(d)
+            return ufl.inner(stress, other)
+
+        end = ufl.gt(ufl.SpatialCoordinate(mesh)[0], (1.0 - 1e-9) * arm.outboard_point[0])
+        load = ufl.conditional(end, 1.0 / area, 0.0) * b[1] * ufl.ds
+        self._stiffness = compat.compile_form(young * energy(a, b) * ufl.dx)
+        self._gradient = compat.compile_form(slope * energy(self.u, self.u) * w * ufl.dx)
+        dofs = fem.locate_dofs_topological(space, d - 1, arm.inboard_facets)
+        self._clamp = fem.dirichletbc(np.zeros(d), dofs, space)
+        self.load = petsc.assemble_vector(compat.compile_form(load))
+        self.load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        petsc.set_bc(self.load, [self._clamp])
+        self._solution, self.K = self.load.duplicate(), petsc.create_matrix(self._stiffness)
+        self._ksp = PETSc.KSP().create(arm.comm)
+        self._ksp.setType("preonly" if d == 2 else "cg")
+        self._ksp.getPC().setType("cholesky" if d == 2 else "gamg")
+        if d == 2:
+            self._ksp.getPC().setFactorSolverType("mumps")
+        self._ksp.setTolerances(rtol=tolerance)
+
+    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the compliance and its derivative (n_cells,) by x; in space energies of cells."""
+        self.x.x.array[: self.count] = x if self.in_plane else self.modulus * (FLOOR + x**PENALTY)
+        compat.scatter_forward(self.x)
+        self.K.zeroEntries()
+        petsc.assemble_matrix(self.K, self._stiffness, bcs=[self._clamp])
+        self.K.assemble()
+        if self.in_plane:
+            self.K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self.K.setOption(PETSc.Mat.Option.SPD, True)
+        else:  # tell GAMG what K does not resist
+            owned = self.K.getLocalSize()[0] // 3
+            with_rigid_motions(self.K, self.space.tabulate_dof_coordinates()[:owned])
+        self._ksp.setOperators(self.K)
+        self._ksp.solve(self.load, self._solution)
+        self.u.x.array[: len(self._solution.array)] = self._solution.array
+        compat.scatter_forward(self.u)
+        gradient = petsc.assemble_vector(self._gradient).array_r.copy()
+        return float(self.load.dot(self._solution)), gradient
+
+
+def pymoto_iteration(scene: Scene, cells: Sequence[int]) -> Iteration | None:
+    """Return the same by pyMOTO 1.5, https://github.com/aatmdelissen/pyMOTO; None: not there.
+
+    In the plane with a factor, in space by CG with three geometric grids, to its own 1e-7.
+    """
+    try:
+        import pymoto as pym
+    except ImportError:
+        return None
+    arm, solid, d = scene.arms[0], scene.material_of(0), len(cells)
+    thickness = arm.thickness / (cells[2] if d == 3 else 1)
+    edges = arm.length / cells[0], arm.height / cells[1], thickness
+
+    def grid(step: int) -> Any:
+        units = {f"unit{axis}": step * edge for axis, edge in zip("xyz", edges, strict=True)}
+        return pym.DomainDefinition(*(n // step for n in cells), **units)
+
+    domain = grid(1)
+    across = np.array([one.ravel() for one in np.indices([n + 1 for n in cells[1:]])])
+    left, right = (domain.get_nodenumber(at, *across) for at in (0, cells[0]))
+    force, fixed = np.zeros(d * domain.nnodes), (d * left[:, None] + np.arange(d)).ravel()
+    edge = [(at == 0) | (at == n) for at, n in zip(across, cells[1:], strict=True)]
+    force[d * right + 1] = np.prod(np.where(edge, 0.5, 1.0), axis=0) / np.prod(cells[1:])
+    density, load = pym.Signal("x", np.ones(domain.nel)), pym.Signal("f", force)
+    stiff, matrix, u, compliance = (pym.Signal(name) for name in "sKuc")
+    options = {"domain": domain, "bc": fixed, "plane": "stress"}
+    options |= {"e_modulus": solid.young_modulus, "poisson_ratio": solid.poisson_ratio}
+    law = f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
+    solver = None
+    if d == 3:
+        inner = pym.solvers.GeometricMultigrid(grid(2))
+        outer = pym.solvers.GeometricMultigrid(domain, inner_level=inner)
+        solver = pym.solvers.CG(preconditioner=outer)
+    network = pym.Network(
+        pym.MathGeneral(density, stiff, expression=law),
+        pym.AssembleStiffness(stiff, matrix, **options),
+        pym.LinSolve([matrix, load], u, solver=solver),
+        pym.EinSum([u, load], compliance, expression="i,i->"),
+    )
+
+    def iterate(x: np.ndarray) -> tuple[float, np.ndarray]:
+        network.reset()
+        density.state = x
+        network.response()
+        compliance.sensitivity = 1.0
+        network.sensitivity()
+        return float(compliance.state), np.asarray(density.sensitivity)
+
+    return iterate

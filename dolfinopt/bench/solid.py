@@ -13,9 +13,9 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, field_tolerance
+from dolfinopt.bench.iterations import PlainStatics, pymoto_iteration
 from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Rows, Steps
-from dolfinopt.bench.programs import PlainStatics, pymoto_iteration
 from dolfinopt.fem import interior
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.mesh.budget import free_memory, solid_bytes

@@ -5,8 +5,8 @@ values, scaled by Young's modulus. Coarser grids leave out lines of the mesh; th
 P' K P (Galerkin), summed from the cells that a coarse cell holds, since P in a coarse cell is
 trilinear. Directions with much longer cells than others are coarsened later.
 
-The whole box is held by the root of its ranks, which solves for all: the result has the same bits
-on any number of ranks, and one rank takes a tenth of what several take with aggregates.
+The whole box is held by the root of its ranks, which solves for all: a second rank saves nothing,
+but one takes less time than several do with aggregates.
 
 Source: Trottenberg, Oosterlee & Schüller, Multigrid (2001), sections 2.4, 5.1 and 7.
 """

@@ -380,8 +380,50 @@ def _without_kept(mesh: ArmMesh, kept: np.ndarray, field: np.ndarray) -> np.ndar
     return found
 
 
+class Filled:
+    """How much of an arm a design fills.
+
+    Attributes:
+        x_phys: (n_cells,) physical densities.
+    """
+
+    x_phys: np.ndarray
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """(n_cells,) of the cells: areas, m2, in space volumes, m3."""
+        raise NotImplementedError
+
+    @property
+    def volume(self) -> float:
+        """The material's, in the plane over the thickness; m3, m2."""
+        return float(self.x_phys @ self.sizes)
+
+    @property
+    def whole(self) -> float:
+        """All that material may fill; m3, m2."""
+        return float(self.sizes.sum())
+
+    @property
+    def total(self) -> float:
+        """Size of the arm with the cells that stay void; m3, m2."""
+        return self.whole
+
+    @property
+    def grayness(self) -> float:
+        """Mean of 4 x (1 - x) over the arm, cells that stay void included."""
+        gray = 4.0 * self.x_phys * (1.0 - self.x_phys) @ self.sizes
+        return float(gray / self.total)
+
+    @property
+    def gray_share(self) -> float:
+        """Share of the material in cells of densities between 0.1 and 0.9."""
+        gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
+        return float((self.x_phys * self.sizes)[gray].sum() / self.volume)
+
+
 @dataclass(frozen=True, eq=False)
-class Domain:
+class Domain(Filled):
     """One arm before its outline is drawn.
 
     Attributes:
@@ -444,25 +486,9 @@ class Domain:
         return float(np.ptp(self.corners[..., 1]))
 
     @property
-    def volume(self) -> float:
-        """The material's volume over the thickness, m2."""
-        return float(self.x_phys @ self.area)
-
-    @property
-    def grayness(self) -> float:
-        """Mean of 4 x (1 - x) over the area."""
-        return float(4.0 * self.x_phys * (1.0 - self.x_phys) @ self.area / self.area.sum())
-
-    @property
-    def whole(self) -> float:
-        """All that material may fill, m2."""
-        return float(self.area.sum())
-
-    @property
-    def gray_share(self) -> float:
-        """Share of the material in cells of densities between 0.1 and 0.9."""
-        gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
-        return float((self.x_phys * self.area)[gray].sum() / self.volume)
+    def sizes(self) -> np.ndarray:
+        """See `Filled`."""
+        return self.area
 
 
 def domain_of(
@@ -555,7 +581,7 @@ AROUND = [0, 1, 3, 2]  # from a tensor product's corners of a quadrilateral to t
 
 
 @dataclass(frozen=True, eq=False)
-class SolidDomain:
+class SolidDomain(Filled):
     """A solid arm with a design, without its cells that stay void.
 
     Attributes:
@@ -600,6 +626,11 @@ class SolidDomain:
         return cell_volumes(self.corners)
 
     @property
+    def total(self) -> float:
+        """See `Filled`."""
+        return self.whole + self.void
+
+    @property
     def cell(self) -> float:
         """Size of a cell: the least of its median edges, m."""
         ends = (1, 2, 3) if self.corners.shape[1] == 4 else (1, 2, 4)
@@ -623,28 +654,6 @@ class SolidDomain:
         normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
         normal *= np.where(((centre - inner) * normal).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
         return np.asarray(normal / np.linalg.norm(normal, axis=1)[:, None])
-
-    @property
-    def volume(self) -> float:
-        """The material's, m3."""
-        return float(self.sizes @ self.x_phys)
-
-    @property
-    def grayness(self) -> float:
-        """Mean of 4 x (1 - x) over the arm's volume, cells that stay void included."""
-        gray = 4.0 * self.x_phys * (1.0 - self.x_phys) @ self.sizes
-        return float(gray / (self.sizes.sum() + self.void))
-
-    @property
-    def whole(self) -> float:
-        """All that material may fill, m3."""
-        return float(self.sizes.sum())
-
-    @property
-    def gray_share(self) -> float:
-        """Share of the material in cells of densities between 0.1 and 0.9."""
-        gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
-        return float((self.x_phys * self.sizes)[gray].sum() / self.volume)
 
 
 def domain_in_scene(

@@ -196,12 +196,21 @@ LIMITED = {"compliance": "load_case_compliance"}
 # Files of responses whose names are not theirs.
 FILES = {
     **dict.fromkeys(
-        ("compliance", "deviation", "esl", "load_case_compliance", "orientation", "settling"),
+        (
+            "compliance",
+            "deviation",
+            "effort",
+            "esl",
+            "load_case_compliance",
+            "orientation",
+            "peak_force",
+            "settling",
+        ),
         "motion",
     ),
-    **dict.fromkeys(("damping_ratio", "pole_frequency"), "poles"),
-    **dict.fromkeys(("effort", "peak_force"), "drives"),
-    **dict.fromkeys(("eigenfrequency", "first_frequency"), "frequency"),
+    **dict.fromkeys(
+        ("damping_ratio", "eigenfrequency", "first_frequency", "pole_frequency"), "frequency"
+    ),
     **dict.fromkeys(("stiffness", "tip_deflection"), "static"),
     "volume_fraction": "mass",
 }

@@ -1,4 +1,4 @@
-"""The bench: what it keeps, draws and tells, and its goals."""
+"""The bench: what it keeps, draws and tells, and its benches."""
 
 import math
 from dataclasses import replace
@@ -10,7 +10,6 @@ from runs import refusal, run
 
 from dolfinopt.bench import (
     elements,
-    goals,
     iterations,
     measure,
     motion,
@@ -20,9 +19,9 @@ from dolfinopt.bench import (
     tolerance,
 )
 from dolfinopt.bench import run as benches
-from dolfinopt.bench.goals import Goal, goal_table
 from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, curves, figure_of, fitted_power, least_x
+from dolfinopt.bench.run import Goal, goal_table
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.paper.reproduction import load_paper
@@ -151,7 +150,7 @@ def test_ended_bench_keeps_what_is_finished(measured, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     goal = Goal("toy", "error [-]", 0.1, lambda frame: frame["error [-]"].min())
-    monkeypatch.setattr(goals, "GOALS", (goal,))
+    monkeypatch.setattr(benches, "GOALS", (goal,))
     with pytest.raises(KeyboardInterrupt):
         measured(toy(lambda step: [("a", 1.0, 1e-2)]), toy(ended, name="late"))
     text = (tmp_path / "bench.md").read_text()
@@ -234,7 +233,7 @@ def test_figure_has_a_panel_a_group_and_quantity():
 
 def measures(diagram, **frames):
     """Return what the diagram's goals measure of rows, by what they say."""
-    mine = [goal for goal in goals.GOALS if goal.diagram == diagram]
+    mine = [goal for goal in benches.GOALS if goal.diagram == diagram]
     return {goal.what: goal.measure(frames[diagram]) for goal in mine}
 
 
