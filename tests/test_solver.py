@@ -66,11 +66,9 @@ def test_band_cholesky(bandwidth):
             assert np.array_equal(right, kept)
     dense[size // 2, size // 2] = -1.0
     assert not band.factorise(dense[rows, columns][band.taken])  # not positive definite
-<<<<<<< HEAD
     empty = BandCholesky(rows[:0], rows[:0], 0)
     assert empty.factorise(np.empty(0))
     assert empty.solve(np.empty((0, 3))).shape == (0, 3)
-=======
 
 
 @pytest.mark.parametrize(("size", "bandwidth"), [(700, 65), (389, 300), (130, 129)])
@@ -90,34 +88,15 @@ def test_band_by_blocks(monkeypatch, size, bandwidth):
     assert band.solve(right[:, :4]) == pytest.approx(one_by_one[:, :4], rel=0.0, abs=1e-15)
 
 
-def test_an_empty_band():
-    none = np.empty(0, dtype=int)
-    band = BandCholesky(none, none, 0)
-    assert band.factorise(np.empty(0))
-    assert band.solve(np.empty((0, 3))).shape == (0, 3)
->>>>>>> solid
-
-
 @pytest.mark.parametrize("pivot", [2.0, 0.0])
 def test_mumps_solves_several_loads_at_once(pivot):
     """As one by one, on any number of ranks; of a singular matrix all are said to fail."""
     size = 12
     mat = assembled(size, lambda row: ((row, pivot if row == 5 else 1.0 + row),))
     first, last = mat.getOwnershipRange()
-<<<<<<< HEAD
-    solver = direct_solver(mat, "natural", "test_", own=False)
-    solver.setUp()
-    factor = PetscFactor(solver)
-=======
-    for row in range(first, last):
-        mat.setValue(row, row, pivot if row == 5 else 1.0 + row)
-    mat.assemble()
-    for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SPD):
-        mat.setOption(option, True)
     ksp = direct_solver(mat, "natural", "test_", own=False)
     ksp.setUp()
     factor = PetscFactor(ksp)
->>>>>>> solid
     right = np.arange(first, last)[:, None] + np.array([1.0, 2.0, 3.0])
     found = factor.solve(right)
     assert factor.failed == (pivot == 0.0)
