@@ -24,36 +24,10 @@ The same step by step, with ranks and profile in hand:
 from __future__ import annotations
 
 # ruff: noqa: F401 - names for type checkers; `__getattr__` imports them at run time
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from dolfinopt.version import __version__
-
-
-class _Versions(ModuleType):
-    """What stands for pkg_resources until more than a version is asked of it.
-
-    UFL and FFCx 2022 ask it for their own at import: it takes as long as UFL itself.
-    """
-
-    @staticmethod
-    def get_distribution(name: str) -> Any:
-        """Return a distribution, which has a `version`."""
-        from importlib.metadata import distribution
-
-        return distribution(name)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):  # what importing itself looks for
-            raise AttributeError(name)
-        if sys.modules.get(self.__name__) is self:
-            del sys.modules[self.__name__]
-        return getattr(import_module(self.__name__), name)
-
-
-sys.modules.setdefault("pkg_resources", _Versions("pkg_resources"))
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm, build_arms
