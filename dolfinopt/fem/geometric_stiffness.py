@@ -48,11 +48,6 @@ class UnitLoads:
     modes: np.ndarray | None = None
 
     @property
-    def num_loads(self) -> int:
-        """Number p of unit loads: 7 in the plane, 18 in space, and those of the modes."""
-        return self.fields.shape[2]
-
-    @property
     def num_frame(self) -> int:
         """Number of those by the arm's own inertia in its frame's acceleration."""
         return NUM_INERTIAL[self.fields.shape[1]]

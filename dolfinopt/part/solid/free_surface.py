@@ -27,9 +27,18 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import NEAR, PlateMesh, extruded, facing
-from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
+from dolfinopt.part.plane.free_outline import (
+    EDGE_SHARE,
+    LEAST_GAP,
+    LEAST_MEMBER,
+    ROOM_SHARE,
+    WIDTH_SHARE,
+    FreeOutline,
+    free_outline,
+)
 from dolfinopt.part.solid.part import SolidPart, plate_part
 from dolfinopt.part.solid.surface import (
+    FURTHER,
     Surface,
     area_vectors,
     crossings,
@@ -41,15 +50,10 @@ REACH = 1.5  # length r over which moves are smooth, cells of the design
 FLAT = 1e-6  # of a normal, by which facets of one flat face differ, and faces from an axis
 STEEP = 0.3  # sine between surface and face from which on the rim between them moves
 NEAREST, WALLS = 400, 60  # places around each that may be the other side; the arm's own faces
-WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
-ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
-EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
 # Worst shape of a cell over that when the mesh was made: a new one is due, or a step goes too far.
 WORN, SPOILT = 0.6, 0.2
 # What is left of moves, within how many cells of what would wear; tried in turn.
 KEPT_BACK = (0.5, 1.0), (0.5, 1.0), (0.0, 1.0), (0.0, 2.0), (0.0, 4.0)
-FURTHER = "further "  # what the names of arrays of further interfaces begin with
-LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 
 
 REPEATED = (
