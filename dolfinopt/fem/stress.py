@@ -363,15 +363,8 @@ def _lengths(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
 def _directions(
     c: np.ndarray, lengths: np.ndarray, which: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return D (k, r) and E (k, r) with c = (c D) E' for those of the coefficients c of a motion.
-
-    What is left out is small beside all of them.
-
-    Args:
-        c: (n, m).
-        lengths: (m,) by which they are weighed.
-        which: (k,) of the m.
-    """
+    """Return D (k, r) and E (k, r) with c = (c D) E' for `which` (k,) coefficients of a motion."""
+    # c: (n, m), weighed by `lengths` (m,); what is left out is small beside all of them.
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     weighed = c * lengths
     if len(weighed) > weighed.shape[1]:

@@ -661,10 +661,8 @@ class _Line:
 
 
 def _lines(loop: tuple[Piece, ...], chord: float, short: float) -> list[Piece | _Line]:
-    """Return a loop's pieces that stay, and one line for all free ones between two of them.
-
-    Free ones that are shorter in all than `short`, m, stay, too: both of their ends do.
-    """
+    """Return a loop's pieces that stay, and one line for all free ones between two of them."""
+    # Free ones that are shorter in all than `short`, m, stay, too: both of their ends do.
     found: list[Piece | _Line] = []
     first = next(k for k, piece in enumerate(loop) if not piece.free)
     loop = (*loop[first:], *loop[:first])  # no line goes on beyond the last piece
