@@ -471,13 +471,10 @@ class _Mixed:
     """Steps of one matrix, mixed so that they leave least: Anderson's acceleration.
 
     Source: Walker & Ni (2011), doi:10.1137/10078356X, in the norm of the changes of q.
-
-    Attributes:
-        serves: whether all mixed steps have lowered the residual.
     """
 
     def __init__(self) -> None:
-        self.serves = True
+        self.serves = True  # as long as mixed steps lower the residual
         self._last: tuple[np.ndarray, ...] = ()  # a, its step, and the change of q
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []  # changes of these, orthonormal
 
@@ -536,12 +533,10 @@ class _Run:
             size = self.stages.relative(shift, self.at.q + shift)[0]
             with np.errstate(all="ignore"):  # inf / inf of what diverges
                 contraction = size / self.before
-                left = _left(
-                    np.maximum(contraction, self.at.norm[0] / self.norm_before), self.tuning
-                )
+                worst = np.maximum(contraction, self.at.norm[0] / self.norm_before)
             if np.isfinite(self.before) and np.isfinite(size):
                 self.rate = max(self.rate, float(contraction))
-            ends = left * size <= self.tuning.goal * self.tolerance
+            ends = _left(worst, self.tuning) * size <= self.tuning.goal * self.tolerance
             if ends or (exact and age == 0 and size <= 1e-3 * self.tolerance):
                 self.at = replace(self.at, a=self.at.a + step)
                 self.converged = True
