@@ -51,9 +51,10 @@ def bench(
     for k, diagram in enumerate(diagrams, 1):
         begun = perf_counter()
         rows, failed = measured(diagram, plan, folder, tell)
-        frame = frames[diagram.name] = diagram.frame(rows)
-        parts.append(write(diagram, frame, folder))
         failures += failed
+        if rows:
+            frame = frames[diagram.name] = diagram.frame(rows)
+            parts.append(write(diagram, frame, folder))
         told = [f"Failed: {failure}" for failure in failures]
         told += [f"Not finished: {one.name} is missing." for one in diagrams[k:]]
         if len(goals := goal_table(frames)):
