@@ -141,6 +141,12 @@ class Spline:
         """Where its polynomials meet, ends included."""
         return np.unique(self.knots)
 
+    @property
+    def joints(self) -> np.ndarray:
+        """Where curves were joined in it: its double knots."""
+        inner = self.knots[DEGREE + 1 : -DEGREE - 1]
+        return np.asarray(inner[1:][np.diff(inner) == 0.0])
+
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return the points (n, 2) at parameters (n,), m."""
         whole = BSpline.construct_fast(self.knots, self.points, DEGREE)
