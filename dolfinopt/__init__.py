@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
     from dolfinopt.optimization.loop import Result
+    from dolfinopt.output.design import gather_views
     from dolfinopt.output.run_folder import optimize
-    from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import abort_together, gather_arms, partition_arms
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient

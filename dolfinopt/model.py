@@ -37,9 +37,15 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.state import HistoryRow
-from dolfinopt.output.design import physical, read_design
+from dolfinopt.output.design import (
+    ArmView,
+    canonical_order,
+    designed,
+    gather_views,
+    physical,
+    read_design,
+)
 from dolfinopt.output.run_folder import optimize
-from dolfinopt.output.views import ArmView, canonical_order, designed, gather_views
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit

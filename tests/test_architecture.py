@@ -12,8 +12,8 @@ from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene.tables.arms import ElementName
 from dolfinopt.scene.tables.design import Law
+from dolfinopt.scene.tables.motion import ReductionMethod
 from dolfinopt.scene.tables.objective import NEEDS, NO_LIMITS, Constraints, ObjectiveKind
-from dolfinopt.scene.tables.simulation import ReductionMethod
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

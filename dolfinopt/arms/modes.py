@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.fem.prestress import Prestress
+from dolfinopt.fem.stress import Prestress
 from dolfinopt.multibody.inverse_dynamics import outward_pass
 from dolfinopt.multibody.machine import (
     ONE,

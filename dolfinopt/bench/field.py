@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from mpi4py import MPI
 
-from dolfinopt.bench import crank, ur10e
+from dolfinopt.bench.field_machines import crank_values, ur10e_values
 from dolfinopt.data import benchmark_folder
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
@@ -309,8 +309,8 @@ HISTORIES: dict[str, History] = {
 }
 # Of the folder of records, where there are some.
 PROGRAMS: dict[str, Callable[[Path | None], dict[str, float]]] = {
-    "crank": lambda _: crank.values(),
-    "ur10e": ur10e.values,
+    "crank": lambda _: crank_values(),
+    "ur10e": ur10e_values,
 }
 
 

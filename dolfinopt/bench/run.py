@@ -11,7 +11,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
-from dolfinopt.bench import elements, iterations, motion, optimiser, solid, tolerance
+from dolfinopt.bench import accuracy, iterations, solid
 from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, version, write
 from dolfinopt.disk import write_text
@@ -26,8 +26,8 @@ HEAD = """# Run time against error
 Measured by `dolfinopt bench{}`: CPU seconds of this process, the least of the repeats, one \
 thread, unless a table says otherwise."""
 # The main one first; what takes long, or is about designs, only when it is named.
-DIAGRAMS = motion.DIAGRAM, iterations.DIAGRAM, elements.DIAGRAM, tolerance.DIAGRAM
-NAMED = optimiser.DIAGRAM, solid.DIAGRAM, solid.STATICS
+DIAGRAMS = accuracy.MOTION, iterations.ITERATION, accuracy.ELEMENTS, accuracy.TOLERANCE
+NAMED = iterations.OPTIMISER, solid.SOLID, solid.STATICS
 
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:
@@ -146,7 +146,7 @@ def _at(frame: Frame, **values: object) -> Frame:
 
 def _usual(coordinates: int, frame: Frame) -> Frame:
     """Return the rows of a simulation as scenes have it by default."""
-    usual = {"method": motion.USUAL, "tolerance [-]": motion.USUAL_TOLERANCE}
+    usual = {"method": accuracy.USUAL, "tolerance [-]": accuracy.USUAL_TOLERANCE}
     return _at(frame, coordinates_per_arm=coordinates, **usual)
 
 
@@ -155,9 +155,9 @@ def _superiority(coordinates: int, frame: Frame) -> float:
     theirs = _at(frame, coordinates_per_arm=coordinates)
     theirs = theirs[theirs["method"].str.startswith("SciPy")]
     ratios = [
-        least_x(points, one[motion.ERROR]) / one[motion.SECONDS]
+        least_x(points, one[accuracy.ERROR]) / one[accuracy.SECONDS]
         for _, one in _usual(coordinates, frame).iterrows()
-        for points in curves(_at(theirs, design=one["design"]), *motion.CURVES).values()
+        for points in curves(_at(theirs, design=one["design"]), *accuracy.CURVES).values()
     ]
     return min(ratios, default=math.nan)
 
@@ -211,8 +211,8 @@ def _over_pymoto(design: str, dofs: int, frame: Frame) -> float:
 
 def _over_straight(frame: Frame) -> float:
     """Return the rod's least mass over that of the straight one."""
-    kept = frame[(frame["problem"] == optimiser.ROD) & (frame["largest excess [-]"] <= EXCESS)]
-    drawn = kept["start"] == optimiser.BY_HAND
+    kept = frame[(frame["problem"] == iterations.ROD) & (frame["largest excess [-]"] <= EXCESS)]
+    drawn = kept["start"] == iterations.BY_HAND
     return kept[~drawn]["objective"].min() / kept[drawn]["objective"].min()
 
 
@@ -223,9 +223,9 @@ def _infeasible(frame: Frame) -> float:
 
 GOALS = (
     Goal("time", "simulation to 1e-4 from cold, 4 coordinates per arm [s]", 0.03,
-         lambda f: _usual(4, f)[motion.SECONDS].max()),
+         lambda f: _usual(4, f)[accuracy.SECONDS].max()),
     Goal("time", "simulation to 1e-4 from cold, 48 coordinates per arm [s]", 0.3,
-         lambda f: _usual(48, f)[motion.SECONDS].max()),
+         lambda f: _usual(48, f)[accuracy.SECONDS].max()),
     *(Goal("time", f"times as fast as solve_ivp at the same error, {q} coordinates per arm [-]",
            FASTER, partial(_superiority, q), least=True) for q in (4, 48)),
     Goal("iteration", "dynamic iteration of two arms of 400 x 24 cells over plain DOLFINx's static "
@@ -237,11 +237,12 @@ GOALS = (
     Goal("iteration", "demos/two_arm.toml on two ranks until it has converged, set-up included, "
          "wall clock [s]", 20.0, _demo),
     Goal("mesh", "error of tip compliance, 50 x 3 cells of the default element [%]", 0.5,
-         lambda f: 100.0 * _at(f, element=elements.DEFAULT, cells="50 x 3")[elements.ERROR].min()),
+         lambda f: 100.0
+         * _at(f, element=accuracy.DEFAULT, cells="50 x 3")[accuracy.TIP_ERROR].min()),
     Goal("tolerance", "largest true error over simulation.tolerance [-]", 1.0,  # inf: it failed
          lambda f: (f["true error [-]"] / f["tolerance [-]"]).max()),
     Goal("optimiser", "objective from a start over the best of its problem, the largest [-]", 1.05,
-         lambda f: optimiser.compared(f[f["iterations"] > 0])[optimiser.OVER].max()),
+         lambda f: iterations.over_best(f[f["iterations"] > 0])[iterations.OVER].max()),
     Goal("optimiser", "mass of the rod over the best straight one [-]", 1.0, _over_straight),
     Goal("optimiser", "evaluations for an iteration, mean [-]", 1.3,
          lambda f: f["evaluations"].sum() / (f["iterations"].sum() or math.nan)),

@@ -135,7 +135,7 @@ def _static_steps(plan: Plan) -> Steps:
             yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, link, name, cells)
 
 
-def _steps(plan: Plan) -> Steps:
+def _links(plan: Plan) -> Steps:
     def rows(link: Callable[..., Found], cells: Cells, ranks: int) -> Rows:
         (dofs, solver, found), memory = in_processes(link, plan.scene, cells, ranks=ranks)
         for name, seconds in zip(OURS if link is iterate_link else [PLAIN], found, strict=True):
@@ -150,11 +150,11 @@ def _steps(plan: Plan) -> Steps:
             yield f"{who}, {size}", partial(rows, link, cells, ranks)
 
 
-DIAGRAM = Diagram(
+SOLID = Diagram(
     "solid",
     "One solid link: a design iteration against degrees of freedom",
     "what | ranks | dofs | iteration [s] | memory [GB] | solver",
-    _steps,
+    _links,
     "dofs",
     ("iteration [s]", "memory [GB]"),
     "what",

@@ -481,7 +481,7 @@ def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
 
 def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Any]:
     """Return both runs as the page needs them, on the root (collective)."""
-    from dolfinopt.output.views import gather_views
+    from dolfinopt.output.design import gather_views
     from dolfinopt.parallel import on_root, together
     from dolfinopt.study.before_after import read_side
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.arms.arm import Arm
     from dolfinopt.optimization.loop import Result
-    from dolfinopt.output.views import ArmView
+    from dolfinopt.output.design import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene
 
@@ -281,9 +281,8 @@ def _check_gradient(
 def plot(folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""
     world = start()
-    from dolfinopt.output.design import arms_with_design, read_history
+    from dolfinopt.output.design import arms_with_design, gather_views, read_history
     from dolfinopt.output.trajectory import read_initial_deviation
-    from dolfinopt.output.views import gather_views
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate

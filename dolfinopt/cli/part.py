@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.part.check import Check
-    from dolfinopt.part.checkpoint import Saved
+    from dolfinopt.part.folder import Saved
     from dolfinopt.part.optimize import Keep, Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
@@ -118,8 +118,7 @@ def part(
     """
     world = start()
     from dolfinopt.parallel import on_root, together
-    from dolfinopt.part import checkpoint
-    from dolfinopt.part.folder import file_names
+    from dolfinopt.part.folder import SHAPES, checkpoint_of_search, file_names
     from dolfinopt.part.part import Curves, PartsError, make_parts
 
     if resume and overwrite:
@@ -136,9 +135,9 @@ def part(
         raise InputError("--optimize: expected splines, not --curves arcs")
     if resume and not asked.optimize:
         raise InputError("--resume: goes on with --optimize, which is not asked for")
-    names = [*file_names(scene), checkpoint.NAME]
-    claim(world, target, overwrite or resume, names, resume=checkpoint.NAME, scene=scene)
-    kept = on_root(world, checkpoint.of_search, target, folder, scene, asked)
+    names = [*file_names(scene), SHAPES]
+    claim(world, target, overwrite or resume, names, resume=SHAPES, scene=scene)
+    kept = on_root(world, checkpoint_of_search, target, folder, scene, asked)
     known = on_root(world, kept.read) if resume else ()
     with _stages(world) as say:
         say("outlines and surfaces")
@@ -299,7 +298,7 @@ class Made:
 
     def draw(self, folder: Path) -> None:
         """Write the picture of the parts, and those of what they do if that is known."""
-        from dolfinopt.output.views import designed
+        from dolfinopt.output.design import designed
         from dolfinopt.part.optimize import TRUSSES
         from dolfinopt.plots.curves import check_figure
         from dolfinopt.plots.design import parts_figure, stress_figure

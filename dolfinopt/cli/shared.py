@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.dynamics.simulation import Trajectory
     from dolfinopt.optimization.state import HistoryRow
-    from dolfinopt.output.views import ArmView
+    from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection
     from dolfinopt.scene.load import Scene
 
@@ -194,7 +194,7 @@ def draw(
     animation: bool = False,
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
-    from dolfinopt.output.views import designed
+    from dolfinopt.output.design import designed
     from dolfinopt.plots.curves import deviation_of, drives_figure, history_of
     from dolfinopt.plots.design import design_figure, stress_figure
     from dolfinopt.plots.machine import machine_figure

@@ -34,11 +34,10 @@ from dolfinopt.multibody.motion import (
     rests,
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.paths.tables import TIME, read_table
+from dolfinopt.paths import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.interfaces import interface_number
-from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
+from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
 
 

@@ -40,7 +40,7 @@ from dolfinopt.mesh.measured import (
     LOST_VOLUME_SHARE,
 )
 from dolfinopt.scene.load import Arm
-from dolfinopt.scene.tables.interfaces import Bore, frame_of
+from dolfinopt.scene.tables.joints import Bore, frame_of
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.

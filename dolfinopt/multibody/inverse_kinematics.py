@@ -37,7 +37,7 @@ from dolfinopt.multibody.measured import (
 )
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import along_curve, curve_of_table, curve_through
-from dolfinopt.paths.tables import TIME, Curve, Table, column_names, read_table
+from dolfinopt.paths import TIME, Curve, Table, column_names, read_table
 from dolfinopt.scene.duration import SPACE_POINT, file_stamp
 from dolfinopt.scene.load import Scene
 

@@ -30,12 +30,11 @@ from dolfinopt.multibody.motion import (
     rigid_motion,
 )
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
-from dolfinopt.paths.tables import Curve
+from dolfinopt.paths import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.closures import Closures, closing_site
-from dolfinopt.scene.tables.interfaces import interface_number
-from dolfinopt.scene.tables.joint_parts import JointParts, joint_parts
+from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
 
 # -- rigid bodies ----------------------------------------------------------------------------
 

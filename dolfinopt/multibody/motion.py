@@ -22,9 +22,11 @@ from dolfinopt.multibody.measured import (
     TABLE_CORNERS_LIMIT,
 )
 from dolfinopt.multibody.mechanism import repeated
-from dolfinopt.paths.tables import (
+from dolfinopt.paths import (
     TIME,
     Curve,
+    Law,
+    Limits,
     Table,
     curve_by_chord,
     curve_by_laws,
@@ -32,7 +34,6 @@ from dolfinopt.paths.tables import (
     moves,
     read_table,
 )
-from dolfinopt.paths.time_laws import Law, Limits
 from dolfinopt.scene.duration import (
     POINT,
     SAME_TIME,

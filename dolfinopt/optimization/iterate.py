@@ -53,7 +53,7 @@ from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory
 from dolfinopt.optimization.stopping import Ending, Residual, ending, kkt_residual
 from dolfinopt.parallel import sum_over_arms
 from dolfinopt.responses.constraints import tightest, violated
-from dolfinopt.responses.mass import cell_volumes
+from dolfinopt.responses.static import cell_volumes
 
 
 class Iterate:

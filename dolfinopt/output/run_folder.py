@@ -22,7 +22,7 @@ from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.loop import Report, Result
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
-from dolfinopt.output.design import HistoryWriter, write_design, write_fields
+from dolfinopt.output.design import ArmView, HistoryWriter, gather_views, write_design, write_fields
 from dolfinopt.output.folders import (
     RUN_FILES,
     check_sources,
@@ -32,7 +32,6 @@ from dolfinopt.output.folders import (
 )
 from dolfinopt.output.summary import summarise, write_budget, write_summary
 from dolfinopt.output.trajectory import write_trajectory
-from dolfinopt.output.views import ArmView, gather_views
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit

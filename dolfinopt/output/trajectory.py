@@ -11,7 +11,7 @@ from dolfinopt.disk import read_arrays, write_arrays, write_text
 from dolfinopt.multibody.mechanism import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.closures import PARTS
-from dolfinopt.scene.tables.joint_parts import joint_parts
+from dolfinopt.scene.tables.joints import joint_parts
 
 BEHIND = "; behind them the bearings', m and rad"
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit

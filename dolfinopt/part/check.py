@@ -21,8 +21,8 @@ from mpi4py import MPI
 
 from dolfinopt.dynamics.collocation import counted
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.output.design import ArmView, gather_views
 from dolfinopt.output.trajectory import drive_units
-from dolfinopt.output.views import ArmView, gather_views
 from dolfinopt.part.folder import scene_data, toml_text
 from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts

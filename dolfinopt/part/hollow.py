@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.mesh.hollow import Hull
-from dolfinopt.mesh.sections import Member
+from dolfinopt.mesh.hollow import Hull, Member
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.solid.surface import Surface, check_surface

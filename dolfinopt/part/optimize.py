@@ -25,7 +25,7 @@ from dolfinopt.optimization.measured import LIMIT_PRICE
 from dolfinopt.optimization.mma import MMAState, Promise, initial_state, judge_step, mma_step
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
-from dolfinopt.part.checkpoint import Forms, Saved
+from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without

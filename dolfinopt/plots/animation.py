@@ -14,7 +14,7 @@ from PIL import Image
 
 from dolfinopt.disk import write_atomically
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.output.views import ArmView
+from dolfinopt.output.design import ArmView
 from dolfinopt.plots.machine import (
     Cast,
     PlaneMotion,

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from dolfinopt.output.views import ArmView
+from dolfinopt.output.design import ArmView
 from dolfinopt.plots.style import (
     BLUE,
     COLOURS,

@@ -17,7 +17,7 @@ from matplotlib.tri import Triangulation
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
-from dolfinopt.output.views import ArmView
+from dolfinopt.output.design import ArmView
 from dolfinopt.plots.design import boundary, sides
 from dolfinopt.plots.style import (
     COLOURS,

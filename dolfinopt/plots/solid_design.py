@@ -14,7 +14,7 @@ import numpy as np
 import pyvista
 
 from dolfinopt.mesh.checks import cell_volumes
-from dolfinopt.output.views import AROUND, ArmView
+from dolfinopt.output.design import AROUND, ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
 from dolfinopt.plots.design import (
     MEGA,

@@ -14,7 +14,7 @@ from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.mechanism import GROUND, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
-from dolfinopt.output.views import ArmView
+from dolfinopt.output.design import ArmView
 from dolfinopt.part.solid.surface import Surface
 from dolfinopt.plots.animation import FRAMES, frame_numbers, round_magnification
 from dolfinopt.plots.machine import poses_along

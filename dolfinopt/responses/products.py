@@ -27,7 +27,7 @@ import numpy as np
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.fem.geometric_stiffness import GeometricGradient
-    from dolfinopt.fem.prestress import PrestressGradient
+    from dolfinopt.fem.stress import PrestressGradient
 
 Pair = tuple[np.ndarray, np.ndarray]  # l and r, each (n_nodes, d, k)
 Interfaces = Callable[[], tuple[np.ndarray, np.ndarray]]

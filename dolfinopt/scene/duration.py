@@ -8,9 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.paths.tables import TIME, column_names, last_instant, read_table
-from dolfinopt.paths.time_laws import Law as TimeLaw
-from dolfinopt.paths.time_laws import Limits, law_for
+from dolfinopt.paths import TIME, Limits, column_names, last_instant, law_for, read_table
+from dolfinopt.paths import Law as TimeLaw
 from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points

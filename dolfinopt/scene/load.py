@@ -55,9 +55,8 @@ from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, s
 from dolfinopt.scene.tables.closures import Closures, as_closure
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Force, Joint
-from dolfinopt.scene.tables.motion import Motion
+from dolfinopt.scene.tables.motion import Motion, Reduction
 from dolfinopt.scene.tables.objective import NEEDS, Objective, WorstBy
-from dolfinopt.scene.tables.simulation import Reduction
 
 __all__ = [
     "FILE_KEYS",

@@ -23,11 +23,10 @@ from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
-from dolfinopt.scene.tables.interfaces import interface_number
+from dolfinopt.scene.tables.joints import interface_number
 from dolfinopt.scene.tables.machine import Closure, Control, Damping, Force, Joint, Payload
-from dolfinopt.scene.tables.motion import Motion
+from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
-from dolfinopt.scene.tables.simulation import Reduction, Simulation
 
 
 def check_scene_name(name: str) -> str:

@@ -14,8 +14,8 @@ import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import lengths
+from dolfinopt.output.design import designed
 from dolfinopt.output.trajectory import drive_units
-from dolfinopt.output.views import designed
 from dolfinopt.plots.style import look
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, html_page
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.multibody.mechanism import Mechanism
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-    from dolfinopt.output.views import ArmView
+    from dolfinopt.output.design import ArmView
 
 Summary = Mapping[str, Any]  # content of summary.json
 Image = dict[str, Any]  # see `tables.embedded`

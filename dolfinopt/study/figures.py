@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.output.design import read_views
-from dolfinopt.output.views import designed
+from dolfinopt.output.design import designed, read_views
 from dolfinopt.plots import style
 from dolfinopt.plots.style import GREY
 from dolfinopt.study import tables

@@ -28,7 +28,7 @@ from scipy.optimize import brentq, minimize
 
 from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.sections import KINDS, Section, member
+from dolfinopt.mesh.hollow import KINDS, Section, member
 from dolfinopt.mesh.solid_cells import msh_bytes
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.constraints import EXCESS

@@ -16,7 +16,7 @@ from dolfinopt.output.design import read_design
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.sensitivity import exact_gradient
-from dolfinopt.scene.tables.interfaces import Interface
+from dolfinopt.scene.tables.joints import Interface
 
 COMM = MPI.COMM_WORLD
 MASS = DENSITY * LENGTH * HEIGHT * THICKNESS

@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 from runs import refusal, run
 
-from dolfinopt.bench import (
-    elements,
-    iterations,
-    measure,
-    motion,
-    optimiser,
-    panel,
-    solid,
-    tolerance,
-)
+from dolfinopt.bench import accuracy, iterations, measure, panel, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, curves, figure_of, fitted_power, least_x
@@ -264,10 +255,10 @@ def test_goals_are_met_or_not_or_not_measured():
 
 def test_goals_of_simulations():
     """The slower design; SciPy's seconds at our error, or a bound where no method got there."""
-    usual = motion.USUAL, motion.USUAL_TOLERANCE
+    usual = accuracy.USUAL, accuracy.USUAL_TOLERANCE
 
     def found(*rows):
-        frame = motion.DIAGRAM.frame([(d, 4, *of, s, e) for d, of, s, e in rows])
+        frame = accuracy.MOTION.frame([(d, 4, *of, s, e) for d, of, s, e in rows])
         seconds, _, ratio, _ = measures("time", time=frame).values()
         return seconds, ratio
 
@@ -286,16 +277,16 @@ def test_goals_of_iterations():
     times = {iterations.PLAIN: (0.05, 0.06), iterations.OURS: (0.10, 0.11)}
     times |= {iterations.TWO_RANKS: (0.20, 0.12)}
     rows = [(name, 9600, *one, 10, 1.0, 300.0) for name, one in times.items()]
-    found = [*measures("iteration", iteration=iterations.DIAGRAM.frame(rows)).values()]
+    found = [*measures("iteration", iteration=iterations.ITERATION.frame(rows)).values()]
     assert found[:2] == [pytest.approx(2.0), pytest.approx(2.0)] and all(map(math.isnan, found[2:]))
-    found = [*measures("iteration", iteration=iterations.DIAGRAM.frame(rows[1:])).values()]
+    found = [*measures("iteration", iteration=iterations.ITERATION.frame(rows[1:])).values()]
     assert all(map(math.isnan, found))
     # The exponent is not fitted to the last cells; whole optimisations have more iterations.
     rows = [(iterations.OURS, n, seconds, 1.0, 10, 1.0, 300.0)
             for n, seconds in ((2400, 2400**1.2), (38400, 38400**1.2), (153600, 1e9))]  # fmt: skip
     rows += [(iterations.TWO_RANKS, 2400, 1.0, 1.0, count, s, 300.0)
              for count, s in ((400, 18.0), (10, 2.0))]  # fmt: skip
-    found = [*measures("iteration", iteration=iterations.DIAGRAM.frame(rows)).values()]
+    found = [*measures("iteration", iteration=iterations.ITERATION.frame(rows)).values()]
     assert found[2:] == [pytest.approx(1.2), 18.0]
 
 
@@ -303,11 +294,11 @@ def test_goals_of_errors():
     """The default element on the coarsest mesh; the largest error over its tolerance."""
     rows = [("incompatible", "50 x 3", 1, 1.0, 2e-3), ("linear", "50 x 3", 1, 1.0, 0.1)]
     rows += [("incompatible", "100 x 6", 1, 1.0, 1e-4)]
-    assert [*measures("mesh", mesh=elements.DIAGRAM.frame(rows)).values()] == [pytest.approx(0.2)]
+    assert [*measures("mesh", mesh=accuracy.ELEMENTS.frame(rows)).values()] == [pytest.approx(0.2)]
     case = 0, "smooth", "arc", "quintic", 1.0, 1.0, 0.0, 4
     rows = [(*case, 1e-2, 1e-3, 5e-3, 10), (*case, 1e-4, 1e-5, 8e-5, 10)]
     for more, worst in (([], 0.8), ([(*case, 1e-3, math.inf, math.inf, 0)], math.inf)):
-        frame = tolerance.DIAGRAM.frame(rows + more)
+        frame = accuracy.TOLERANCE.frame(rows + more)
         assert [*measures("tolerance", tolerance=frame).values()] == [pytest.approx(worst)]
 
 
@@ -324,9 +315,9 @@ def test_goals_of_links():
         for what, seconds in zip((solid.PLAIN, solid.COLD, solid.WARM), (1.0, 2.0, 0.5))
         for row in links(what, seconds, power, ranks)
     ]
-    found = measures("solid", solid=solid.DIAGRAM.frame(rows))
+    found = measures("solid", solid=solid.SOLID.frame(rows))
     assert [*found.values()] == pytest.approx([2.0, 0.5, 1.0, 1.0, 2.0, 0.5, 1.1, 1.1, 10.0])
-    small = solid.DIAGRAM.frame([(*row[:2], 9000, *row[3:]) for row in rows])
+    small = solid.SOLID.frame([(*row[:2], 9000, *row[3:]) for row in rows])
     assert all(map(math.isnan, measures("solid", solid=small).values()))
 
 
@@ -343,21 +334,21 @@ def test_goals_of_statics():
 def test_goals_of_the_optimiser():
     kept, left = 5e-4, 2e-3
     rows = [
-        (optimiser.ROD, optimiser.BY_HAND, 0, 0, 0, 0.10, 0.0, 0, 1.0, ""),
-        (optimiser.ROD, "half", 100, 120, 101, 0.12, kept, 100, 1.0, ""),
-        (optimiser.ROD, "thin", 100, 140, 101, 0.15, kept, 90, 1.0, ""),
-        (optimiser.ROD, "thick", 50, 65, 51, 0.05, left, 50, 1.0, ""),
+        (iterations.ROD, iterations.BY_HAND, 0, 0, 0, 0.10, 0.0, 0, 1.0, ""),
+        (iterations.ROD, "half", 100, 120, 101, 0.12, kept, 100, 1.0, ""),
+        (iterations.ROD, "thin", 100, 140, 101, 0.15, kept, 90, 1.0, ""),
+        (iterations.ROD, "thick", 50, 65, 51, 0.05, left, 50, 1.0, ""),
         ("deviation", "half", 50, 55, 51, 3.0, -0.1, 50, 1.0, ""),
     ]
-    found = measures("optimiser", optimiser=optimiser.DIAGRAM.frame(rows))
+    found = measures("optimiser", optimiser=iterations.OPTIMISER.frame(rows))
     assert [*found.values()] == pytest.approx([1.25, 1.2, 380.0 / 300.0, 1.0])
 
 
-@pytest.mark.parametrize("name", optimiser.problems())
+@pytest.mark.parametrize("name", iterations.problems())
 def test_problems_are_scenes(name):
     """From every start, and with an initial design that the limit of the volume allows."""
-    for start, initial in optimiser.STARTS.items():
-        scene = optimiser.posed(optimiser.problems()[name], start, 3)
+    for start, initial in iterations.STARTS.items():
+        scene = iterations.posed(iterations.problems()[name], start, 3)
         share = scene.design.volume_fraction
         assert scene.design.initial == min(initial, share or 1.0)
         assert scene.optimizer.max_iterations == 3
@@ -366,16 +357,16 @@ def test_problems_are_scenes(name):
 @pytest.mark.slow
 def test_problems_are_solved_beside_a_straight_rod():
     """Its stress is that of its limit: of steel, 6.90 mm high, 0.130 kg."""
-    (hand,) = optimiser.straight_rod()
+    (hand,) = iterations.straight_rod()
     assert abs(hand[6]) < 1e-4 and hand[5] == pytest.approx(7850 * 0.2 * 0.012 * 6.90e-3, rel=1e-3)
-    (row,) = optimiser.solved("frozen loads", "half", 2)
-    frame = optimiser.DIAGRAM.frame([hand, row])
+    (row,) = iterations.optimised("frozen loads", "half", 2)
+    frame = iterations.OPTIMISER.frame([hand, row])
     assert frame["iterations"].tolist() == [0, 2] and frame["largest excess [-]"].max() < 1e-3
 
 
 def test_links_that_do_not_fit_are_left_out(monkeypatch):
     monkeypatch.setattr(solid, "free_memory", lambda: 4e9)
-    steps = dict(solid.DIAGRAM.steps(Plan(SCENE, False)))
+    steps = dict(solid.SOLID.steps(Plan(SCENE, False)))
     left_out = [name for name in steps if name.endswith("left out")]
     names = steps.keys() - {*left_out}
     assert len(left_out) == 5 and all([*steps[name]()] == [] for name in left_out)

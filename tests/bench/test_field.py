@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from runs import TWO_ARM, refused, run
 
-from dolfinopt.bench import field, ur10e
+from dolfinopt.bench import field
+from dolfinopt.bench import field_machines as ur10e
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.scene import INERTIA
@@ -116,12 +117,12 @@ def write_robot(folder):
             f'<child link="link{k}"/><origin xyz="0.1 0 0.3" rpy="0 0.2 0"/><axis xyz="{axis}"/>'
             "</joint>"
         )
-    for file in (ur10e.ROBOT, ur10e.LEARNT[0], ur10e.PREDICTED[0]):
+    for file in (ur10e.UR10E, ur10e.LEARNT[0], ur10e.PREDICTED[0]):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
     robot = f'<robot name="six">{"".join(links + joints)}</robot>'
-    (folder / ur10e.ROBOT).write_text(robot)
-    machine = ur10e.machine(folder / ur10e.ROBOT)
-    own = read_robot(folder / ur10e.ROBOT).links
+    (folder / ur10e.UR10E).write_text(robot)
+    machine = ur10e.machine(folder / ur10e.UR10E)
+    own = read_robot(folder / ur10e.UR10E).links
     bodies = [own[f"link{k}"].own for k in range(1, 7)]
     rigid = [
         rigid_spatial_body(b.mass, b.centre, [b.tensor[place] for place in INERTIA]) for b in bodies
@@ -141,7 +142,7 @@ def write_robot(folder):
 def test_torques_of_a_known_robot_are_predicted(tmp_path):
     """What is left are the ends of the records, where the method has no accelerations."""
     write_robot(tmp_path)
-    assert max(ur10e.values(tmp_path).values()) < 0.015
+    assert max(ur10e.ur10e_values(tmp_path).values()) < 0.015
     (tmp_path / ur10e.LEARNT[0]).write_text("1,2\n" * 700)
     with pytest.raises(InputError, match="12harm"):
-        ur10e.values(tmp_path)
+        ur10e.ur10e_values(tmp_path)

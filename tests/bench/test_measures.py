@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from dolfinopt.bench import elements, iterations, measure, motion, solid, tolerance
+from dolfinopt.bench import accuracy, iterations, measure, solid
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
@@ -28,13 +28,13 @@ def problem():
     """The paper's motion with coarse uniform arms of two slow vibrations each."""
     scene = reduced(changed(SCENE, "arms.cells=[20,2]", "motion.horizon=1.9"), "modal", 2)
     built = measure.arms_of(scene)
-    return motion.problem_of(scene, built, {k: arm.uniform(0.5) for k, arm in built.items()})
+    return accuracy.problem_of(scene, built, {k: arm.uniform(0.5) for k, arm in built.items()})
 
 
 @pytest.fixture(scope="module")
 def reference(problem):
     """What the problem's solutions are measured against."""
-    return motion.Reference(problem)
+    return accuracy.Reference(problem)
 
 
 # -- motion ----------------------------------------------------------------------------------
@@ -44,7 +44,7 @@ def test_accelerations_solve_the_residual(problem):
     size = problem.mechanism.num_coordinates
     rng = np.random.default_rng(1)
     q, qd = 1e-3 * rng.normal(size=size), 1e-2 * rng.normal(size=size)
-    qdd = motion.accelerations(problem, 0.7, q, qd)
+    qdd = accuracy.accelerations(problem, 0.7, q, qd)
     now = problem.at(np.array([0.7]))
     left, at_rest = (now.residual(q[None], qd[None], rate[None]) for rate in (qdd, 0 * qdd))
     assert np.abs(left).max() < 1e-11 * np.abs(at_rest).max()
@@ -55,11 +55,11 @@ def test_jacobian_is_the_derivative_of_accelerations(problem):
     size = problem.mechanism.num_coordinates
     rng = np.random.default_rng(2)
     y, d = 1e-3 * rng.normal(size=2 * size), rng.normal(size=2 * size)
-    exact = motion.jacobian(problem, 0.7, y) @ d
+    exact = accuracy.jacobian(problem, 0.7, y) @ d
 
     def rate(step):
         q, qd = np.split(y + step * d, 2)
-        return np.concatenate([qd, motion.accelerations(problem, 0.7, q, qd)])
+        return np.concatenate([qd, accuracy.accelerations(problem, 0.7, q, qd)])
 
     central = (rate(1e-5) - rate(-1e-5)) / 2e-5
     np.testing.assert_allclose(central, exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
@@ -71,8 +71,8 @@ def test_scipy_and_radau_agree(problem, reference):
     def error(q):
         return relative_error(problem.mechanism, q - reference.q, reference.q)
 
-    assert error(motion.scipy_motion("Radau", 1e-3, reference)) < 1e-2
-    errors = [error(motion.radau_motion(3, tol, reference)) for tol in (1e-3, 1e-5)]
+    assert error(accuracy.scipy_motion("Radau", 1e-3, reference)) < 1e-2
+    errors = [error(accuracy.radau_motion(3, tol, reference)) for tol in (1e-3, 1e-5)]
     assert errors[0] < 1e-3 and errors[1] < 1e-5  # the tolerances
 
 
@@ -86,9 +86,9 @@ def test_elements_that_do_not_lock():
     # The rigid end leaves no shear at a free one, but its moment is free: a cantilever.
     right = 1.0 / (3 * E * t * h**3 / 12) + shear
     names = get_args(ElementName)
-    error = {e: elements.tip_compliance(SCENE, e, (50, 3))[0] / right - 1.0 for e in names}
+    error = {e: accuracy.tip_compliance(SCENE, e, (50, 3))[0] / right - 1.0 for e in names}
     # A clamped end does not let the section warp: 0.1 % of the compliance.
-    assert all(abs(error[n]) < 3e-3 for n in (elements.DEFAULT, elements.FINEST))
+    assert all(abs(error[n]) < 3e-3 for n in (accuracy.DEFAULT, accuracy.FINEST))
     assert error["linear"] < -0.03  # they lock
 
 
@@ -146,14 +146,14 @@ def built():
 @pytest.fixture(scope="module")
 def draw(built):
     """A function that draws a case by its number."""
-    return partial(tolerance.random_case, changed(SCENE, "arms.cells=[24,6]"), built)
+    return partial(accuracy.random_case, changed(SCENE, "arms.cells=[24,6]"), built)
 
 
 def test_random_cases_differ_and_come_back(draw):
     cases = [draw(number) for number in range(8)]
     cells = [cells for cells, _ in cases]
-    assert [one[1] for one in cells[:4]] == list(tolerance.KINDS)
-    assert {one[2] for one in cells} == set(tolerance.PATHS)
+    assert [one[1] for one in cells[:4]] == list(accuracy.KINDS)
+    assert {one[2] for one in cells} == set(accuracy.PATHS)
     assert {one[6] > 0.0 for one in cells} == {True, False}
     assert len({one[3:6] for one in cells}) == len(cells)
     again, problem = draw(5)
@@ -164,10 +164,10 @@ def test_random_cases_differ_and_come_back(draw):
         assert 0.5 <= one[4] <= 6.0 and 0.0 <= one[5] <= 50.0
 
 
-@pytest.mark.parametrize("kind", tolerance.KINDS)
+@pytest.mark.parametrize("kind", accuracy.KINDS)
 def test_random_designs(built, kind):
     arm = built[0]
-    x = tolerance.random_design(kind, arm, np.random.default_rng(1))
+    x = accuracy.random_design(kind, arm, np.random.default_rng(1))
     along, up = arm.mesh.centroid.T
     assert x.shape == (arm.mesh.num_cells,) and x.min() >= 0.0 and x.max() <= 1.0
     assert (kind == "uniform") == (np.ptp(x) == 0.0)
@@ -177,16 +177,16 @@ def test_random_designs(built, kind):
 
 
 def rows_of(case):
-    return tolerance.DIAGRAM.frame(tolerance.compared(*case))
+    return accuracy.TOLERANCE.frame(accuracy.compared(*case))
 
 
 def test_errors_of_a_damped_case(draw):
     """The largest difference at the reference's own instants, found by hand."""
     case = next(one for n in range(1, 20) if (one := draw(n))[0][6] > 1e-5)
     rows, problem = rows_of(case), case[1]
-    assert rows["tolerance [-]"].tolist() == list(tolerance.TOLERANCES)
-    found = radau.integrate(problem, 1e-3, tolerance.STAGES, Profile())
-    right = tolerance.reference(problem, found)
+    assert rows["tolerance [-]"].tolist() == list(accuracy.CASE_TOLERANCES)
+    found = radau.integrate(problem, 1e-3, accuracy.STAGES, Profile())
+    right = accuracy.reference(problem, found)
     assert right.error <= 1e-6 and len(right.a) > len(found.a) and right.a.shape[1] == 5
     t = np.linspace(0.0, problem.breakpoints[-1], 4001)
     q = right.sample(t)
@@ -209,4 +209,4 @@ def test_failures_count(draw, monkeypatch):
         assert np.isinf(rows_of(case)["true error [-]"]).all()
     monkeypatch.setattr(radau, "on_grid", fail)
     with pytest.raises(ConvergenceError, match="gave up"):
-        tolerance.reference(case[1], radau.integrate(case[1], 1e-2, 4, Profile()))
+        accuracy.reference(case[1], radau.integrate(case[1], 1e-2, 4, Profile()))

@@ -19,7 +19,7 @@ from dolfinopt.multibody.mechanism import plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.multibody.tangent import linearise
-from dolfinopt.paths.time_laws import quintic
+from dolfinopt.paths import quintic
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # arrays of one process

@@ -19,7 +19,7 @@ from dolfinopt.multibody.kinematics import deviation, end_rotation
 from dolfinopt.multibody.mechanism import Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
-from dolfinopt.paths.time_laws import quintic
+from dolfinopt.paths import quintic
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 

@@ -19,7 +19,7 @@ from machines import (
     with_keys,
 )
 
-from dolfinopt.bench.crank import CRANK, END, ROD, crank, desired, rod, solved, unknowns
+from dolfinopt.bench.field_machines import CRANK, END, ROD, crank, desired, rod, solved, unknowns
 from dolfinopt.dynamics import radau
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -118,7 +118,7 @@ def test_crank_without_stiffness_starts_closed_and_at_rest(kind: str) -> None:
     assert np.abs(gaps(result)).max() < 1e-9  # m
 
 
-# -- the flexible slider-crank `crank.f` of the IVP test set: see `dolfinopt.bench.crank` ----
+# -- the flexible slider-crank `crank.f` of the IVP test set: `bench.field_machines` -----------
 
 
 # Its solution at 0.1 s: positions, velocities, accelerations of (phi2, q), multipliers of the

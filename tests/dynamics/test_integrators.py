@@ -34,7 +34,7 @@ from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
-from dolfinopt.paths.time_laws import Limits, law_for, quintic
+from dolfinopt.paths import Limits, law_for, quintic
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # arrays of one process

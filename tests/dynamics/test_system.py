@@ -23,7 +23,7 @@ from dolfinopt.dynamics.machine_system import DenseLinearisation, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.multibody.mechanism import Drives, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.paths.time_laws import quintic
+from dolfinopt.paths import quintic
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

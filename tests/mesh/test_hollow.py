@@ -8,8 +8,7 @@ from solids import solid_arm
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes, check_cells
-from dolfinopt.mesh.hollow import Wall, box_hull, hull_of, stations, tube_hull
-from dolfinopt.mesh.sections import Member
+from dolfinopt.mesh.hollow import Member, Wall, box_hull, hull_of, stations, tube_hull
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
 
 SIZE, CELLS, WALL = (0.5, 0.08, 0.06), (6, 4, 3), 0.004  # m

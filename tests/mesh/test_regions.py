@@ -10,7 +10,7 @@ from runs import ROOT, STATED, TWO_ARM, refusal
 
 import dolfinopt as do
 from dolfinopt.optimization.problem import Evaluator
-from dolfinopt.output.views import gather_views
+from dolfinopt.output.design import gather_views
 from dolfinopt.plots.design import REGION, design_figure
 from dolfinopt.scene.regions import grid_regions
 

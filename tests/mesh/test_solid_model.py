@@ -18,7 +18,7 @@ from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
-from dolfinopt.scene.tables.interfaces import Interface
+from dolfinopt.scene.tables.joints import Interface
 
 COMM = MPI.COMM_WORLD
 KEYS = {"name": "a", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": None}

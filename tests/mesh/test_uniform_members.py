@@ -8,9 +8,9 @@ from mpi4py import MPI
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.mesh import sections
+from dolfinopt.mesh import hollow
 from dolfinopt.mesh.checks import cell_volumes, check_cells
-from dolfinopt.mesh.sections import FLAT_BAR, SOLID_BAR, member
+from dolfinopt.mesh.hollow import FLAT_BAR, SOLID_BAR, member
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.profiling import Profile
@@ -19,8 +19,8 @@ from dolfinopt.study.sections import Members
 LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
 E, NU = 70e9, 0.33
 G = 0.5 * E / (1.0 + NU)
-MESHED = {"rectangular tube": sections.RECTANGULAR_TUBE, "round tube": sections.ROUND_TUBE,
-          "I section": sections.I_SECTION}  # fmt: skip
+MESHED = {"rectangular tube": hollow.RECTANGULAR_TUBE, "round tube": hollow.ROUND_TUBE,
+          "I section": hollow.I_SECTION}  # fmt: skip
 
 
 def moments(kind, share):

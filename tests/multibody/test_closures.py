@@ -36,7 +36,7 @@ from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loop
 from dolfinopt.multibody.machine import exponential, joint_motion, loops_of, skeleton
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import Loop, assembled, rotation
-from dolfinopt.paths.time_laws import Limits, law_for
+from dolfinopt.paths import Limits, law_for
 from dolfinopt.scene.load import Scene
 
 pytestmark = pytest.mark.serial

@@ -28,7 +28,7 @@ from dolfinopt.multibody.motion import (
     line,
     rigid_motion,
 )
-from dolfinopt.paths.time_laws import quintic, septic
+from dolfinopt.paths import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

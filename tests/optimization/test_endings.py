@@ -11,8 +11,7 @@ from scipy.integrate import trapezoid
 
 import dolfinopt as do
 from dolfinopt.optimization.stopping import kkt_residual
-from dolfinopt.output.design import read_history, write_fields
-from dolfinopt.output.views import ArmView
+from dolfinopt.output.design import ArmView, read_history, write_fields
 from dolfinopt.parallel import Partition, on_root, sum_over_arms
 from dolfinopt.responses import response
 from dolfinopt.responses.constraints import Limit, distinct, violated, worst_limits

@@ -10,8 +10,8 @@ from runs import TWO_ARM, by_root, contents, summary_of
 import dolfinopt as do
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.output import run_folder as results
+from dolfinopt.output.design import gather_views
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
-from dolfinopt.output.views import gather_views
 
 WORLD = MPI.COMM_WORLD
 SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01")

@@ -12,7 +12,7 @@ from runs import run, summary_of
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.output.views import canonical_order
+from dolfinopt.output.design import canonical_order
 from dolfinopt.part import check as checks
 from dolfinopt.part.check import check_parts, crisp
 from dolfinopt.part.part import make_parts, mesh_parts

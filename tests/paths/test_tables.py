@@ -11,7 +11,7 @@ from bodies import assert_close, derivative
 from runs import refusal
 
 from dolfinopt.errors import InputError
-from dolfinopt.paths.tables import Curve, Table, curve_by_chord, curve_in_time, read_table
+from dolfinopt.paths import Curve, Table, curve_by_chord, curve_in_time, read_table
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

@@ -16,7 +16,7 @@ from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.multibody.motion import breakpoints, desired_path, rigid_motion
-from dolfinopt.paths.time_laws import Law, Limits, law_for
+from dolfinopt.paths import Law, Limits, law_for
 from dolfinopt.responses.evaluation import evaluate_batch
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 

@@ -18,7 +18,7 @@ from dolfinopt.multibody.mechanism import Closure, Mechanism, plane_chain
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.state import HistoryRow
-from dolfinopt.output.views import ArmView
+from dolfinopt.output.design import ArmView
 from dolfinopt.plots import animation, curves, design, machine, style
 from dolfinopt.scene.load import scene_from_dict
 

@@ -11,7 +11,7 @@ from runs import ROOT
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_volumes
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.output.views import AROUND, ArmView, designed
+from dolfinopt.output.design import AROUND, ArmView, designed
 from dolfinopt.part.solid.surface import surface_at
 from dolfinopt.plots import animation, solid_design, solid_machine
 from dolfinopt.plots.design import design_figure, stress_figure

@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.arms.modes import buckling_modes
 from dolfinopt.errors import InputError
-from dolfinopt.fem.prestress import Prestress, StressedModulus
+from dolfinopt.fem.stress import Prestress, StressedModulus
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.buckling import pressed, stressed_modulus, worst_instants

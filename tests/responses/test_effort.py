@@ -11,7 +11,7 @@ from runs import demo, refused, scene
 
 import dolfinopt as do
 from dolfinopt import Model
-from dolfinopt.paths.time_laws import quintic
+from dolfinopt.paths import quintic
 from dolfinopt.responses.constraints import constraint_label, limits_by_column, limits_of
 
 # Ranks: limits of effort and peak force in test_every_option_gives_the_same_bits_on_any_number...

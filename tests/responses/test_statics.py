@@ -20,7 +20,7 @@ from dolfinopt.responses.sensitivity import (
     static_gradient,
     static_response,
 )
-from dolfinopt.scene.tables.interfaces import Interface
+from dolfinopt.scene.tables.joints import Interface
 
 YOUNG = 70e9  # Pa, of the scene
 UNIT = np.eye(3)  # a force along the arm, one across it, a moment

@@ -11,10 +11,10 @@ from runs import ROOT, TWO_ARM, by_root, overrides, refusal, run
 from studies import COARSE, column, rows_of, write_uniform
 
 import dolfinopt as do
-from dolfinopt.mesh.sections import FLAT_BAR, SOLID_BAR
+from dolfinopt.mesh.hollow import FLAT_BAR, SOLID_BAR
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.scene.schema import file_digest
-from dolfinopt.scene.tables.interfaces import Interface
+from dolfinopt.scene.tables.joints import Interface
 from dolfinopt.study.sections import (
     LEAST,
     WORTH,

@@ -10,7 +10,7 @@ import pytest
 from runs import refusal
 from scipy import stats
 
-from dolfinopt.study.statistics import (
+from dolfinopt.study.uncertainty import (
     Distribution,
     draw,
     parse_distribution,

@@ -33,7 +33,7 @@ from dolfinopt.exchange.urdf.robot import (
     roll_pitch_yaw_of,
     scene_bodies,
 )
-from dolfinopt.paths.tables import Table, column_names, curve_in_time, read_table
+from dolfinopt.paths import Table, column_names, curve_in_time, read_table
 
 if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.geometry import LinkCells

@@ -12,30 +12,28 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
 from dolfinopt.scene.tables.design import Region, check_regions
-from dolfinopt.scene.tables.interfaces import (
-    Bore,
-    Interface,
-    Point,
-    check_bores,
-    check_interfaces,
-    in_frame,
-)
-from dolfinopt.scene.tables.joint_parts import (
+from dolfinopt.scene.tables.joints import (
     FRICTION_SPEED,
     PART_KEYS,
     BearingDamping,
     BearingStiffness,
+    Bore,
     Friction,
     FrictionSpeed,
     GearDamping,
     GearRatio,
     GearStiffness,
+    Interface,
     JointDamping,
     JointStiffness,
+    Point,
     RotorInertia,
+    check_bores,
+    check_interfaces,
     check_parts,
     check_plane_bearing,
     check_springs,
+    in_frame,
 )
 
 if TYPE_CHECKING:

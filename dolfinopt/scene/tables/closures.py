@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from dolfinopt.scene.tables.base import Length, Loc, Position, Refusal, Table, shown
-from dolfinopt.scene.tables.interfaces import OUTBOARD, interface_number, refuse_unknown
+from dolfinopt.scene.tables.joints import OUTBOARD, interface_number, refuse_unknown
 from dolfinopt.scene.tables.machine import (
     GROUND,
     Angle,

@@ -9,9 +9,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, shown
-from dolfinopt.scene.tables.interfaces import OUTBOARD, check_used, refuse_unknown
-from dolfinopt.scene.tables.joint_parts import (
+from dolfinopt.scene.tables.joints import (
     FRICTION_SPEED,
+    OUTBOARD,
     PART_KEYS,
     BearingDamping,
     BearingStiffness,
@@ -22,7 +22,9 @@ from dolfinopt.scene.tables.joint_parts import (
     Inertia,
     Ratio,
     check_parts,
+    check_used,
     joint_parts,
+    refuse_unknown,
 )
 
 if TYPE_CHECKING:
