@@ -52,7 +52,7 @@ _HOME = {
     "Evaluation": "responses.evaluation",
     "evaluate": "responses.evaluation",
     "gradient": "responses.evaluation",
-    "gather_views": "output.views",
+    "gather_views": "output.design",
     "gather_arms": "parallel",
     "Profile": "profiling",
     "Model": "model",

@@ -19,7 +19,7 @@ from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.output import checkpoint, design, run_folder, summary, views
+from dolfinopt.output import checkpoint, design, run_folder, summary
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
@@ -216,8 +216,9 @@ EXACT, STATIC = "objective.gradient=exact", "objective.kind=static"
 PERIOD, TIP = "objective.kind=eigenfrequency", "constraints.tip_deflection=1.0"
 FREQUENCY = "constraints.first_frequency=1.0"
 PLACES = [
-    (building, LONE, mesh, "mesh_geo"),
-    (building, LONE, mesh, "_arm_mesh"),
+    (building, LONE, mesh, "snap"),
+    (building, LONE, mesh, "build_model", "arms.1.mesh=meshes/arm.geo"),
+    (building, LONE, mesh, "_arm_mesh", "arms.1.mesh=meshes/arm.geo"),
     (building, LONE, IncompatibleElement, "operators"),
     (building, LONE, arm, "Substructure"),
     (evaluating, LONE, design_state, "interpolate"),
@@ -253,7 +254,7 @@ PLACES = [
     (optimising, LONE, checkpoint, "_rows"),
     (resuming, LONE, checkpoint, "_match"),
     (writing, LONE, arm.Arm, "volume_fraction"),
-    (writing, 0, views, "_views"),
+    (writing, 0, design, "_views"),
     (writing, 0, run_folder, "write_design"),
     (writing, 0, run_folder, "write_trajectory"),
     (writing, 0, summary, "versions"),
@@ -310,14 +311,14 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(mesh, "mesh_geo"), (mesh, "_arm_mesh"), (elements, "_full"), (elasticity, "AffineMatrix"),
+    [(mesh, "snap"), (elements, "_full"), (elasticity, "AffineMatrix"),
      (design_state, "interpolate")],
 )  # fmt: skip
 def test_a_shared_arm(owner, name, monkeypatch):
     """The ranks of an arm meet in between: none is left in a collective of the arm."""
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)
-    # The last rank shares its arm with others from three ranks on; Gmsh runs on the first.
-    fail_on(monkeypatch, 0 if name == "mesh_geo" else COMM.size - 1, owner, name)
+    # The last rank shares its arm with others from three ranks on.
+    fail_on(monkeypatch, COMM.size - 1, owner, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
         evaluating(None, "arms.1.rigid=true")()
     COMM.Barrier()
@@ -369,7 +370,7 @@ def test_tables(monkeypatch, shared_tmp_path):
 
 # What fails, on which rank, in which command; the other places above end in the same two handlers.
 COMMANDS = {
-    "mesh": ("dolfinopt.mesh.arm_mesh", "mesh_geo", 1, "simulate"),
+    "mesh": ("dolfinopt.mesh.arm_mesh", "snap", 1, "simulate"),
     "simulation": ("dolfinopt.responses.evaluation", "simulate_batch", 0, "simulate"),
     "checkpoint": ("dolfinopt.output.checkpoint", "write_arrays", 0, "optimize"),
 }

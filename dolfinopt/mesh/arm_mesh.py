@@ -11,7 +11,6 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
@@ -23,7 +22,6 @@ from dolfinopt.mesh.gmsh_session import (
     PASSIVE,
     VOID,
     gmsh_on_root,
-    mesh_geo,
 )
 from dolfinopt.mesh.hollow import Hull, Wall, box_hull, read_hull, rib_stations, tube_hull, wall_of
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
@@ -155,54 +153,15 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         ends = like.solid_ends
         if pattern is not None:
             ends = like.passive_columns * arm.length / arm.cells[0]
-        if len(arm.cells) == 3:
-            size = arm.length, arm.height, arm.thickness
-            mesh = box_arm(comm, arm.name, size, arm.cells, ends)
-            if arm.interfaces:
-                mesh = with_interfaces(mesh, arm, ends)
-            return with_regions(mesh, like, scales)
-        mesh = structured_arm(comm, arm.name, arm.length, arm.height, arm.cells, ends)
+        size = (arm.length, arm.height, arm.thickness)[: len(arm.cells)]
+        mesh = box_arm(comm, arm.name, size, arm.cells, ends)
+        if arm.interfaces:
+            mesh = with_interfaces(mesh, arm, ends)
     return with_regions(mesh, like, scales)
 
 
-def structured_arm(
-    comm: MPI.Comm,
-    name: str,
-    length: float,
-    height: float,
-    cells: tuple[int, int],
-    passive: float = 0.0,
-) -> ArmMesh:
-    """Mesh a rectangular arm with `cells` (along, across) quadrilaterals from meshes/arm.geo.
-
-    Args:
-        comm: ranks that share the arm.
-        name: the arm's name.
-        length: joint axis to joint axis, m.
-        height: in the plane of motion, m.
-        cells: number along and across.
-        passive: length kept solid at both ends, m.
-    """
-    parameters = {
-        "Parameters/1 length (m)": length,
-        "Parameters/2 height (m)": height,
-        "Parameters/3 cells along": cells[0],
-        "Parameters/4 cells across": cells[1],
-        "Parameters/5 solid length at both ends (m)": passive,
-    }
-    with gmsh_on_root(comm) as gmsh:
-        with together(comm):
-            if comm.rank == 0:
-                mesh_geo(gmsh, mesh_folder() / "arm.geo", parameters)
-        parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
-    with together(comm):
-        snap(parts[0].geometry.x[:, 0], 0.0, length / cells[0])
-        snap(parts[0].geometry.x[:, 1], -0.5 * height, height / cells[1])
-        return _arm_mesh(comm, name, length, *parts)
-
-
 def snap(values: np.ndarray, first: float, step: float) -> None:
-    """Move coordinates that lie on a grid but for Gmsh's rounding, 1e-14 m, to its very lines."""
+    """Move coordinates that lie on a grid but for rounding, 1e-14 m, to its very lines."""
     lines = first + step * np.rint((values - first) / step)
     near = np.abs(values - lines) < GRID_ROUNDING_SHARE * step
     values[near] = lines[near]
@@ -356,33 +315,32 @@ def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 def box_arm(
     comm: MPI.Comm,
     name: str,
-    size: tuple[float, float, float],
-    cells: tuple[int, int, int],
+    size: Sequence[float],
+    cells: tuple[int, ...],
     passive: float = 0.0,
 ) -> ArmMesh:
-    """Mesh a box with `cells` (along, height, thickness) hexahedra (collective).
+    """Mesh a rectangle or a box with `cells` quadrilaterals or hexahedra (collective).
 
     x runs along from the inboard joint axis, y along the height and z along the thickness, both
-    from the middle. The interfaces are the faces x = 0 and x = length.
+    from the middle. The interfaces are the sides x = 0 and x = length.
 
     Args:
         comm: ranks that share the arm.
         name: the arm's name.
-        size: length, height, thickness, m.
+        size: length, height, in space thickness, m.
         cells: number in these directions.
         passive: length kept solid at both ends, m; whole layers of cells whose centre lies within.
     """
-    length, height, thickness = size
-    low = np.array([0.0, -0.5 * height, -0.5 * thickness])
-    high = np.array([length, 0.5 * height, 0.5 * thickness])
-    mesh = compat.box_mesh(comm, low, high, cells)
+    length, *across = size
+    low = np.array([0.0, *(-0.5 * one for one in across)])
+    mesh = compat.box_mesh(comm, low, np.array([length, *(0.5 * one for one in across)]), cells)
     with together(comm):
-        for k in range(3):
+        for k in range(len(size)):
             snap(mesh.geometry.x[:, k], low[k], size[k] / cells[k])
     ends = [compat.facets_on(mesh, x, 0.25 * length / cells[0]) for x in (0.0, length)]
     with together(comm):
         owned, _ = compat.local_cell_counts(mesh)
-        corners = compat.cell_coordinates(mesh, owned)
+        corners = compat.cell_coordinates(mesh, owned)[:, :, : len(size)]
         centroid = corners.mean(axis=1)
         layers = math.ceil(passive / length * cells[0] - 0.5)  # as in meshes/arm.geo
         layer = np.floor(centroid[:, 0] / length * cells[0])
@@ -391,12 +349,12 @@ def box_arm(
             comm=comm,
             mesh=mesh,
             centroid=centroid,
-            area=cell_volumes(corners),
+            area=cell_areas(corners) if len(size) == 2 else cell_volumes(corners),
             passive=(layer < layers) | (layer >= cells[0] - layers),
             void=np.zeros(owned, dtype=bool),
             inboard_facets=ends[0],
             outboard_facets=ends[1],
-            outboard_point=np.array([length, 0.0, 0.0]),
+            outboard_point=np.array([length, *(0.0 for _ in across)]),
         )
 
 

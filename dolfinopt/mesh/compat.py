@@ -167,12 +167,20 @@ def facets_on(mesh: Any, plane: float, tolerance: float) -> np.ndarray:
 
 
 def box_mesh(comm: MPI.Comm, low: np.ndarray, high: np.ndarray, cells: tuple[int, ...]) -> Any:
-    """Return a grid of hexahedra between two corners, ghosted as by `model_to_mesh`."""
-    return dolfinx.mesh.create_box(
+    """Return a grid of quadrilaterals or hexahedra, ghosted as by `model_to_mesh`.
+
+    Args:
+        comm: ranks that share it.
+        low, high: (d,) opposite corners, m.
+        cells: d numbers along the axes.
+    """
+    plane, kinds = len(cells) == 2, dolfinx.mesh.CellType
+    create = dolfinx.mesh.create_rectangle if plane else dolfinx.mesh.create_box
+    return create(
         comm,
         [np.asarray(low, dtype=float), np.asarray(high, dtype=float)],
         list(cells),
-        dolfinx.mesh.CellType.hexahedron,
+        kinds.quadrilateral if plane else kinds.hexahedron,
         ghost_mode=GhostMode.shared_facet,
     )
 

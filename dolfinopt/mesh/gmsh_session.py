@@ -18,7 +18,6 @@ from typing import Any, TypeVar, cast
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.file_check import open_file
 from dolfinopt.mesh.measured import UNREAD_STATEMENTS_LIMIT
 from dolfinopt.parallel import together
 
@@ -144,14 +143,6 @@ def silent_terminal() -> Iterator[None]:
             os.dup2(copy, target)
             os.close(copy)
         os.close(nowhere)
-
-
-def mesh_geo(gmsh: Any, path: Path, parameters: Mapping[str, float]) -> None:
-    """Mesh a parametric .geo file; ONELAB `parameters` override its DefineConstant defaults."""
-    for name, value in parameters.items():
-        gmsh.onelab.setNumber(name, [float(value)])
-    open_file(gmsh, path)
-    gmsh.model.mesh.generate(2)
 
 
 def mesh_surfaces(gmsh: Any, shape: str | None) -> None:

@@ -19,7 +19,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
 
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, structured_arm
+from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_volumes, facet_corners
 from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, sampled
 from dolfinopt.scene.load import Arm, Scene
@@ -723,7 +723,7 @@ def _flat_domain(
     values[place // arm.cells[2], place % arm.cells[2]] = np.stack(rows, axis=1)
     if np.ptp(values, axis=1).max() > ROUNDING:
         return None
-    plate = structured_arm(MPI.COMM_SELF, arm.name, arm.length, arm.height, arm.cells[:2])
+    plate = box_arm(MPI.COMM_SELF, arm.name, (arm.length, arm.height), arm.cells[:2])
     thin = arm.model_copy(update={"cells": (*arm.cells[:2], 1)})
     points = np.column_stack([plate.centroid, np.zeros(plate.num_cells)])
     x, smooth, passive, void = values.mean(axis=1)[_grid_places(thin, points)].T

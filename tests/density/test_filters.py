@@ -12,7 +12,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.density import filter as filters
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, structured_arm
+from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT = 1.0, 0.06  # m
@@ -22,7 +22,7 @@ ROUNDING = 1e-13
 
 
 def arm(cells=(40, 6), comm=COMM, length=LENGTH, height=HEIGHT, passive=0.0):
-    return structured_arm(comm, "arm", length, height, cells, passive)
+    return box_arm(comm, "arm", (length, height), cells, passive)
 
 
 def rough(centroid):

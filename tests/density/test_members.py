@@ -12,7 +12,7 @@ from solids import grid, sixths, solid_scene
 import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.density.members import thinnest, thinnest_solid
-from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.optimization.problem import Evaluator, problem_of
 from dolfinopt.output.summary import _widths, filter_warnings
 
@@ -95,7 +95,7 @@ def test_the_radius_of_widths(member, gap, erosion):
     design = do.load_scene(TWO_ARM, (f"design={toml(data)}", *fine)).design
     assert min(design.erosions) == pytest.approx(erosion) and max(design.erosions) < 0.5
     cell = 1.0 / 8000.0
-    mesh = structured_arm(MPI.COMM_SELF, "a", 1.0, 0.002, (8000, 1))
+    mesh = box_arm(MPI.COMM_SELF, "a", (1.0, 0.002), (8000, 1))
     smooth = HelmholtzFilter(mesh, design.radius)
     for wanted, distance in zip((member, gap or member), design.erosions, strict=True):
         half = -design.radius / (2.0 * np.sqrt(3.0)) * np.log(0.5 - distance)

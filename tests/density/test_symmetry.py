@@ -11,7 +11,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.data import mesh_folder
 from dolfinopt.density.filter import AxisSymmetry
-from dolfinopt.mesh.arm_mesh import arm_mesh, structured_arm
+from dolfinopt.mesh.arm_mesh import arm_mesh, box_arm
 from dolfinopt.scene.load import Arm as Entry
 
 COMM = MPI.COMM_WORLD
@@ -26,8 +26,8 @@ def bores(shape, **keys):
 
 
 MESHES = {
-    "rectangle": lambda: structured_arm(COMM, "a", 1.0, 0.06, (20, 4)),
-    "odd rectangle": lambda: structured_arm(COMM, "a", 1.0, 0.06, (20, 5)),
+    "rectangle": lambda: box_arm(COMM, "a", (1.0, 0.06), (20, 4)),
+    "odd rectangle": lambda: box_arm(COMM, "a", (1.0, 0.06), (20, 5)),
     "quadrilaterals": lambda: bores("quadrilateral"),
     "triangles": lambda: bores("triangle"),
 }
@@ -40,7 +40,7 @@ def mesh(request):
 
 def scattered():
     """Return a mesh with centroids off their places, so that mirror images are no pairs."""
-    mesh = structured_arm(COMM, "a", 1.0, 0.5, (20, 10))
+    mesh = box_arm(COMM, "a", (1.0, 0.5), (20, 10))
     off = 0.02 * np.sin(mesh.centroid @ [[900.0, 310.0], [470.0, 850.0]])
     return dataclasses.replace(mesh, centroid=mesh.centroid + off)
 
@@ -79,7 +79,7 @@ def test_backward_is_the_transpose(mesh, pairs):
 
 
 def test_mesh_without_symmetry_is_refused():
-    mesh = structured_arm(COMM, "a", 1.0, 0.06, (20, 4))
+    mesh = box_arm(COMM, "a", (1.0, 0.06), (20, 4))
     above = dataclasses.replace(mesh, centroid=mesh.centroid + np.array([0.0, 0.03]))
     with refused("no mirror image", "1.25 cell"):
         AxisSymmetry(above)

@@ -13,7 +13,7 @@ from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs, StressTensor
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.profiling import Profile
 
 COMM = MPI.COMM_WORLD
@@ -22,7 +22,7 @@ LENGTH, HEIGHT, CELLS = 1.0, 0.06, (30, 5)
 
 def make_arm(element: str, shift: float = 0.0) -> ElasticArm:
     """Return an arm of random materials; nodes off their places by `shift` of a cell at random."""
-    mesh = structured_arm(COMM, "arm", LENGTH, HEIGHT, CELLS)
+    mesh = box_arm(COMM, "arm", (LENGTH, HEIGHT), CELLS)
     points = mesh.mesh.geometry.x
     away = np.sin(1e4 * points[:, 0] + 7e4 * points[:, 1])  # the same on all ranks
     points[:, 0] += shift * LENGTH / CELLS[0] * away * (points[:, 0] % LENGTH > 1e-9)
@@ -108,7 +108,7 @@ def test_cells_that_are_not_alike() -> None:
 
 def test_nodes_of_a_grid_lie_on_its_lines() -> None:
     """Gmsh places them to 1e-14 m, which is far more than their rounding."""
-    points = structured_arm(COMM, "arm", LENGTH, HEIGHT, (400, 3)).mesh.geometry.x
+    points = box_arm(COMM, "arm", (LENGTH, HEIGHT), (400, 3)).mesh.geometry.x
     for values, first, step in ((points[:, 0], 0.0, 0.0025), (points[:, 1], -0.03, 0.02)):
         lines = first + step * np.rint((values - first) / step)
         assert np.array_equal(values, lines)

@@ -12,7 +12,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import ELEMENTS
-from dolfinopt.mesh.arm_mesh import structured_arm
+from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.optimization import gradient_check
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
 from dolfinopt.parallel import Partition, sum_over_arms
@@ -103,7 +103,7 @@ def substructure(
     skew: bool = False,
 ) -> Substructure:
     """Return a rectangle of length, height and thickness, m; of cells that are none if `skew`."""
-    mesh = structured_arm(comm, "arm", *size[:2], cells)
+    mesh = box_arm(comm, "arm", size[:2], cells)
     if skew:
         mesh.mesh.geometry.x[:, :2] += bulge(mesh.mesh.geometry.x[:, :2], size[0], size[1])
     operators = ELEMENTS[element].operators(mesh, size[2], poisson_ratio)

@@ -14,7 +14,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm as ScenesArm
 from dolfinopt.data import mesh_folder
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import interior_facets, structured_arm
+from dolfinopt.mesh.arm_mesh import box_arm, interior_facets
 from dolfinopt.mesh.checks import cell_areas
 from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.scene.load import Arm
@@ -35,7 +35,7 @@ SHAPES = [  # length m, height m, cells
 
 
 def arm(length=1.0, height=0.06, cells=(20, 4), passive=0.0, comm=COMM):
-    return structured_arm(comm, "arm", length, height, cells, passive)
+    return box_arm(comm, "arm", (length, height), cells, passive)
 
 
 def collect(values):

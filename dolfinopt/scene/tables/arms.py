@@ -672,7 +672,7 @@ class Arm(Table):
         """
         if self.cells is None:
             return 0
-        # The expression of meshes/arm.geo, so that rounding cannot tell the two apart.
+        # The expression of `mesh.arm_mesh.box_arm`, so that rounding cannot tell the two apart.
         return math.ceil(self.solid_ends / self.length * self.cells[0] - 0.5)
 
     @property
