@@ -95,6 +95,7 @@ SMALL_TURN = 0.2  # rad
 # Radius of the filter in cells, and erosion of the robust projection, from which on its designs had
 # few or no cells that meet in corners or edges alone (docs/pages/develop/decisions.md).
 FILTER_CELLS, EROSION = 2.0, 0.25
+SOLID = 0.5 - 1e-6  # densities above are; a uniform one of one half is, however the filter rounds
 NO_JOINTS = (
     "the design cut at a density of one half joins its interfaces by contacts alone: without them "
     "there is nothing to simulate"
@@ -468,7 +469,7 @@ def _widths(
                 points = _lowest(mesh.comm, points)
             if points.shape[1:] == (4, 2):
                 points = points[:, [0, 1, 3, 2]]
-            corners[k], solid[k], fixed[k] = points, x_phys[k] > 0.5, mesh.fixed
+            corners[k], solid[k], fixed[k] = points, x_phys[k] > SOLID, mesh.fixed
             asked[k] = max(design.least_widths)
     whole, cut, stays = (gather_cells(partition, one) for one in (corners, solid, fixed))
     asked = gather_arms(partition, asked)
@@ -492,7 +493,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         scene.arms[index].cell_size or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
-        arm.contacts(arm.kind.share(x_phys) > 0.5),
+        arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
 
 

@@ -89,11 +89,12 @@ class Studio:
 
     Attributes:
         low, high: (2,) what of the camera's plane is seen, m.
+        back: (3,) unit vector towards the viewer.
         plotter: PyVista's; holds the solids.
     """
 
     def __init__(self, camera: Camera, low: np.ndarray, high: np.ndarray, px_per_m: float) -> None:
-        self.low, self.high = low, high
+        self.low, self.high, self.back = low, high, camera.back
         size = [int(np.ceil(n)) for n in (high - low) * px_per_m]
         theme = pyvista.themes.DocumentTheme()
         theme.multi_samples = 4  # eight double the time of the software renderer

@@ -48,7 +48,8 @@ PALE = 0.72  # share of white in the first pose
 ELEVATION = np.radians(25.0)  # of the viewer
 AZIMUTHS = np.radians(np.arange(-75.0, 270.0, 30.0))
 # Sizes over the machine's.
-ROD, PIN, PIN_LENGTH, AXIS, BALL, PLATE = 0.01, 0.016, 0.05, 0.16, 0.03, 0.12
+ROD, PIN, PIN_LENGTH, AXIS, BALL, PLATE = 0.01, 0.016, 0.05, 0.16, 0.026, 0.12
+APART = 1e-3  # by which links that lie in one plane are drawn nearer to the viewer than the last
 BARREL = 0.55  # of a cylinder's length
 
 
@@ -124,7 +125,7 @@ def solid_machine_figure(
     draw_base(studio, machine, frames)
     draw_path(studio, path, ORANGE, 2.0)
     for number, n in enumerate(at):
-        draw_pose(studio, machine, frames, n, PALE * (1.0 - number / max(1, len(at) - 1)))
+        draw_pose(studio, machine, frames, n, number, PALE * (1.0 - number / max(1, len(at) - 1)))
     for i, joint in enumerate(mechanism.joints):
         if joint.coordinate is not None:
             half = 0.5 * AXIS * machine.size * frames.axes[at[-1], i]
@@ -222,11 +223,15 @@ def draw_path(studio: Studio, path: np.ndarray, colour: str, width: float) -> No
     studio.line(np.stack([path[:-1], path[1:]], axis=1), colour, width)
 
 
-def draw_pose(studio: Studio, machine: Assembly, frames: Frames, n: int, pale: float = 0.0) -> None:
-    """Draw links, rigid bodies, joints and load at one instant, with a share of white."""
+def draw_pose(
+    studio: Studio, machine: Assembly, frames: Frames, n: int, number: int, pale: float
+) -> None:
+    """Draw links, rigid bodies, joints and load at an instant, pose `number`, a share of white."""
     for i, surface in enumerate(machine.surfaces):
         if surface is not None:
             points = surface.points @ frames.rotation[n, i].T + frames.origin[n, i]
+            # Surfaces in one plane would show through each other in specks.
+            points += (number + i / len(machine.surfaces)) * APART * machine.size * studio.back
             studio.solid(Surface(points, surface.triangles), color=lighter(STEEL, pale))
     draw_skeleton(studio, machine, frames, n, pale)
 

@@ -274,3 +274,12 @@ def test_the_lightest_link(tmp_path):
             assert result.crisp.objective == pytest.approx(result.evaluation.objective, rel=0.03)
         else:
             assert one.pieces > 5 and one.edges > 20 and one.left_out > 0.05
+
+
+@pytest.mark.serial
+def test_a_uniform_design_of_one_half_is_one_piece(tmp_path):
+    """The filter's rounding leaves some of its cells below one half."""
+    run("simulate", TWO_ARM, "--out", tmp_path / "run", "--no-plots",
+        *overrides("arms.cells=[100,6]"))  # fmt: skip
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert [(one["pieces"], one["corners"]) for one in summary["contacts"].values()] == 2 * [(1, 0)]

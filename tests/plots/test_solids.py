@@ -118,7 +118,7 @@ def test_picture_of_a_machine_in_space(result):
     camera = solid_machine.camera_of(machine, frames)
     low, high = solid_machine.seen_part(machine, frames, camera)
     studio = solid_design.Studio(camera, low, high, 300.0)
-    solid_machine.draw_pose(studio, machine, frames, len(one.t) - 1)
+    solid_machine.draw_pose(studio, machine, frames, len(one.t) - 1, 0, 0.0)
     image = studio.close().astype(int)
 
     def colour_at(point):
