@@ -211,8 +211,7 @@ FILES = {
     **dict.fromkeys(
         ("damping_ratio", "eigenfrequency", "first_frequency", "pole_frequency"), "frequency"
     ),
-    **dict.fromkeys(("stiffness", "tip_deflection"), "static"),
-    "volume_fraction": "mass",
+    **dict.fromkeys(("mass", "stiffness", "tip_deflection", "volume_fraction"), "static"),
 }
 
 _known: dict[str, type[Response]] = {}

@@ -220,3 +220,9 @@ def test_the_least_made_smooth() -> None:
         assert slopes[k] == pytest.approx((there - back) / 2e-6, rel=1e-6)
     assert worst_of([3.0], 20.0, least=True) == (3.0, [1.0])
     assert worst_of([3.0, 0.0], 20.0, least=True) == (0.0, [0.0, 0.0])
+
+
+@pytest.mark.parametrize("name", NEEDS)
+def test_responses_stand_in_the_files_that_are_imported_for_them(name):
+    file = registry.FILES.get(name, name)
+    assert registry.find(name).__module__ == f"dolfinopt.responses.{file}"
