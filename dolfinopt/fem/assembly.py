@@ -16,6 +16,7 @@ from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.fem.measured import (
     ALIKE_CELLS_ERROR,
     BUFFER_ENTRIES,
+    FIELD_CHUNK_ENTRIES,
     STRESS_CHUNK_CELLS,
     STRESS_CHUNK_ENTRIES,
 )
@@ -62,25 +63,37 @@ class AffineMatrix:
 class NodePairs:
     """Which nodes share a cell, and by which pairs of its corners: the pattern of like cells.
 
+    Matrices are symmetric: sums are taken of pairs (i, j) with i <= j, of the others transposed.
+
     Attributes:
         pattern: (n_nodes, n_nodes) matrix of ones.
+        starts, cell, place: of the pairs' sums: where each begins, and the cells and the places in
+            a cell's matrix of all that adds to them.
+        source: (nnz,) the pair whose sum each entry of the pattern has, or its transpose.
+        flipped: entries that have the transpose.
     """
 
     def __init__(self, cells: np.ndarray, num_nodes: int):
         """Sort the pairs of nodes of all cells (n_cells, n)."""
-        width = cells.shape[1]
-        keys = (cells[:, :, None].astype(np.int64) * num_nodes + cells[:, None, :]).ravel()
+        self.width = width = cells.shape[1]
+        first, second = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, (1, width)).ravel()
+        upper = np.flatnonzero(first <= second)
+        keys = first[upper].astype(np.int64) * num_nodes + second[upper]
         order = np.argsort(keys, kind="stable")
-        keys = keys[order]
-        first = np.flatnonzero(np.diff(keys, prepend=-1))
-        # The entries of one pair of nodes by their cells, and by their places in a cell's matrix.
-        self.starts = np.append(first, len(keys))
-        self.cell = (order // width**2).astype(np.int32)
-        self.place = (order % width**2).astype(np.int32)
-        self.width = width
-        rows, columns = np.divmod(keys[first], num_nodes)
+        keys, upper = keys[order], upper[order]
+        begin = np.flatnonzero(np.diff(keys, prepend=-1))
+        self.starts = np.append(begin, len(keys))
+        self.cell = (upper // width**2).astype(np.int32)
+        self.place = (upper % width**2).astype(np.int32)
+        rows, columns = np.divmod(keys[begin], num_nodes)
+        apart = np.flatnonzero(rows != columns)
+        every = np.append(keys[begin], columns[apart] * num_nodes + rows[apart])
+        order = np.argsort(every, kind="stable")
+        self.source = np.append(np.arange(len(rows)), apart)[order].astype(np.int32)
+        self.flipped = np.flatnonzero(order >= len(rows)).astype(np.int32)
+        rows, columns = np.divmod(every[order], num_nodes)
         indptr = np.searchsorted(rows, np.arange(num_nodes + 1)).astype(np.int32)
-        data = (np.ones(len(first)), columns.astype(np.int32), indptr)
+        data = (np.ones(len(rows)), columns.astype(np.int32), indptr)
         self.pattern = sp.csr_matrix(data, shape=(num_nodes, num_nodes))
 
 
@@ -96,7 +109,7 @@ class CellMatrix:
     """
 
     def __init__(self, pairs: NodePairs, elements: np.ndarray):
-        """Set up for A_e (1 or n_cells, b n, b n) of cells with n nodes."""
+        """Set up for symmetric A_e (1 or n_cells, b n, b n) of cells with n nodes."""
         self._pairs, self.pattern = pairs, pairs.pattern
         size, n = elements.shape[1], pairs.width
         self.block = b = size // n
@@ -112,13 +125,14 @@ class CellMatrix:
         pairs, b, pattern = self._pairs, self.block, self.pattern
         by_place = sp.csr_matrix(
             (scale[pairs.cell], self._places, pairs.starts),
-            shape=(pattern.nnz, len(self._blocks)),
+            shape=(len(pairs.starts) - 1, len(self._blocks)),
         )
-        values = by_place @ self._blocks
+        values = (by_place @ self._blocks)[pairs.source]
         if b == 1:
             return sp.csr_matrix((values.ravel(), pattern.indices, pattern.indptr), pattern.shape)
         size = b * pattern.shape[0]
         values = values.reshape(-1, b, b)
+        values[pairs.flipped] = values[pairs.flipped].swapaxes(1, 2)
         return sp.bsr_matrix((values, pattern.indices, pattern.indptr), (size, size))
 
 
@@ -312,6 +326,12 @@ def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return flat.reshape(*field.shape[:2], coefficients.shape[1])
 
 
+def runs_of_columns(field: np.ndarray) -> list[slice]:
+    """Return runs of the columns of a nodal field (n_nodes, d, k): not all are copied at once."""
+    step = max(1, FIELD_CHUNK_ENTRIES * field.shape[2] // max(1, field.size))
+    return [slice(k, k + step) for k in range(0, field.shape[2], step)]
+
+
 # -- nodal fields on cells, and energies cell by cell: derivatives by the material of each cell ----
 #
 # Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells
@@ -446,11 +466,12 @@ class Cells:
 
     def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
-        rows, others = self.by_component(left), self.by_component(right)
-        out = np.empty(self.count)
-        for cells in self._runs(len(rows)):
-            values = self.differences(rows, cells)
-            out[cells] = self.difference_products(values, self.differences(others, cells), cells)
+        out = np.zeros(self.count)
+        for part in runs_of_columns(left):
+            rows, others = self.by_component(left[:, :, part]), self.by_component(right[:, :, part])
+            for cells in self._runs(len(rows)):
+                values, more = self.differences(rows, cells), self.differences(others, cells)
+                out[cells] += self.difference_products(values, more, cells)
         return out
 
     def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -188,7 +188,10 @@ class InteriorSystem:
 
     @cached_property
     def _stiffness(self) -> InteriorMatrix:
-        return InteriorMatrix(self._T.comm, self._entries, self._num_rows)
+        found = InteriorMatrix(self._T.comm, self._entries, self._num_rows)
+        if self._band is None:  # nothing else asks for them
+            del self._entries
+        return found
 
     @cached_property
     def _mass(self) -> InteriorMatrix:

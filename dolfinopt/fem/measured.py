@@ -15,6 +15,7 @@ STRESS_CHUNK_CELLS = 256
 # NumPy copies factors that it repeats along an axis into buffers, unless rows are longer than
 # these: by default 8192, which takes longer than the products.
 BUFFER_ENTRIES = 256
+FIELD_CHUNK_ENTRIES = 4_000_000  # of nodal fields that are copied at a time: 32 MB
 QUADRATURE_CHUNK_CELLS = 4096  # whose matrices are summed up at a time
 # Entries of displacement gradients at a time, for derivatives by the places of corners.
 SHAPE_CHUNK_ENTRIES = 250_000

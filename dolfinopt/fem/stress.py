@@ -20,7 +20,7 @@ import basix
 import numpy as np
 import scipy.sparse as sp
 
-from dolfinopt.fem.assembly import combine
+from dolfinopt.fem.assembly import combine, runs_of_columns
 from dolfinopt.fem.elements import KINDS, ElementOperators, by_cells, elasticity, gauss_points
 from dolfinopt.fem.geometric_stiffness import (
     NUM_INERTIAL,
@@ -237,30 +237,37 @@ class LoadFields:
             columns = (a @ self.to_columns)[:, q:]
             sums, directions = on_root(arm.comm, _factors, columns, lengths)
             by_w, loads = combine(by_u, sums), directions @ self.loads
-        mu = static_response(arm, *arm.restrict(by_w))
-        weighted = arm.mass_times(mu)
+        mu = np.empty_like(by_w)
+        # Conjugate gradients have one space for all right sides; ranks have fields of other sizes.
+        together = arm.substructure.interior.is_iterative or arm.comm.size > 1
+        for part in [slice(None)] if together else runs_of_columns(by_w):
+            mu[:, :, part] = static_response(arm, *arm.restrict(by_w[:, :, part]))
         _, frame, _, elastic = self.split(loads)
+        by_V, by_loads = combine(by_u, modes), []
+        for part in runs_of_columns(mu):
+            weighted = arm.mass_times(mu[:, :, part])
+            by_V += moved_back(weighted, elastic[part])
+            if not summed:
+                by_frame = np.tensordot(weighted, self.accelerations, ((0, 1), (0, 1)))
+                by_loads.append(np.hstack([by_frame, moved_products(weighted, V)]))
         if summed:
             by_columns = np.tensordot(by_u, self.columns, ((0, 1), (0, 1)))
             by_a = arm.comm.allreduce(by_columns) @ self.to_columns.T
         else:
-            by_parts = [
-                np.tensordot(by_u, V, ((0, 1), (0, 1))),
-                np.tensordot(weighted, self.accelerations, ((0, 1), (0, 1))),
-                moved_products(weighted, V),
-            ]
-            by_modes, by_frame, by_elastic = map(arm.comm.allreduce, by_parts)
+            by_modes = arm.comm.allreduce(np.tensordot(by_u, V, ((0, 1), (0, 1))))
+            by_inertial = arm.comm.allreduce(np.concatenate(by_loads))
+            by_frame, by_elastic = np.split(by_inertial, [self.accelerations.shape[2]], axis=1)
             by_a = np.hstack([by_modes, by_frame, T.coordinates(mu).T, by_elastic])
         return DisplacementGradient(
             fields=self,
             by_a=by_a,
             by_static=by_w,
-            by_modes=combine(by_u, modes) + moved_back(weighted, elastic),
-            adjoint=mu,
-            static=self.displacements(loads),
-            loads=loads,
+            by_modes=by_V,
             by_modal_inertia=moved_back(mu, elastic),
             by_inertia=by_inertia(combine(mu, frame)),
+            adjoint=np.negative(mu, out=mu),
+            static=self.displacements(loads),
+            loads=loads,
         )
 
 
@@ -273,8 +280,8 @@ class DisplacementGradient:
         by_a: (k, m) by their coefficients; of all ranks.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         by_static: (n_nodes, d, r) by w, likewise.
-        adjoint: (n_nodes, d, r) mu.
-        static: (n_nodes, d, r) w: mu . dK w is to be subtracted.
+        adjoint: (n_nodes, d, r) -mu.
+        static: (n_nodes, d, r) w: -mu . dK w is part of it.
         loads: (r, m) coefficients of what loads w.
         by_modal_inertia: (n_nodes, d, q) fields whose products with dM V are the part by the mass.
         by_inertia: (n_nodes, d, 2) likewise, with dM 1_x and dM X.
@@ -297,9 +304,9 @@ class DisplacementGradient:
         residual = arm.stiffness_times(self.static) - arm.mass_times(
             self.fields.inertia(self.loads)
         )
-        by_fields = self.by_static - arm.stiffness_times(self.adjoint)
+        by_fields = self.by_static + arm.stiffness_times(self.adjoint)
         rigid = by_fields @ T.coordinates(self.static).T
-        return np.asarray(rigid - residual @ T.coordinates(self.adjoint).T)
+        return np.asarray(rigid + residual @ T.coordinates(self.adjoint).T)
 
 
 def load_fields(

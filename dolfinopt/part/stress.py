@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -154,7 +155,7 @@ class CornerStress(PointStress):
         young = state.solid.young_modulus
         operator = young * stress_operator(state.mesh, state.elastic.operators, self.vertices)
         by_u = self.fields.stress_transposed(operator, by_own)
-        stress = StressProduct(self.vertices, young * by_own, self.fields.displacements(a))
+        stress = StressProduct(self.vertices, young * by_own, partial(self.fields.displacements, a))
         return by_u, Products(volumes=by_areas, stress=stress)
 
 

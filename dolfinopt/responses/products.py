@@ -41,12 +41,12 @@ class StressProduct:
     Attributes:
         points: (p, d) of the reference cell.
         by_stress: (s, n_cells p, k) derivatives by the stress of unit Young's modulus.
-        fields: (n_nodes, d, k) whose stress it is, held.
+        fields: returns those (n_nodes, d, k) whose stress it is, held.
     """
 
     points: np.ndarray
     by_stress: np.ndarray
-    fields: np.ndarray
+    fields: Callable[[], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
     for left, right in mass:
         by_corners += shape.mass(left, right, elastic.density)
     if (stress := products.stress) is not None:
-        by_corners += shape.stress(stress.points, stress.by_stress, stress.fields)
+        by_corners += shape.stress(stress.points, stress.by_stress, stress.fields())
     if (one := products.prestress) is not None:
         by_corners += shape.geometric_stiffness(
             one.stress.u, one.modes, one.by_K0, one.stress.modulus.value

@@ -124,7 +124,7 @@ def _body_products(
             places = places + one.by_inertia[:, :, 1]
             partners.left[:, :, 1:-1] += one.by_modal_inertia
     if displaced is not None:
-        stiffness.append((-displaced.adjoint, displaced.static))
+        stiffness.append((displaced.adjoint, displaced.static))
     interfaces = partial(_at_interfaces, state, by_V, fields, geometric, displaced)
     mass: list[Pair] = [(partners.left, partners.right)]
     if fields.frame is not None:

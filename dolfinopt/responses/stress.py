@@ -144,7 +144,7 @@ class CellStress(PointStress):
         by_u = self.fields.stress_transposed(operator, by_stress)
         centre = element_centres(compat.cell_corner_count(state.mesh.mesh), state.mesh.dim)
         by_x = np.divide(0.5 * by_logs, x, out=np.zeros_like(x), where=x > 0.0)
-        stress = StressProduct(centre, by_stress, self.fields.displacements(a))
+        stress = StressProduct(centre, by_stress, partial(self.fields.displacements, a))
         return by_u, Products(densities=by_x, volumes=by_weights, stress=stress)
 
 

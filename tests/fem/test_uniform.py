@@ -121,6 +121,7 @@ def test_matrices_of_blocks():
     rng = np.random.default_rng(1)
     for b in (1, 3):
         elements = rng.standard_normal((3, 4 * b, 4 * b))
+        elements += elements.swapaxes(1, 2)
         dofs = (b * cells[:, :, None] + np.arange(b)).reshape(3, 4 * b)
         scale = np.array([2.0, 0.0, -1.0])
         for given in (elements, elements[:1]):
