@@ -13,17 +13,14 @@ from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
     exponential,
-    rigid_spatial_body,
     skew,
     spatial_mechanism,
 )
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     STIFFENING,
     TABLE,
     ShapeIntegrals,
-    in_space,
     plane_body,
 )
 
@@ -388,29 +385,6 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     loads = {site: random_cloud(rng, 0, 3) for site in sorted({(1, 0), (1, last), (3, 0), (4, 0)})}
     clouds = rigid, fork, *outer, rigid
     return CloudTree(clouds, tuple(joints), loads, rng.normal(size=3), 4)
-
-
-def posed_machine(plane: Mechanism) -> Mechanism:
-    """Return a plane machine in space: a cart on the x axis, joints about z."""
-    x, _, z = np.eye(3)
-    none, still = np.zeros(3), np.eye(3)
-    joints = [Joint("cart", "prismatic", GROUND, 0, x, rotor=float(plane.rotors[0]))]
-    for k in range(len(plane.bodies)):
-        origin = np.array([*plane.origin, 0.0]) if k == 0 else none
-        rotor = float(plane.rotors[1 + k])
-        joints.append(Joint(f"joint{k}", "revolute", k, 1 + k, z, origin, still, rotor))
-    carried = {
-        (1 + k, 0): rigid_spatial_body(load.mass, none, (0.0, 0.0, load.W_rest[0, 0], *none))
-        for (k, _), load in plane.loads.items()
-    }
-    bodies = (rigid_spatial_body(0.0, none, np.zeros(6)), *map(in_space, plane.bodies))
-    gravity = np.array([*plane.gravity[:, 0], 0.0])
-    return spatial_mechanism(bodies, joints, carried, gravity, (len(plane.bodies), 0))
-
-
-def posed_motion(motion: RigidMotion) -> RigidMotion:
-    """Return a plane machine's motion as that of the joints in space."""
-    return RigidMotion(motion.q, motion.qd, motion.qdd)
 
 
 # -- changes and derivatives -----------------------------------------------------------------

@@ -5,11 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import built_of, wave
 from runs import ROOT, assert_same_bits, overrides, run, summary_of
 
 import dolfinopt as do
-from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.parallel import on_root
 
 WORLD = MPI.COMM_WORLD
@@ -97,31 +95,6 @@ def test_goes_with(name):
     result = do.optimize(coarse(path, ROUGHLY, *changes, iterations=2))
     objectives = [row.objective for row in result.history]
     assert objectives[-1] < 0.95 * objectives[0], objectives
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("path", "changes"),
-    [
-        pytest.param(
-            CONTROLLED, "scenarios=[{changes=['payload.mass=3']}, "
-            "{changes=['control.stiffness_factor=0.1', 'control.damping_factor=0.3']}]",
-            marks=pytest.mark.slow,
-        ),
-        (SLIDER_CRANK, "scenarios=[{changes=['closure.force=-200']}, "
-         "{changes=['motion.speed=100']}]"),
-    ],
-    ids=["gains", "force and speed"],
-)  # fmt: skip
-@pytest.mark.usefixtures("three_steps")
-def test_gradient_of_scenarios(path, changes):
-    """Second-order remainders where scenarios differ in gains, load and speed."""
-    cells = "arms.cells=[12,3]" if path == CONTROLLED else "arms.rod.cells=[12,3]"
-    settings = [cells, "simulation.tolerance=1e-3", "reduction.coordinates=3", changes]
-    scene = do.load_scene(path, [*COARSE[path], *settings])
-    built = built_of(scene)
-    test = taylor_test(scene, built.partition, built.arms, built.fields(wave), built.profile)
-    assert test.passed, [row.rate for row in test.rows]
 
 
 @pytest.mark.serial
