@@ -28,7 +28,7 @@ from dolfinopt.responses.constraints import EXCESS
 pytestmark = pytest.mark.serial
 
 SMALL = ("arms.cells=[100,6]", "simulation.sample=0.005", "arms.0.symmetric=true")
-STEPS = 4
+STEPS = 3
 
 
 @pytest.fixture(scope="module")
@@ -301,7 +301,7 @@ def test_flanges_that_would_buckle_are_kept(tmp_path):
         told = (*SMALL, *soft, f"constraints.buckling={least}")
         folder = folder_with(tmp_path / f"run{least}", frame, *told)
         scene = scene_of(folder)
-        one = optimize_parts(scene, make_parts(scene, folder), 6, lambda line: None)
+        one = optimize_parts(scene, make_parts(scene, folder), 5, lambda line: None)
         found[least] = one.best.value, {limit.name: limit.value for limit in one.best.limits}
     assert found[0.01][1]["buckling"] < 1.6
     mass, limits = found[1.7]
@@ -342,7 +342,7 @@ def scara(tmp_path_factory):
 def test_cutter_and_smallest_member_of_a_scara_robot(scara):
     """Every concave corner takes the 6 mm cutter, and no member is thinner than 4 mm."""
     scene, parts = scara
-    found = optimize_parts(scene, parts, STEPS, lambda line: None)
+    found = optimize_parts(scene, parts, 2, lambda line: None)
     assert found.best.value < 0.99 * found.before
     assert all(limit.met for limit in found.best.limits)
     size = 1e-4
