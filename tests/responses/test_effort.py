@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import demo, refused, scene
+from runs import demo, scene
 
 import dolfinopt as do
 from dolfinopt import Model
@@ -59,31 +59,6 @@ def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
         assert len(rms) == len(made.driven)
         assert result.objective == pytest.approx(np.linalg.norm(rms), rel=1e-12)
         assert result.unit == "-"
-
-
-BALANCED, ALPHA = "reduction.method=balanced", "simulation.integrator=generalized-alpha"
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        (["constraints.peak_force=[9.0]"], ("constraints.peak_force", "3 numbers", "cart, arm1")),
-        ([BALANCED, "objective.kind=esl", "constraints.effort=9"], (BALANCED[:16], "effort")),
-        (["objective.effort_weights=[1.0]"], ("effort_weights", "3 numbers", "cart, arm1, arm2")),
-        (["objective.effort_weights=[0.0,0.0,0.0]"], ("effort_weights", "not all of them 0")),
-        ([BALANCED], ("reduction.method", 'objective.kind = "effort"', '"craig-bampton"')),
-        ([ALPHA], ("simulation.integrator", '"radau"', 'objective.kind = "effort"')),
-        # Without a limit of what arms do none of them would be left.
-        (["constraints={mass=3.0}"], ('kind = "effort"', "limit under [constraints]")),
-        (["objective.kind=peak_force", "constraints={mass=3.0}"], ("peak_force", "[constraints]")),
-        (["constraints.peak_force=[inf,inf,inf]"], ("peak_force", "one drive at least")),
-        (["constraints.peak_force=[inf,1.0]"], ("peak_force", "3 numbers")),
-    ],
-)
-def test_refusals(changes, words) -> None:
-    """One line that names the key and what is allowed."""
-    with refused(*words):
-        scene(*SMALL, *changes)
 
 
 def test_peak_forces_are_limited_drive_by_drive() -> None:

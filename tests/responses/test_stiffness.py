@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 from machines import held_link
 from remainders import build, built_of
-from runs import refusal
 
 import dolfinopt as do
 from dolfinopt.responses.constraints import EXCESS, limits_of
@@ -71,19 +70,3 @@ def test_the_plane_pays_no_solve_for_it() -> None:
         built.constraint_gradients(trajectory)
         assert built.profile.counts.solves == counts[-1]
     assert counts[0] == counts[1]
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("case", "words"),
-    [
-        ("{arm='arm3', moment=1.0, rotation=1.0}", ("stiffness.0.arm", '"arm3"', "arm1, arm2")),
-        ("{arm='arm1', moment=1.0}", ("stiffness.0", "displacement or rotation")),
-        ("{arm='arm1', rotation=1.0}", ("stiffness.0", "force or moment")),
-        ("{arm='arm1', force=[1.0,0.0,0.0], rotation=1.0}", ("stiffness.0", "two components")),
-        ("{arm='arm1', moment=1.0, rotatoin=1.0}", ("rotatoin", "stiffness.0.rotation")),
-        ("", ("stiffness = []", "[[constraints.stiffness]]")),
-    ],
-)
-def test_refusals(case, words) -> None:
-    refusal(lambda: build(f"constraints.stiffness=[{case}]"), *words)
