@@ -119,7 +119,7 @@ def test_round_trip_through_json():
 )  # fmt: skip
 def test_borders_of_the_ranges_are_allowed(paths, value):
     for data in [changed(path, value) for path in paths.split()] or [minimal(**value)]:
-        scene_from_dict(data, overrides=["arms.passive=0"])
+        assert isinstance(scene_from_dict(data, overrides=["arms.passive=0"]), Scene)
 
 
 def test_reducible_dofs():
