@@ -249,7 +249,7 @@ def flexible_slider_crank(folder: Path) -> Scene:
         "payload": {"mass": 0.0, "arm": "rod"},
         "damping": {"stiffness_proportional": 1e-5},
         "reduction": {"coordinates": 12},
-        "simulation": {"tolerance": 1e-3, "sample": 1e-4, "stiffening": False},
+        "simulation": {"tolerance": 5e-3, "sample": 1e-4, "stiffening": False},
         "design": {"volume_fraction": 1.0, "initial": 1.0},
     }  # fmt: skip
     return closed(folder, f"t,turn\n0,0\n{last},1e-3\n", tree)
