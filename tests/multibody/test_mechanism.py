@@ -15,7 +15,7 @@ from bodies import (
     changed,
     complex_derivative,
     derivative,
-    random_cloud,
+    random_chain,
     random_tree,
     stiffened,
 )
@@ -36,16 +36,13 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
 )
 from dolfinopt.multibody.machine import exponential, roll_pitch_yaw, skew
-from dolfinopt.multibody.mechanism import AppliedForce, JointHardware, Mechanism
+from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
 
-COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
-# Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
-HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
 ROUNDING = 1e-12
 
@@ -82,14 +79,6 @@ class Machine:
         return linearise(self.mechanism, motion, *rates, keep, rigid)
 
 
-def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
-    """Return a chain of random clouds with payload and gravity in both directions."""
-    clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
-    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms] * bent]
-    stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
-    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
-
-
 def given(mechanism: Mechanism) -> tuple[AppliedForce, ...]:
     """Return forces of the world and the arm on every interface, two together at the end."""
     every = [(i, s) for i, c in enumerate(mechanism.constants) for s in range(len(c.points))]
@@ -110,7 +99,7 @@ def machine_of(kind: str, count: int = 4) -> Machine:
             bodies = tuple(stiffened(rng, b) if b.num_modes else b for b in mechanism.bodies)
             mechanism = replace(mechanism, bodies=bodies)
     else:
-        model = chain(rng, int(arms[0]), bent)
+        model = random_chain(rng, int(arms[0]), bent)
         mechanism = model.mechanism()
     size = mechanism.num_rigid + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
