@@ -20,7 +20,6 @@ pytestmark = pytest.mark.serial  # a hundred small runs
 QUICK = ["arms.cells=[12,2]", "motion.duration=4", "motion.horizon=4", "simulation.sample=0.05"]
 QUICK += ["objective.load_cases=5", "optimizer.max_iterations=1", "simulation.tolerance=0.01"]
 DENSE = "design.initial=0.6"  # cut at one half, a uniform design of one half is nothing
-LINEAR = ["simulation.stiffening=false", "reduction.coordinates=3"]
 # What a key needs to be used at all.
 USED = {
     "reduction.shifts": ["reduction.method=krylov"],
@@ -29,9 +28,8 @@ USED = {
     "motion.start": ["motion.path=line"],
     "motion.end": ["motion.path=line"],
     # With stiffening they are refused after a long search, as payload.mass is.
-    "arms.joint_mass": LINEAR,
-    "arms.joint_inertia": LINEAR,
-    "payload.inertia": LINEAR,
+    "arms.joint_inertia": ["simulation.stiffening=false", "reduction.coordinates=3"],
+    "payload.inertia": ["simulation.stiffening=false", "reduction.coordinates=3"],
     "motion.horizon": ["motion.duration=1e5", "simulation.sample=1e3"],
     "motion.gravity": ["motion.duration=2", "motion.horizon=2"],
     "motion.base_position": ["motion.base=fixed"],
@@ -79,8 +77,7 @@ def toml(value, allowed):
 def tree_at(key, value):
     """Return a machine that uses the key, with it."""
     table, _, name = key.partition(".")
-    quick = {"motion": {"speed": 20.0},
-             "simulation": {"sample": 5e-3, "tolerance": 1e-2, "stiffening": False}}  # fmt: skip
+    quick = {"motion": {"speed": 20.0}, "simulation": {"sample": 5e-3, "tolerance": 1e-2}}
     data = loop_tree(**quick, reduction={"coordinates": 3})
     if table == "arms":
         data["arms"][0][name] = value
