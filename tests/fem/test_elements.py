@@ -166,7 +166,7 @@ def test_patch(shape, element):
 
 @pytest.mark.serial  # ranks: test_ranks
 @pytest.mark.parametrize(
-    ("element", "exact"), zip(OF_QUADRILATERALS, [True, False, True, True]), ids=repr
+    ("element", "exact"), list(zip(OF_QUADRILATERALS, [True, False, True, True])), ids=repr
 )
 def test_pure_bending_of_the_reduced_arm(element, exact):
     """A moment at the tip: rotation L / (E I), strain -y / (E I), in the reduced model, too."""
