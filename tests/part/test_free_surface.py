@@ -46,7 +46,7 @@ def window(x, y, z):
 @pytest.fixture(scope="module", params=[open_box, window])
 def form(request, tmp_path_factory):
     """Folder and scene of a run, its part and what moves of it."""
-    cells = "arms.link1.cells=" + ("[20,4,4]" if request.param is open_box else "[40,4,2]")
+    cells = "arms.link1.cells=" + ("[25,4,4]" if request.param is open_box else "[40,4,2]")
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", (cells, *COARSE))
     folder = write_run(tmp_path_factory.mktemp("solid") / "run", scene, request.param)
     with pytest.MonkeyPatch.context() as patch:
