@@ -85,14 +85,6 @@ def write(shared_tmp_path: Path) -> Callable[[str, str], Path]:
     return write
 
 
-@pytest.fixture
-def three_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Taylor tests with the command's middle steps alone: every step is four simulations."""
-    from dolfinopt.optimization import gradient_check
-
-    monkeypatch.setattr(gradient_check, "STEPS", gradient_check.STEPS[1:4])
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _clean_ranks() -> Iterator[None]:
     """Free what a file's tests left on all ranks together, and at no other time.

@@ -1,4 +1,4 @@
-"""The page on the architecture is true: picture, files, and the words of the scene."""
+"""The page on the architecture is true: picture, files, the words of the scene; and profiles."""
 
 import importlib.util
 import re
@@ -7,8 +7,10 @@ from typing import get_args
 import pytest
 from runs import ROOT
 
+from dolfinopt import profiling as profile
 from dolfinopt.density.interpolation import LAWS
 from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene.tables.arms import ElementName
 from dolfinopt.scene.tables.design import Law
@@ -57,3 +59,28 @@ def test_words_of_the_scene_are_those_of_the_code():
     assert set(get_args(ElementName)) == ELEMENTS.keys()
     limited = Constraints.model_fields.keys() - set(NO_LIMITS)
     assert {*get_args(ObjectiveKind), *limited} == NEEDS.keys()
+
+
+# -- seconds by phase: each is counted once  ------------------------------------------------------
+
+
+def test_nested_phases_share_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An inner phase stops the clock of the outer one, also where it ends by an error."""
+    now = 0.0
+    monkeypatch.setattr(profile.time, "perf_counter", lambda: now)
+    found = Profile()
+    with found.phase("outer"):
+        now += 1.0
+        with found.phase("inner"):
+            now += 10.0
+            with found.phase("outer"):  # of the same name again
+                now += 100.0
+        now += 1000.0
+        with pytest.raises(ZeroDivisionError), found.phase("inner"):
+            now += 10_000.0
+            raise ZeroDivisionError
+        now += 100_000.0
+    now += 7.0  # in no phase
+    with found.phase("later"):
+        now += 3.0
+    assert found.seconds == {"outer": 101_101.0, "inner": 10_010.0, "later": 3.0}

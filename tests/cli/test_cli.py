@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from machines import controlled, loop
 from mpi4py import MPI
 from runs import (
     ROOT,
@@ -22,11 +23,15 @@ from runs import (
     shell,
     summary_of,
 )
+from scipy.io import loadmat
 
 import dolfinopt as do
 from dolfinopt.cli import shared
+from dolfinopt.cli.shared import plain_lines
 from dolfinopt.disk import RUN
+from dolfinopt.optimization.state import FurtherRow, HistoryRow
 from dolfinopt.output.folders import RUN_FILES
+from dolfinopt.part.folder import toml_text
 
 TINY = overrides("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
 SMALL = overrides("arms.cells=[40,4]", "simulation.sample=0.005")
@@ -377,51 +382,28 @@ def test_resume_of_another_scene(optimised):
 
 @pytest.mark.serial
 @pytest.mark.parametrize("ranks", [0, 2])
-def test_exit_status_and_streams(shared_tmp_path, ranks):
-    """Status 2 and one line on standard error, from the process itself and through mpirun."""
-    words = "optimize", TWO_ARM, "--set", "payload.mas=1", "--out", shared_tmp_path
-    done = shell(*words, ranks=ranks)
-    assert done.returncode == 2 and done.stdout == ""
-    ours = [line for line in done.stderr.splitlines() if "payload.mas" in line]
-    assert len(ours) == 1 and ours[0].startswith("dolfinopt: ")
-    assert "Traceback" not in done.stderr
-    if not ranks:
-        assert len(done.stderr.splitlines()) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.serial
-@pytest.mark.parametrize("ranks", [0, 2])
-@pytest.mark.parametrize("words", [[], ["--help"], ["optimize", "--help"], ["--version"]])
-def test_help_is_printed_once(words, ranks):
-    """On standard output, with status 0, before MPI could tell the ranks apart."""
-    done = shell(*words, ranks=ranks)
-    assert done.returncode == 0 and done.stderr == ""
-    if words == ["--version"]:
-        assert done.stdout.count("dolfinopt") == 1
-        return
-    assert done.stdout.count("Usage: dolfinopt") == 1
-    if "optimize" not in words:
-        assert all(name in done.stdout for name in ("optimize", "simulate", "gradient", "plot"))
-
-
-@pytest.mark.slow
-@pytest.mark.serial
-@pytest.mark.parametrize("ranks", [0, 2])
 @pytest.mark.parametrize(
-    ("words", "parts"),
+    ("words", "status", "parts"),
     [
-        (["optimise", TWO_ARM], ["optimise", "did you mean optimize?", "(see dolfinopt --help)"]),
-        (["optimize", TWO_ARM, "--ot", "x"], ["--ot", "(see dolfinopt optimize --help)"]),
-        (["gradient"], ["SCENE", "(see dolfinopt gradient --help)"]),
+        ([], 0, ["Usage: dolfinopt", "optimize", "simulate", "gradient", "plot"]),
+        (["optimize", "--help"], 0, ["Usage: dolfinopt optimize"]),
+        (["--version"], 0, ["dolfinopt"]),
+        (["optimise", TWO_ARM], 2, ["did you mean optimize?", "(see dolfinopt --help)"]),
+        (["optimize", TWO_ARM, "--ot", "x"], 2, ["--ot", "(see dolfinopt optimize --help)"]),
+        (["gradient"], 2, ["SCENE", "(see dolfinopt gradient --help)"]),
+        (["optimize", TWO_ARM, "--set", "payload.mas=1"], 2, ["unknown key payload.mas;"]),
     ],
-)
-def test_a_wrong_word_is_told_once(words, parts, ranks):
+)  # fmt: skip
+def test_exit_status_and_streams(words, status, parts, ranks):
+    """Help with status 0, or one line and status 2, once: from the process, and through mpirun."""
     done = shell(*words, ranks=ranks)
-    assert done.returncode == 2 and done.stdout == ""
-    [line] = [line for line in done.stderr.splitlines() if line.startswith("dolfinopt: ")]
-    for part in parts:
-        assert part in line
+    assert done.returncode == status and "Traceback" not in done.stderr
+    assert not (done.stdout if status else done.stderr)
+    told = done.stdout if status == 0 else done.stderr
+    assert told.count(parts[0]) == 1 and all(part in told for part in parts)
+    if status:
+        [line] = [one for one in told.splitlines() if parts[0] in one]
+        assert line.startswith("dolfinopt: ") and (ranks or told == line + "\n")
 
 
 @pytest.mark.serial
@@ -449,3 +431,136 @@ def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening)
     run("export", tmp_path / "scene.toml", *asked, "--out", tmp_path / "out")
     told = capsys.readouterr().err
     assert ("arm2.sid holds no geometric stiffness" in told) == (stiffening == "false")
+
+
+# -- what is shown while an optimisation runs, and the time it says to have taken  ----------------
+
+
+@pytest.mark.serial
+def test_lines_without_a_terminal(capsys):
+    """The first row's wait is no silence, either; the last row is repeated while nothing comes."""
+    with plain_lines(400, every=0.05) as show:
+        deadline = time.monotonic() + 10.0
+        text = ""
+        while "setting up" not in text and time.monotonic() < deadline:
+            time.sleep(0.01)
+            text += capsys.readouterr().err
+        show(HistoryRow(7, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
+        while text.count("7/400") < 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
+            text += capsys.readouterr().err
+    assert "setting up" in text
+    assert text.count("7/400 objective 2.5 dev 7.5 mm") >= 2
+    time.sleep(0.1)
+    assert capsys.readouterr().err.count("\n") <= 1  # it ends with the run
+
+
+@pytest.mark.serial
+def test_further_iterations_are_told_apart(capsys):
+    with plain_lines(400, every=0.02) as show:
+        show(FurtherRow(3, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0, of=20))
+        deadline, text = time.monotonic() + 10.0, ""
+        while "objective" not in text and time.monotonic() < deadline:
+            time.sleep(0.01)
+            text += capsys.readouterr().err
+    assert "exact gradient, further 3/20 objective 2.5" in text and "/400" not in text
+
+
+@pytest.mark.serial
+def test_a_short_run_says_nothing(capsys):
+    with plain_lines(10, every=60.0) as show:
+        show(HistoryRow(1, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
+    assert capsys.readouterr().err == ""
+
+
+# -- the commands on controlled machines and closed loops  ----------------------------------------
+
+
+QUICK = ["--set", "simulation.tolerance=1e-3"]
+
+
+@pytest.fixture
+def write_scene(write):
+    """Return what writes a scene's file on the root; it returns its path."""
+    return lambda scene: write("machine.toml", toml_text({"name": scene.name} | scene.to_tree()))
+
+
+SCENES = {"slider": loop, "pin": lambda: loop("pin"), "control": controlled}
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", SCENES)
+def test_simulate_draws_and_plot_draws_again(kind, shared_tmp_path, write_scene):
+    path, out = write_scene(SCENES[kind]()), shared_tmp_path / "out"
+    film = ["--animation"] if kind == "pin" else []
+    run("simulate", path, *QUICK, "--out", out, *film)
+    pictures = {"design.png", "machine.png", "drives.png", "stress.png"}
+    pictures |= {"motion.gif"} if film else {"deviation.png"}
+    assert {name for name in contents(out) if name.endswith(("png", "gif"))} == pictures
+    summary = summary_of(out)
+    assert summary["converged"] and summary["ranks"] == WORLD.size
+    by_root((out / "drives.png").unlink)
+    run("plot", out)
+    assert (out / "drives.png").stat().st_size > 5000
+
+
+def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scene):
+    """Both files hold the same matrices, with names, whatever the ranks; refusals write nothing."""
+    path, out = write_scene(controlled()), shared_tmp_path / "run"
+    run("simulate", path, *QUICK, "--out", out, "--no-plots")
+    run("export", out, "--state-space", 3.0)
+    run("export", path, *QUICK, "--state-space", 3.0, "--out", shared_tmp_path / "scene")
+    folders = (out / "state-space", shared_tmp_path / "scene")
+    first, second = (np.load(one / "state_space.npz") for one in folders)
+    for key in first.files:  # numbers to rounding: where arrays lie in memory may tell
+        a, b = first[key], second[key]
+        if a.dtype.kind in "fc":
+            assert np.allclose(a, b, rtol=1e-9, atol=1e-12 * np.abs(a).max(initial=0.0))
+        else:
+            assert np.array_equal(a, b)
+    matlab = loadmat(folders[0] / "state_space.mat")
+    for key in "ABCD":
+        assert np.array_equal(matlab[key], first[key])
+    assert [str(one[0]) for one in matlab["inputs"][:, 0]] == list(first["inputs"])
+    assert first["A"].shape == (len(first["states"]),) * 2
+    if WORLD.rank == 0:
+        told = capsys.readouterr().out
+        assert "with its control, at 3 s: 22 states, 6 inputs, 7 outputs" in told
+    for words, expected in (
+        ([path, "--state-space", 5.0], "motion.horizon = 3"),
+        ([path, "--state-space", 1.0, "--urdf"], "--urdf"),
+        ([out, "--state-space", 1.0, "--set", "payload.mass=2"], "--set"),
+        ([out], "--state-space T"),
+    ):
+        line = ["export", *words, "--out", shared_tmp_path / "none"]
+        refusal(lambda line=line: run(*line), expected)
+    assert not (shared_tmp_path / "none").exists()
+
+
+def test_bodies_of_a_loop_are_exported(shared_tmp_path, write_scene):
+    run("export", write_scene(loop("pin")), "--out", shared_tmp_path / "bodies")
+    arms, kinds = ("coupler", "rocker"), (".sid", ".sid.npz", ".fem")
+    assert set(contents(shared_tmp_path / "bodies")) == {a + kind for a in arms for kind in kinds}
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+def test_gradient_of_machines_is_checked(shared_tmp_path, capsys, write_scene):
+    """Control's gradient: tests/responses/test_gradients.py."""
+    tight = ["--set", "simulation.tolerance=1e-4", "--set", "objective.kind=compliance"]
+    out = shared_tmp_path / "gradient.npz"
+    run("gradient", write_scene(loop()), *tight, "--kind", "exact", "--check", "--out", out)
+    if WORLD.rank == 0:
+        table = [line for line in capsys.readouterr().out.splitlines() if "e-" in line]
+        rates = [float(line.split()[-1]) for line in table if line.split()[-1][0].isdigit()]
+        assert len(rates) >= 4
+        np.testing.assert_allclose(rates, 2.0, atol=0.05)
+
+
+def test_a_table_without_a_column_leaves_no_folder(shared_tmp_path, write, write_scene):
+    write("drive.csv", "t,cart\n0,0\n1,1")
+    line = ["simulate", write_scene(controlled()), "--set", "control.forces=drive.csv", "--out"]
+    refusal(lambda: run(*line, shared_tmp_path / "out"), "drive.csv: line 1", "column 'arm1'")
+    WORLD.barrier()
+    assert not (shared_tmp_path / "out").exists()

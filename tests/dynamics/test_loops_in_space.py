@@ -14,19 +14,18 @@ from loops import (
     FOOT,
     HEAD,
     LUG,
+    SOFT,
     boom,
     closed,
     double_four_bar,
     five_bar,
     flexible_slider_crank,
-    four_bar,
     free,
     spatial_slider_crank,
     started,
 )
 from machines import apart, gaps, imbalance, machine, reference
 from mpi4py import MPI
-from remainders import taylor, wave
 from scipy.integrate import solve_ivp
 
 import dolfinopt as do
@@ -39,14 +38,6 @@ WORLD = MPI.COMM_WORLD
 GRAVITY = 9.81  # m/s2
 CONTROL = {"stiffness": [1e6, 1e8], "damping": [1e4, 1e5]}
 SPRING = boom()["closures"][0] | {"stiffness": 1e7, "damping": 1e4}
-SOFT = {
-    "interpolation": {"law": "two-material", "penalty": 3.0, "floor": 1e-3},
-    "objective": {"kind": "compliance", "gradient": "exact", "load_cases": 6},
-    "reduction": {"coordinates": 6},
-    "damping": {"stiffness_proportional": 1e-4},
-    "design": {"initial": 0.6, "volume_fraction": 0.6, "filter_radius": 0.0},
-    "simulation": {"tolerance": 1e-4},
-}
 
 
 def compliant_boom() -> Any:
@@ -188,36 +179,6 @@ def test_a_spring_gives_way(tmp_path) -> None:
     trajectory, _ = machine(do.Model(scene).simulate())
     shorter = trajectory.desired.q[:, 2] - trajectory.q_r[:, 2]
     assert shorter == pytest.approx(trajectory.closure_force[:, 0] / 1e7, rel=1e-4)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("tree", "table", "changes"),
-    [
-        (boom(), BOOM_TABLE, {}),
-        (boom(), BOOM_TABLE, {"control": CONTROL, "objective": {"kind": "effort"},
-                              "constraints": {"deviation": 0.01}}),
-        pytest.param(boom(), BOOM_TABLE, {"objective": {"kind": "peak_force"},
-                                          "constraints": {"deviation": 0.01}},
-                     marks=pytest.mark.slow),
-        pytest.param(boom(), BOOM_TABLE, {"objective": {"kind": "stress"}},
-                     marks=pytest.mark.slow),
-        (boom(), BOOM_TABLE, {"closures": [SPRING], "simulation": {"stiffening": True}}),
-        pytest.param(compliant_boom(), BOOM_TABLE, {"control": CONTROL}, marks=pytest.mark.slow),
-        (four_bar(), "t,turn\n0,0.5\n0.3,2.5\n",
-         SOFT | {"motion": {"horizon": 0.35, "gravity": [0, -9.81, 3.0]},
-                 "simulation": {"stiffening": True},
-                 "control": {"stiffness": [100.0], "damping": [2.0]}}),
-    ],
-    ids=["compliance", "effort", "peak force", "stress", "spring", "compliant", "pin"],
-)  # fmt: skip
-def test_gradient(tmp_path, tree: dict, table: str, changes: dict[str, Any]) -> None:
-    """Remainders fall with the square of the step."""
-    scene = closed(tmp_path, table, tree, **changes)
-    found = taylor(scene, wave, (4e-3, 1e-3), ("random",), MPI.COMM_SELF)
-    for row in found.rows:
-        coarse, fine = row.remainders
-        assert np.log(coarse / fine) / np.log(4.0) == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")

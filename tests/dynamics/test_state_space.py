@@ -213,26 +213,5 @@ def test_least_damping_follows_the_control() -> None:
     assert ratios[1] > 1.2 * ratios[0]
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: scene_from_dict(two_arm("constraints.damping_ratio=0.05")),
-         ["constraints.damping_ratio = 0.05", "[control]"]),
-        (lambda: controlled("constraints.damping_below=10.0"),
-         ["constraints.damping_below = 10.0", "none without constraints.damping_ratio"]),
-        (lambda: controlled("constraints.damping_ratio=0.05", "constraints.poles_at=[0.5,9.0]"),
-         ["constraints.poles_at", "motion.horizon"]),
-        (lambda: controlled("constraints.damping_ratio=1.5"), ["damping_ratio = 1.5", "<= 0.99"]),
-        (lambda: controlled("objective.kind=pole_frequency", "control.stiffness=[1,1]"),
-         ["control.stiffness"]),
-        (lambda: scene_from_dict(loop_tree(
-            control={"stiffness": [2e3], "damping": [20.0]},
-            constraints={"pole_frequency": 3.0})), ["constraints.pole_frequency", "closure"]),
-    ],
-)  # fmt: skip
-def test_poles_that_cannot_be_limited(make, words) -> None:
-    refusal(make, *words)
-
-
 def test_instant_within_the_motion() -> None:
     refusal(lambda: state_space(open_two_arm(), 4.0), "--state-space 4", "motion.horizon = 3")

@@ -142,6 +142,14 @@ def test_drives_follow_their_law() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
+def test_a_machine_tells_how_far_its_arms_bend() -> None:
+    """Of cart, joint and mode the mode alone turns the arm's end."""
+    system = controlled(1.0)
+    y = np.array([[5.0, 2.0, 0.1], [5.0, 2.0, -0.3]])
+    turn = 0.3 * abs(system.mechanism.bodies[0].outboard[2, 0])
+    assert system.describe(y) == f"the arms' ends turn by {turn:.2g} rad"
+
+
 def by_scipy(system: MachineSystem, t: np.ndarray) -> np.ndarray:
     """Return y (n, S) by SciPy's explicit method, accelerations from the mass matrix."""
     size = system.num_coordinates

@@ -1,15 +1,21 @@
 """Standard input data: the text file as other programs write it, round trips, damaged files."""
 
+import io
 import re
+from contextlib import redirect_stdout
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from bodies import beam
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from readers import check_npz
-from runs import refusal
+from mpi4py import MPI
+from readers import check_npz, read_as_mbdyn_does
+from runs import ROOT, overrides, refusal, run, tomllib
 
+import dolfinopt as do
+from dolfinopt.cli.shared import doubts_of_files
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.sid import (
     Node,
@@ -19,8 +25,8 @@ from dolfinopt.exchange.sid import (
     write_sid,
     write_sid_npz,
 )
-
-pytestmark = pytest.mark.serial  # nothing here knows of ranks
+from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
+from dolfinopt.multibody.standard_input import load_body, to_sid
 
 # A bar of 3 kg and 2 m that swings about its end by v = (x / 2)^2 q in the manner of FEMBS, by
 # hand: Fortran's exponents, ragged columns, zeros left out, half of a symmetric matrix.
@@ -110,6 +116,7 @@ def matrix(*shape, **entries):
     return out
 
 
+@pytest.mark.serial
 def test_a_file_in_the_manner_of_fembs(tmp_path):
     data = read(tmp_path, bar())
     assert data.mass == 3.0 and data.num_modes == 2 and data.comment == "a bar"
@@ -144,6 +151,7 @@ def test_a_file_in_the_manner_of_fembs(tmp_path):
     assert np.array_equal(data.mdCM.at(q)[:, 0], [3.0, 0.5, 0.0])
 
 
+@pytest.mark.serial
 def test_spacing_case_and_order_do_not_matter(tmp_path):
     reference = bits(read(tmp_path, bar()))
     unspaced = re.sub(r"[ ]*([=(),])[ ]*", r"\1", bar()).replace("nodes,No", "nodes, No")
@@ -192,6 +200,7 @@ def random_data(rng, nq, sigma, J=(6, 1)):
     )
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize(("nq", "sigma", "J"), [(1, False, (6, 1)), (3, True, (3, 3))])
 def test_round_trips_are_exact(tmp_path, nq, sigma, J):
     data = random_data(np.random.default_rng(nq), nq, sigma, J)
@@ -208,6 +217,7 @@ def test_round_trips_are_exact(tmp_path, nq, sigma, J):
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 
 
+@pytest.mark.serial
 @settings(max_examples=30)
 @given(values=st.lists(numbers, min_size=9, max_size=9), structure=st.integers(0, 4))
 def test_every_number_survives(tmp_path_factory, values, structure):
@@ -223,6 +233,7 @@ def test_every_number_survives(tmp_path_factory, values, structure):
     assert again.structure == structure or structure in (0, 4)
 
 
+@pytest.mark.serial
 def test_what_other_programs_write(tmp_path):
     """nq = 0 where nothing depends on q, and numbers in many ways."""
     lines = bar().splitlines()
@@ -280,12 +291,14 @@ DAMAGED = {
 }
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damaged_file(tmp_path, name):
     text, words = DAMAGED[name]
     refusal(lambda: read(tmp_path, text), f"{tmp_path / 'bar.SID_FEM'}, line ", *words)
 
 
+@pytest.mark.serial
 def test_no_damage_goes_unsaid(tmp_path):
     """A file that ends anywhere is refused; so is one with a line of nonsense anywhere."""
     lines = bar().splitlines()
@@ -298,3 +311,98 @@ def test_no_damage_goes_unsaid(tmp_path):
         with pytest.raises(InputError, match=f"line {cut + 1}: "):
             read(tmp_path, "\n".join([*lines[:cut], nonsense[cut % 4], *lines[cut:]]))
     refusal(lambda: read_sid(tmp_path / "none.sid"), "none.sid", "cannot be read", "SID")
+
+
+# -- `dolfinopt export` of a machine in space, and scenes that take its files  --------------------
+
+
+COMM = MPI.COMM_WORLD
+DEMO = ROOT / "demos" / "spatial_arm.toml"
+CELLS = {"link1": [8, 2, 2], "link2": [6, 2, 2]}
+LENGTHS = {"link1": 0.5, "link2": 0.45}
+COARSE = overrides(*(f"arms.{name}.cells={cells}" for name, cells in CELLS.items()))
+SETTINGS = overrides("simulation.stiffening=true", "arms.column.mass=2.0")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The folder of the links' files, the same on all ranks; what was told."""
+    out = COMM.bcast(tmp_path_factory.mktemp("space") / "bodies")
+    with redirect_stdout(io.StringIO()) as told:
+        run("export", DEMO, *COARSE, *SETTINGS, "--out", out)
+    return out, told.getvalue()
+
+
+def test_files_of_every_link(folder):
+    """Masses and inertias of boxes of half density; the geometric stiffness of all loads."""
+    out, told = folder
+    kinds = (".sid", ".sid.npz", ".fem")
+    assert {path.name for path in out.iterdir()} == {f"{n}{k}" for n in CELLS for k in kinds}
+    if COMM.rank == 0:
+        assert "column: not exported, it is rigid: 2 kg, centre (0, 0, 0) m" in told
+        assert "6 coordinates, 2 nodes, geometric stiffness" in told
+    for name, length in LENGTHS.items():
+        path = out / f"{name}.sid"
+        body = load_body(path, 3, length)
+        groups = read_as_mbdyn_does(path.with_suffix(".fem").read_text())
+        check_npz(out / f"{name}.sid.npz", read_sid(path))
+        mass = 0.6 * 2700.0 * length * 0.04 * 0.02
+        assert body.mass == groups[12][0] == pytest.approx(mass, rel=1e-5)  # void: 1e-6 of solid
+        assert groups[12][1:4] == pytest.approx([0.5 * length, 0.0, 0.0], abs=1e-9)
+        sizes = np.array([length, 0.04, 0.02]) ** 2
+        expected = np.diag(mass / 12.0 * (sizes.sum() - sizes))
+        assert np.abs(groups[12][4:].reshape(3, 3) - expected).max() < 1e-5 * expected.max()
+        assert body.K0.shape == (12, 6, 6) and body.K0_outboard.shape == (6, 6, 6)
+        assert [load for load, _ in groups[19]] == list(range(1, 19))
+        data = read_sid(path)
+        assert np.array_equal(groups[9], data.Me.M0) and np.array_equal(groups[10], body.K)
+        assert np.abs(body.M - groups[9]).max() < 1e-12 * np.abs(groups[9]).max()
+        assert [node.name for node in data.nodes] == ["1", "2"]
+
+
+@pytest.mark.skipif(COMM.size == 1, reason="one rank")
+def test_files_are_the_same_on_any_number_of_ranks(folder, shared_tmp_path):
+    if COMM.rank == 0:
+        run("export", DEMO, *COARSE, *SETTINGS, "--out", shared_tmp_path, world=MPI.COMM_SELF)
+        for path in shared_tmp_path.iterdir():
+            if path.suffix != ".npz":  # archives hold the time of day
+                assert path.read_bytes() == (folder[0] / path.name).read_bytes(), path.name
+
+
+def meshed():
+    """Return the demo as a dictionary, coarse and short, every arm with all of its keys."""
+    scene = tomllib.loads(DEMO.read_text())
+    scene["motion"]["file"] = str(DEMO.with_suffix(".csv"))
+    scene["simulation"] = {"stiffening": True, "sample": 0.02}
+    for arm in scene["arms"][1:]:
+        arm |= {"cells": CELLS[arm["name"]], "height": 0.04, "thickness": 0.02}
+    return scene
+
+
+@pytest.mark.serial
+def test_motion_with_a_link_of_a_file(folder):
+    """The machine moves as with the link's mesh, but for what the inertia of its modes stiffens."""
+    expected = do.Model(meshed()).simulate().trajectory.deviation
+    scene = meshed()
+    scene["arms"][1] = {"name": "link1", "sid": str(folder[0] / "link1.sid")}
+    found = do.Model(scene).simulate().trajectory.deviation
+    assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()  # measured 3e-5
+
+
+@pytest.mark.serial
+def test_links_of_files_that_cannot_be(folder, tmp_path):
+    """Stiffness that cannot be left out; bodies that do not bend, or in the plane alone."""
+    scene = meshed()
+    scene["simulation"]["stiffening"] = False
+    scene["arms"][2] = {"name": "link2", "sid": str(folder[0] / "link2.sid")}
+    refusal(lambda: do.Model(scene), "link2.sid", "geometric stiffness")
+    write_sid(tmp_path / "bar.sid", to_sid(in_space(rigid_bar(0.45, 0.04, 0.9))))
+    scene["arms"][2]["sid"] = str(tmp_path / "bar.sid")
+    refusal(lambda: do.Model(scene), "bar.sid", "nelastq = 0", "rigid = true, mass")
+    write_sid(tmp_path / "beam.sid", to_sid(in_space(beam().body())))
+    scene = meshed()
+    scene = meshed()
+    scene["arms"][2] = {"name": "link2", "sid": str(tmp_path / "beam.sid")}
+    stiffening, plane = doubts_of_files(do.scene_from_dict(scene))
+    assert "beam.sid" in stiffening and "geometric stiffness" in stiffening
+    assert "'link2'" in plane and "rigid" in plane

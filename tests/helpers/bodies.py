@@ -13,17 +13,14 @@ from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
     exponential,
-    rigid_spatial_body,
     skew,
     spatial_mechanism,
 )
 from dolfinopt.multibody.mechanism import JointHardware, Mechanism, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     STIFFENING,
     TABLE,
     ShapeIntegrals,
-    in_space,
     plane_body,
 )
 
@@ -265,6 +262,19 @@ class Chain:
         return derivative(momentum) - derivative(lagrangian) + lost
 
 
+COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+# Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
+HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
+
+
+def random_chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
+    """Return a chain of random clouds with payload and gravity in both directions."""
+    clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
+    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms] * bent]
+    stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
+    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
+
+
 def rotation(angle: np.ndarray) -> np.ndarray:
     """Return the matrix that turns by an angle."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -388,29 +398,6 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     loads = {site: random_cloud(rng, 0, 3) for site in sorted({(1, 0), (1, last), (3, 0), (4, 0)})}
     clouds = rigid, fork, *outer, rigid
     return CloudTree(clouds, tuple(joints), loads, rng.normal(size=3), 4)
-
-
-def posed_machine(plane: Mechanism) -> Mechanism:
-    """Return a plane machine in space: a cart on the x axis, joints about z."""
-    x, _, z = np.eye(3)
-    none, still = np.zeros(3), np.eye(3)
-    joints = [Joint("cart", "prismatic", GROUND, 0, x, rotor=float(plane.rotors[0]))]
-    for k in range(len(plane.bodies)):
-        origin = np.array([*plane.origin, 0.0]) if k == 0 else none
-        rotor = float(plane.rotors[1 + k])
-        joints.append(Joint(f"joint{k}", "revolute", k, 1 + k, z, origin, still, rotor))
-    carried = {
-        (1 + k, 0): rigid_spatial_body(load.mass, none, (0.0, 0.0, load.W_rest[0, 0], *none))
-        for (k, _), load in plane.loads.items()
-    }
-    bodies = (rigid_spatial_body(0.0, none, np.zeros(6)), *map(in_space, plane.bodies))
-    gravity = np.array([*plane.gravity[:, 0], 0.0])
-    return spatial_mechanism(bodies, joints, carried, gravity, (len(plane.bodies), 0))
-
-
-def posed_motion(motion: RigidMotion) -> RigidMotion:
-    """Return a plane machine's motion as that of the joints in space."""
-    return RigidMotion(motion.q, motion.qd, motion.qdd)
 
 
 # -- changes and derivatives -----------------------------------------------------------------

@@ -23,6 +23,14 @@ UP = [0, 0, 1]
 QUARTER = 0.5 * np.pi
 STEEL = {"young_modulus": 2.1e11, "poisson_ratio": 0.3, "density": 7850.0}
 SECTION = {"height": 0.01, "thickness": 0.01}  # m
+SOFT: Tree = {  # tables of designs that bend well, and of their gradients
+    "interpolation": {"law": "two-material", "penalty": 3.0, "floor": 1e-3},
+    "objective": {"kind": "compliance", "gradient": "exact", "load_cases": 6},
+    "reduction": {"coordinates": 6},
+    "damping": {"stiffness_proportional": 1e-4},
+    "design": {"initial": 0.6, "volume_fraction": 0.6, "filter_radius": 0.0},
+    "simulation": {"tolerance": 1e-4},
+}
 
 
 def bar(name: str, length: float, **keys: Any) -> Tree:
@@ -158,9 +166,8 @@ FOOT, HEAD, LUG = (0.3, 0.0, 0.2), (0.0, 0.0, 1.0), (0.75, -0.075, 0.0)  # m
 
 def boom(**changes: Any) -> Tree:
     """Return a crane: a column that slews, and a flexible boom on a cylinder."""
-    return with_keys({
+    return with_keys(SOFT | {
         "name": "boom",
-        "interpolation": {"law": "two-material", "penalty": 3.0, "floor": 1e-3},
         "arms": [
             weightless("column", ("head", HEAD), ("foot", FOOT)),
             flexible("boom", 2.0, height=0.15, thickness=0.08, cells=[8, 2, 2], passive=0.1,
@@ -174,11 +181,7 @@ def boom(**changes: Any) -> Tree:
         "closures": [{"name": "cylinder", "kind": "rod", "between": ["boom.lug", "column.foot"]}],
         "motion": {"initial_joints": [0, 0.5], "gravity": [0, 0, -9.81], "horizon": 1.2},
         "payload": {"mass": 100.0},
-        "damping": {"stiffness_proportional": 1e-4},
         "reduction": {"coordinates": 12},
-        "simulation": {"tolerance": 1e-4},
-        "objective": {"kind": "compliance", "gradient": "exact", "load_cases": 6},
-        "design": {"initial": 0.6, "volume_fraction": 0.6, "filter_radius": 0.0},
         "optimizer": {"max_iterations": 2},
     }, changes)  # fmt: skip
 
@@ -246,7 +249,7 @@ def flexible_slider_crank(folder: Path) -> Scene:
         "payload": {"mass": 0.0, "arm": "rod"},
         "damping": {"stiffness_proportional": 1e-5},
         "reduction": {"coordinates": 12},
-        "simulation": {"tolerance": 1e-3, "sample": 1e-4, "stiffening": False},
+        "simulation": {"tolerance": 5e-3, "sample": 1e-4, "stiffening": False},
         "design": {"volume_fraction": 1.0, "initial": 1.0},
     }  # fmt: skip
     return closed(folder, f"t,turn\n0,0\n{last},1e-3\n", tree)

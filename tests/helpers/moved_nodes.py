@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from remainders import Built, built_of
+from solids import tetrahedra
 
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.mesh import compat
@@ -25,19 +25,6 @@ from dolfinopt.scene.load import Arm, Scene
 
 # From an arm's name and the places of its nodes (n, d), m, to their moves (n, d), m.
 Moves = Callable[[str, np.ndarray], np.ndarray]
-
-
-def tetrahedra(comm: MPI.Comm, arm: Arm) -> ArmMesh:
-    """Return a box of hexahedra each cut into six tetrahedra."""
-    size = np.array([arm.length, arm.height, arm.thickness])
-    low = np.array([0.0, -0.5, -0.5]) * size
-    mesh = create_box(comm, [low, low + size], list(arm.cells), CellType.tetrahedron)
-    owned, _ = compat.local_cell_counts(mesh)
-    corners, none = compat.cell_coordinates(mesh, owned), np.zeros(owned, dtype=bool)
-    ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, arm.length)]
-    point = np.array([arm.length, 0.0, 0.0])
-    volume, centroid = cell_volumes(corners), corners.mean(axis=1)
-    return ArmMesh(arm.name, comm, mesh, centroid, volume, none, none.copy(), *ends, point)
 
 
 def with_moves(mesh: ArmMesh, moves: np.ndarray) -> ArmMesh:
@@ -60,7 +47,11 @@ def built_with(
     """
 
     def meshed(comm: MPI.Comm, arm: Arm, pattern: Arm | None = None) -> ArmMesh:
-        mesh = tetrahedra(comm, arm) if cut else arm_mesh(comm, arm, pattern)
+        if cut:
+            size = arm.length, arm.height, arm.thickness
+            mesh = tetrahedra(comm, arm.name, size, arm.cells)
+        else:
+            mesh = arm_mesh(comm, arm, pattern)
         places = mesh.mesh.geometry.x[:, : mesh.dim].copy()
         if regular is not None:
             regular[arm.name] = places

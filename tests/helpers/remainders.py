@@ -185,6 +185,28 @@ def rates(
     return float(np.log(coarse / fine) / np.log(steps[0] / steps[1]))
 
 
+def limit_rates(built: Built, steps: Sequence[float]) -> list[float]:
+    """Return the orders of the remainders of all limits but the volume's (collective).
+
+    Limits hold for true values; what is differentiated are smooth ones, scaled to them.
+    """
+    x, d = built.fields(wave), built.fields(uneven)
+
+    def smooth(h: float) -> np.ndarray:
+        evaluation, _ = built.evaluate({k: x[k] + h * d[k] for k in x})
+        return np.concatenate([one.smooth for one in evaluation.responses[2:]])
+
+    evaluation, trajectory = built.evaluate(x)
+    rows = built.constraint_gradients(trajectory)
+    scale = (1.0 + np.array(beside_volume(evaluation))) / smooth(0.0)
+    built.evaluate(x)
+    slopes = [built.dot(row, d) for row in rows]
+    assert len(slopes) == len(scale)
+    return [
+        rates(lambda h, k=k: (scale * smooth(h))[k], one, steps) for k, one in enumerate(slopes)
+    ]
+
+
 def hold_instants(patch: pytest.MonkeyPatch) -> None:
     """Let buckling look at the same instants: where a peak goes on to the next its slope steps."""
 

@@ -31,6 +31,7 @@ ROOT = Path(__file__).parents[2]
 TWO_ARM = ROOT / "demos" / "two_arm.toml"
 QUICK = ("arms.cells=[24,3]", "design.filter_radius=0.05", "motion.horizon=1.9",
          "simulation.tolerance=1e-2")  # fmt: skip
+REFUSALS = (InputError, click.UsageError)
 # The tables that every scene states, for tests of one arm's mesh, filter or keys.
 STATED = {"motion": {"path": "arc"}, "payload": {"mass": 6.0}}  # kg
 
@@ -56,19 +57,28 @@ def overrides(*changes: str) -> list[str]:
     return [word for change in changes for word in ("--set", change)]
 
 
-def refusal(make: Callable[[], object], *words: str) -> str:
-    """Check that a call is refused in one line that has all the words; return the line."""
-    with pytest.raises((InputError, click.UsageError)) as caught:
-        make()
-    error = caught.value
-    message = error.format_message() if isinstance(error, click.UsageError) else str(error)
-    assert len(message.splitlines()) == 1 and message.isprintable()
+@contextmanager
+def refused(
+    *words: str, error: type[Exception] | tuple[type[Exception], ...] = REFUSALS
+) -> Iterator[list[str]]:
+    """Check that what is run is refused in one line with all the words; it is added to the list."""
+    told: list[str] = []
+    with pytest.raises(error) as caught:
+        yield told
+    one = caught.value
+    told.append(one.format_message() if isinstance(one, click.UsageError) else str(one))
+    assert len(told[0].splitlines()) == 1 and told[0].isprintable()
     # No other exception would be printed above it; those of click have their own.
-    if isinstance(error, InputError):
-        assert error.__context__ is None or error.__suppress_context__
-    for word in words:
-        assert word in message
-    return message
+    if isinstance(one, InputError):
+        assert one.__context__ is None or one.__suppress_context__
+    assert [word for word in words if word not in told[0]] == [], told[0]
+
+
+def refusal(make: Callable[[], object], *words: str) -> str:
+    """Check that a call is refused so; return the line."""
+    with refused(*words) as told:
+        make()
+    return told[0]
 
 
 def run(*words: object, world: MPI.Comm = MPI.COMM_WORLD) -> None:
@@ -93,16 +103,6 @@ def contents(folder: Path) -> dict[str, bytes]:
 def summary_of(folder: Path) -> dict:
     """Return a run's summary."""
     return json.loads((folder / "summary.json").read_text())
-
-
-@contextmanager
-def refused(*words: str, error: type[Exception] = InputError) -> Iterator[None]:
-    """Assert that what is run is refused in one line with all these words: key, value, remedy."""
-    with pytest.raises(error) as caught:
-        yield
-    said = str(caught.value)
-    assert "\n" not in said
-    assert [word for word in words if word not in said] == [], said
 
 
 def assert_same_bits(found: do.Result, expected: do.Result) -> None:

@@ -1,5 +1,6 @@
 """One solid arm of a scene, 0.5 x 0.04 x 0.02 m of aluminium."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -69,19 +70,22 @@ def sixths(corners: np.ndarray) -> np.ndarray:
     return np.concatenate([corners[:, one] for one in SIXTHS])
 
 
-def link_mesh(shape: str, cells: tuple[int, int, int]) -> ArmMesh:
-    """Return the link of hexahedra, or of hexahedra each cut into six tetrahedra."""
-    comm, size = MPI.COMM_WORLD, (LENGTH, HEIGHT, THICKNESS)
-    if shape == "hexahedron":
-        return box_arm(comm, "a", size, cells)
-    low = np.array([0.0, -0.5 * HEIGHT, -0.5 * THICKNESS])
+def tetrahedra(comm: MPI.Comm, name: str, size: Sequence[float], cells: Sequence[int]) -> ArmMesh:
+    """Return a box of hexahedra, length, height and thickness in m, each cut into six."""
+    low = np.array([0.0, -0.5, -0.5]) * size
     mesh = create_box(comm, [low, low + size], list(cells), CellType.tetrahedron)
     owned, _ = compat.local_cell_counts(mesh)
     corners, none = compat.cell_coordinates(mesh, owned), np.zeros(owned, dtype=bool)
-    ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, LENGTH)]
-    point = np.array([LENGTH, 0.0, 0.0])
+    ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, size[0])]
     volume, centroid = cell_volumes(corners), corners.mean(axis=1)
-    return ArmMesh("a", comm, mesh, centroid, volume, none, none, *ends, point)
+    point = np.array([size[0], 0.0, 0.0])
+    return ArmMesh(name, comm, mesh, centroid, volume, none, none.copy(), *ends, point)
+
+
+def link_mesh(shape: str, cells: tuple[int, int, int]) -> ArmMesh:
+    """Return the link of hexahedra, or of hexahedra each cut into six tetrahedra."""
+    make = box_arm if shape == "hexahedron" else tetrahedra
+    return make(MPI.COMM_WORLD, "a", (LENGTH, HEIGHT, THICKNESS), cells)
 
 
 def rigid_tip(basis: Any, length: float) -> csr_matrix:

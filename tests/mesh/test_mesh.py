@@ -1,6 +1,9 @@
-"""Meshes: the parametric geometry, its groups, and the facets between cells."""
+"""Meshes: the parametric geometry, its groups, facets between cells, boxes and uniform members."""
+
+from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 
@@ -13,11 +16,16 @@ from runs import ROOT, STATED, refusal
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm as ScenesArm
 from dolfinopt.data import mesh_folder
-from dolfinopt.mesh import compat
+from dolfinopt.mesh import compat, hollow
 from dolfinopt.mesh.arm_mesh import box_arm, interior_facets
-from dolfinopt.mesh.checks import cell_areas
+from dolfinopt.mesh.checks import cell_areas, cell_volumes, check_cells, facet_areas
 from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
+from dolfinopt.mesh.hollow import FLAT_BAR, SOLID_BAR, member
+from dolfinopt.mesh.solid_cells import TENSOR
+from dolfinopt.output.design import arms_with_design
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
+from dolfinopt.study.sections import Members
 
 COMM = MPI.COMM_WORLD
 # Gmsh places the points of a curve by integrating its length to Mesh.LcIntegrationPrecision = 1e-9;
@@ -241,3 +249,196 @@ def test_import_keeps_compilers_quiet():
     script += "logging.getLogger('FFCx').warning('compiled')"
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert (run.stdout, run.stderr) == ("", "")
+
+
+# -- members of uniform section: areas in closed form, their bodies against the theory of beams  --
+
+
+LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
+E, NU = 70e9, 0.33
+G = 0.5 * E / (1.0 + NU)
+MESHED = {"rectangular tube": hollow.RECTANGULAR_TUBE, "round tube": hollow.ROUND_TUBE,
+          "I section": hollow.I_SECTION}  # fmt: skip
+
+
+def moments(kind, share):
+    """Return A, I_z, I_y, the shear areas along y and z, and the twist by a moment L / (G J)."""
+    # Shear areas: walls that carry it, half of a thin ring, 5/6 of a rectangle. Twist: Bredt's
+    # formula at the wall's middle, the circle's polar moment, Vlasov's with both ends held from
+    # warping, the series of the rectangle (Timoshenko & Goodier, Theory of Elasticity, 109).
+    h, b, L = HEIGHT, THICKNESS, LENGTH
+    if kind == "solid bar":
+        h, b = share * h, share * b
+        n = np.arange(1, 60, 2)
+        series = (np.tanh(0.5 * n * np.pi * h / b) / n**5).sum()
+        J = h * b**3 / 3.0 * (1.0 - 192.0 * b / np.pi**5 / h * series)
+        A = h * b
+        return A, b * h**3 / 12.0, h * b**3 / 12.0, A / 1.2, A / 1.2, L / (G * J)
+    if kind == "rectangular tube":
+        t = 0.5 * share * b
+        hi, bi, hm, bm = h - 2.0 * t, b - 2.0 * t, h - t, b - t
+        J = 2.0 * t * (hm * bm) ** 2 / (hm + bm)
+        I_z, I_y = (b * h**3 - bi * hi**3) / 12.0, (h * b**3 - hi * bi**3) / 12.0
+        return h * b - hi * bi, I_z, I_y, 2.0 * t * h, 2.0 * t * b, L / (G * J)
+    if kind == "round tube":
+        R, r = 0.5 * b, 0.5 * b * (1.0 - share)
+        A, inertia = math.pi * (R**2 - r**2), 0.25 * math.pi * (R**4 - r**4)
+        return A, inertia, inertia, 0.5 * A, 0.5 * A, L / (2.0 * G * inertia)
+    t = share * min(0.5 * h, b)
+    A, hm = 2.0 * b * t + (h - 2.0 * t) * t, h - t
+    I_z = (b * h**3 - (b - t) * (h - 2.0 * t) ** 3) / 12.0
+    I_y = (2.0 * t * b**3 + (h - 2.0 * t) * t**3) / 12.0
+    J, warping = (2.0 * b + hm) * t**3 / 3.0, t * b**3 * hm**2 / 24.0
+    k = math.sqrt(G * J / (E * warping))
+    twist = (L - 2.0 / k * math.tanh(0.5 * k * L)) / (G * J)
+    return A, I_z, I_y, t * h, 2.0 * b * t / 1.2, twist
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.6])
+@pytest.mark.parametrize("kind", MESHED)
+def test_volume(kind, share):
+    """Cells are valid and have the section's area, the circle's too, all along."""
+    section = MESHED[kind]
+    found = member(section, LENGTH, (HEIGHT, THICKNESS), share)
+    cells = found.cells[:, TENSOR[8]]
+    check_cells(found.points, cells)
+    area = section.area(HEIGHT, THICKNESS, share)
+    assert area == pytest.approx(moments(kind, share)[0], rel=1e-12)
+    assert cell_volumes(found.points[cells]).sum() == pytest.approx(area * LENGTH, rel=1e-9)
+    for facets, x in ((found.inboard, 0.0), (found.outboard, LENGTH)):
+        assert (found.points[facets][:, :, 0] == x).all()
+
+
+def test_areas_of_bars():
+    assert FLAT_BAR.area(0.06, 0.01, 0.5) == pytest.approx(0.03 * 0.01, rel=1e-15)
+    assert SOLID_BAR.area(0.06, 0.01, 0.5) == pytest.approx(0.03 * 0.005, rel=1e-15)
+    assert FLAT_BAR.measures(0.06, 0.01, 0.5) == (0.03, 0.01)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("share", [0.02, 0.2])
+@pytest.mark.parametrize("kind", [*MESHED, "solid bar"])
+def test_cantilever(kind, share, tmp_path):
+    """Bending both ways and twist of the clamped member; twist where the walls are thin."""
+    own = [f"arms.link1.{key}={value}" for key, value in
+           (("length", LENGTH), ("height", HEIGHT), ("thickness", THICKNESS))]  # fmt: skip
+    keys = [*own, "simulation.stiffening=false"]
+    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", keys)
+    members = Members(scene, kind, MESHED.get(kind, SOLID_BAR), tmp_path)
+    made = members.case((share, share)).scene
+    _, arms, x_phys = arms_with_design(MPI.COMM_SELF, made, None, Profile())
+    body = arms[1].reduce(x_phys[1])
+    A, I_z, I_y, along_y, along_z, twist = moments(kind, share)
+    assert body.mass == pytest.approx(2700.0 * A * LENGTH, rel=1e-9)
+    assert body.mass == pytest.approx(members.mass(1, share), rel=1e-9)
+    flexibility = np.diag(body.outboard @ np.linalg.solve(body.K, body.outboard.T))
+    expected = [LENGTH**3 / (3.0 * E * second) + LENGTH / (G * a)
+                for second, a in ((I_z, along_y), (I_y, along_z))]  # fmt: skip
+    assert flexibility[1:3] == pytest.approx(expected, rel=0.01)
+    if share < 0.1 or kind in ("round tube", "solid bar"):
+        assert flexibility[3] == pytest.approx(twist, rel=0.01)
+
+
+# -- solid arms: boxes of hexahedra, volumes and facets of cells in space, what cannot be a solid
+
+
+SIZE, CELLS = (0.5, 0.04, 0.02), (10, 4, 2)
+
+
+def test_box():
+    """Size, interfaces, solid ends by whole layers, and nodes on the very lines of the grid."""
+    mesh = box_arm(COMM, "a", SIZE, CELLS, passive=0.08)
+    counts = [mesh.num_cells, mesh.area.sum(), mesh.passive.sum()]
+    assert np.allclose(COMM.allreduce(np.array(counts)), [80, np.prod(SIZE), 2 * 2 * 8])
+    facets = mesh.mesh.topology.index_map(2).size_local
+    ends = (mesh.inboard_facets, mesh.outboard_facets)
+    assert [COMM.allreduce(int((side < facets).sum())) for side in ends] == [8, 8]
+    assert mesh.dim == 3 and np.array_equal(mesh.outboard_point, [0.5, 0.0, 0.0])
+    x, y, z = mesh.mesh.geometry.x.T
+    for values, first, step in ((x, 0.0, 0.05), (y, -0.02, 0.01), (z, -0.01, 0.01)):
+        assert np.array_equal(values, first + step * np.rint((values - first) / step))
+    assert mesh.passive.tolist() == (np.abs(mesh.centroid[:, 0] - 0.25) > 0.15).tolist()
+
+
+def test_facets_between_cells():
+    """All 10 x 4 x 2 cells' inner faces, once a rank that owns one of both cells."""
+    mesh = box_arm(COMM, "a", SIZE, CELLS)
+    first, second, area, distance = interior_facets(mesh.mesh)
+    mine = np.minimum(first, second) < mesh.num_cells
+    owner = mesh.mesh.topology.index_map(3).local_to_global(first[mine].astype(np.int32))
+    assert np.allclose(area[mine] * distance[mine], 0.05 * 0.01 * 0.01)
+    if COMM.size == 1:
+        assert len(owner) == 9 * 8 + 10 * 3 * 2 + 10 * 4
+
+
+def test_volumes_of_skew_cells():
+    """Boxes and tetrahedra under a linear map; a frustum, whose faces are planes."""
+    corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+    F = np.array([[1.0, 0.3, -0.2], [0.1, 0.7, 0.4], [-0.3, 0.2, 1.1]])
+    volume = np.linalg.det(F)
+    assert cell_volumes((corners @ F.T)[None])[0] == pytest.approx(volume)
+    assert cell_volumes((corners[[0, 1, 2, 4]] @ F.T)[None])[0] == pytest.approx(volume / 6.0)
+    frustum = corners.copy()
+    frustum[4:, :2] *= 0.5
+    assert cell_volumes(frustum[None])[0] == pytest.approx((1.0 + 0.5 + 0.25) / 3.0)
+    assert np.allclose(np.abs(facet_areas(frustum[None, 4:])), [[0.0, 0.0, 0.25]])
+
+
+@pytest.mark.serial
+def test_facets_of_cells_in_the_order_of_the_reference_cell():
+    mesh = box_arm(COMM, "a", SIZE, CELLS)
+    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
+    low = mesh.centroid[:, 0] < 0.05
+    assert np.isin(facets[low, 2], mesh.inboard_facets).all()  # opposite to x = 1
+    assert not np.isin(facets[:, [0, 1, 3, 4, 5]], mesh.inboard_facets).any()
+
+
+# Five tetrahedra in a hexahedron whose corners are numbered as a tensor product.
+FIVE = np.array([[0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7], [1, 2, 4, 7]])
+
+
+def row() -> tuple[np.ndarray, np.ndarray]:
+    """Return points and cells of three cubes in a row along z."""
+    grid = np.stack(np.meshgrid(np.arange(4), [0, 1], [0, 1], indexing="ij"), axis=3)
+    return grid.reshape(-1, 3)[:, ::-1].astype(float), np.arange(8) + 4 * np.arange(3)[:, None]
+
+
+# Three tetrahedra at one facet, the second one on its other side.
+FAN = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.1, 0.1, 1], [0.1, 0.1, -1], [0.3, 0.3, 1.0]])
+THREE = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])
+
+
+def changed(place: int, *value: float) -> np.ndarray:
+    points = row()[0]
+    points[place] = value
+    return points
+
+
+@pytest.mark.serial
+def test_sound_cells():
+    """Whichever way round their corners are numbered."""
+    points, cells = row()
+    check_cells(points, cells)
+    check_cells(points * [1.0, 1.0, -1.0], cells)
+    turned = cells.copy()
+    turned[1] = cells[1][[1, 0, 3, 2, 5, 4, 7, 6]]
+    check_cells(points, turned)
+    check_cells(points[:8], FIVE)
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(
+    ("points", "cells", "words"),
+    [
+        (changed(5, np.nan, 0.0, 0.0), row()[1], ["2 cells", "no numbers"]),
+        (row()[0] * [1.0, 1.0, 0.0], row()[1], ["3 cells", "flat"]),
+        (changed(5, 1.0, 0.0, 2.5), row()[1], ["1 cells", "folded", "(0.5, 0.5, "]),
+        (row()[0], np.concatenate([row()[1], row()[1][:1]]), ["2 cells", "overlap"]),
+        (row()[0], np.repeat(row()[1][:1], 3, axis=0), ["3 cells", "overlap"]),
+        (FAN, THREE, ["cells overlap"]),
+        (changed(7, 0.2, 0.2, 0.2)[:8], FIVE, ["overlap", "inverted"]),
+        (row()[0], row()[1][[0, 2]], ["2 separate parts"]),
+    ],
+)
+def test_cells_that_are_no_solid(points, cells, words):
+    refusal(lambda: check_cells(points, cells), *words)

@@ -7,7 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import assert_close, change_of, changed, derivative, random_tree, stiffened
+from bodies import (
+    assert_close,
+    change_of,
+    changed,
+    derivative,
+    random_chain,
+    random_tree,
+    stiffened,
+)
 from loops import (
     BASE,
     BOOM_TABLE,
@@ -28,7 +36,6 @@ from loops import (
 )
 from machines import with_keys
 from runs import refused
-from test_mechanism import machine_of
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.multibody import motion as motions
@@ -53,7 +60,7 @@ def equations_of(rng: np.random.Generator, d: int) -> tuple[Equation, ...]:
 def mechanism_of(kind: str) -> Mechanism:
     rng = np.random.default_rng(5)
     if kind == "plane":
-        return machine_of("3 arms, stiffened").mechanism
+        return random_chain(np.random.default_rng(7), 3, bent=True).mechanism()
     tree = random_tree(rng, interfaces=2).mechanism()
     bodies = [stiffened(rng, one) if one.num_modes else one for one in tree.bodies]
     return replace(tree, bodies=tuple(bodies)) if kind == "stiffened" else tree

@@ -1,4 +1,4 @@
-"""Mechanisms of plane and space: point masses, tangents and gradients, closed forms."""
+"""Mechanisms of plane and space against point masses; bodies by quadrature; rotations."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ from bodies import (
     assert_close,
     change_of,
     changed,
+    complex_derivative,
     derivative,
-    random_cloud,
+    random_chain,
     random_tree,
     stiffened,
 )
+from mpi4py import MPI
+from remainders import substructure
 from runs import ROOT
+from scipy.linalg import expm
 
 from dolfinopt.multibody import measured
 from dolfinopt.multibody import tangent as tangents
+from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.kinematics import (
     Posed,
@@ -30,16 +35,14 @@ from dolfinopt.multibody.kinematics import (
     end_effector_gradient,
     end_rotation,
 )
-from dolfinopt.multibody.mechanism import AppliedForce, JointHardware, Mechanism
+from dolfinopt.multibody.machine import exponential, roll_pitch_yaw, skew
+from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
+from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
 
-pytestmark = pytest.mark.serial  # one rank shows all there is
-
-COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
-# Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
-HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
 ROUNDING = 1e-12
 
@@ -76,14 +79,6 @@ class Machine:
         return linearise(self.mechanism, motion, *rates, keep, rigid)
 
 
-def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
-    """Return a chain of random clouds with payload and gravity in both directions."""
-    clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
-    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms] * bent]
-    stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
-    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
-
-
 def given(mechanism: Mechanism) -> tuple[AppliedForce, ...]:
     """Return forces of the world and the arm on every interface, two together at the end."""
     every = [(i, s) for i, c in enumerate(mechanism.constants) for s in range(len(c.points))]
@@ -104,7 +99,7 @@ def machine_of(kind: str, count: int = 4) -> Machine:
             bodies = tuple(stiffened(rng, b) if b.num_modes else b for b in mechanism.bodies)
             mechanism = replace(mechanism, bodies=bodies)
     else:
-        model = chain(rng, int(arms[0]), bent)
+        model = random_chain(rng, int(arms[0]), bent)
         mechanism = model.mechanism()
     size = mechanism.num_rigid + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
@@ -123,6 +118,7 @@ def machine(request) -> Machine:
     return machine_of(request.param)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("kind", OF_POINTS)
 def test_forces_are_those_of_the_points(kind: str) -> None:
     """Lagrange's equations in the plane, Newton's law for every point in space."""
@@ -136,6 +132,7 @@ def test_forces_are_those_of_the_points(kind: str) -> None:
     assert_close(alone, found[:, one.rigid :], ROUNDING)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("in_world", [True, False])
 @pytest.mark.parametrize("kind", ["3 arms", "3 arms, stiffened", "tree, stiffened"])
 def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
@@ -156,6 +153,7 @@ def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
     assert_close(np.hstack([drives, rows]), expected, ROUNDING)
 
 
+@pytest.mark.serial
 def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
     """Dense, by parts and from both sides, whatever rigid and elastic coordinates are asked for."""
     states, R = machine.states, machine.rigid
@@ -190,6 +188,7 @@ def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
         assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("kind", KINDS)
 def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
     """The same as of all at once."""
@@ -202,6 +201,7 @@ def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
     assert_close(parts.drives, whole.drives, ROUNDING)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("name", CONSTANTS)
 def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
     """Virtual work of rows and drives by every integral of every body."""
@@ -221,6 +221,7 @@ def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
         assert_close(found, derivative(work, 2e-3), DIFFERENCES, 10.0 * np.abs(weights).sum())
 
 
+@pytest.mark.serial
 def test_end_effector(machine: Machine) -> None:
     """Its place, the deviation from the rigid machine, and derivatives by all they depend on."""
     mechanism, rng = machine.mechanism, np.random.default_rng(9)
@@ -259,6 +260,7 @@ def test_end_effector(machine: Machine) -> None:
             assert_close(np.sum(gradient * change), derivative(moved), DIFFERENCES, 10.0)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("kind", ["2 arms, stiffened", "tree"])
 def test_few_instants_are_those_of_many(kind: str, count: int) -> None:
@@ -282,6 +284,7 @@ def test_few_instants_are_those_of_many(kind: str, count: int) -> None:
         assert_close(few, whole, ROUNDING, max(1.0, np.abs(whole).max(initial=0.0)))
 
 
+@pytest.mark.serial
 def test_few_instants_do_not_depend_on_memory() -> None:
     """The same bits wherever the arrays lie; NumPy 1.24 multiplies short complex arrays two ways.
 
@@ -310,3 +313,137 @@ def test_few_instants_do_not_depend_on_memory() -> None:
             ]
             found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
         assert len(found) == 1
+
+
+# -- inertia shape integrals: rigid figures in closed form, modes by brute-force quadrature  ------
+
+
+COMM = MPI.COMM_WORLD
+LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.01  # m
+YOUNG, DENSITY = 70e9, 2700.0  # Pa, kg/m3
+DAMPING = 2e-4  # s
+REDUCTORS = {"craig-bampton": craig_bampton, "modal": modal}
+# Sums over some dozens of cells; measured: 1e-15.
+
+
+def uneven(place):
+    """Densities in [0, 1] without structure, the same on any number of ranks."""
+    place = np.round(place, 9)
+    return 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
+
+
+@pytest.fixture(scope="module")
+def uneven_arm():
+    arm = substructure((LENGTH, HEIGHT, THICKNESS), (10, 3), COMM)
+    x = uneven(arm.mesh.centroid)
+    return arm.at(YOUNG * x**3, DENSITY * x)
+
+
+def quadrature(arm, x, V):
+    """Return the integrals by 3 x 3 Gauss points a cell of the bilinear fields, one by one."""
+    points = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
+    weights = np.array([5.0, 8.0, 5.0]) / 18.0
+    S = np.array([[0.0, -1.0], [1.0, 0.0]])
+    q = V.shape[2]
+    m, c, J = 0.0, np.zeros(2), 0.0
+    C, j, r = np.zeros((2, q)), np.zeros(q), np.zeros(q)
+    M, G = np.zeros((q, q)), np.zeros((q, q))
+    for nodes, density in zip(arm.operators.cells, DENSITY * x):
+        corners, modes = arm.points[nodes], V[nodes]
+        area = abs(np.linalg.det([corners[1] - corners[0], corners[2] - corners[0]]))
+        for a, wa in zip(points, weights):
+            for b, wb in zip(points, weights):
+                shape = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+                dm = wa * wb * area * THICKNESS * density
+                X, Phi = shape @ corners, np.tensordot(shape, modes, 1)
+                m, c, J = m + dm, c + dm * X, J + dm * X @ X
+                C += dm * Phi
+                j += dm * X @ Phi
+                r += dm * (S @ X) @ Phi
+                M += dm * Phi.T @ Phi
+                G += dm * Phi.T @ (S @ Phi)
+    parts = (m, c, J, C, j, r, M, G)
+    return [arm.comm.allreduce(part) for part in parts]
+
+
+@pytest.mark.parametrize("method", sorted(REDUCTORS))
+def test_integrals_of_modes_by_quadrature(uneven_arm, method):
+    arm = uneven_arm
+    basis = REDUCTORS[method](arm, Options(6))
+    body = shape_integrals(arm, basis, DAMPING)
+    names = ("mass", "moment", "inertia", "C", "j", "r", "M", "G")
+    for name, expected in zip(names, quadrature(arm, uneven(arm.mesh.centroid), basis.V)):
+        scale = np.abs(expected).max()
+        assert np.abs(getattr(body, name) - expected).max() < ROUNDING * scale, name
+    assert np.array_equal(body.G, -body.G.T)
+    assert np.array_equal(body.M, body.M.T)
+    assert np.linalg.eigvalsh(body.M)[0] > 0.0
+    assert np.array_equal(body.K, basis.stiffness)
+    assert np.array_equal(body.D, DAMPING * basis.stiffness)
+    assert np.array_equal(body.outboard, basis.outboard)
+
+
+def test_modes_give_the_first_frequency_of_the_body(uneven_arm):
+    body = shape_integrals(uneven_arm, modal(uneven_arm, Options(2)), DAMPING)
+    values = np.sqrt(np.diag(body.K)) / (2.0 * np.pi)
+    # Modes are orthonormal in M to 1e-12.
+    assert body.first_frequency == pytest.approx(values[0], rel=1e-11)
+    # Every other basis gives an upper bound.
+    for q in (3, 4, 8):
+        body = shape_integrals(uneven_arm, craig_bampton(uneven_arm, Options(q)), DAMPING)
+        assert body.first_frequency > values[0] * (1.0 - 1e-11)
+    assert body.first_frequency == pytest.approx(values[0], rel=1e-5)  # measured: 3e-7
+
+
+# -- rotations in space  --------------------------------------------------------------------------
+
+
+# rad: on both sides of where the series takes more terms (1) and where sine and cosine take over
+# (3.16); 31 and 60 are five and nearly ten turns.
+@pytest.mark.serial
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5, 0.9999, 2.5, 3.15, 3.17, 6.0, 31.0, 60.0, 100.0])
+def test_rotation_vector(size):
+    """Against the matrix exponential, and derivatives of it by complex steps, to rounding."""
+    rng = np.random.default_rng(0)
+    theta, v, a, M = rng.normal(size=(4, 5, 3))
+    theta *= size / np.linalg.norm(theta, axis=1)[:, None]
+    exact = np.stack([expm(skew(x)) for x in theta], axis=2)
+    assert np.abs(exponential(theta) - exact.transpose(2, 0, 1)).max() < ROUNDING
+    theta, v, a, M = theta.T, v.T, a.T, M.T
+    one = SpaceTurning(theta, v, a)
+    assert np.abs(one.R - exact).max() < ROUNDING
+    rate = complex_derivative(lambda h: SpaceTurning(theta + h * v, v, a).R)  # R' = w~ R
+    turned = np.einsum("nij,jkn->ikn", skew(one.velocity.T), one.R)
+    assert np.abs(rate - turned).max() < ROUNDING
+    turned = complex_derivative(lambda h: SpaceTurning(theta + h * v, v + h * a, a).velocity)
+    assert np.abs(turned - one.acceleration).max() < ROUNDING
+    units = np.eye(3)[:, :, None]
+
+    def columns(function):
+        return np.stack([complex_derivative(lambda h, e=e: function(h * e)) for e in units], axis=1)
+
+    pairs = (
+        (lambda e: SpaceTurning(theta + e, v, a).velocity, one.by_theta(v)),
+        (lambda e: SpaceTurning(theta + e, v, a).acceleration, one.acceleration_by_theta),
+        (lambda e: SpaceTurning(theta, v + e, a).acceleration, one.acceleration_by_rate),
+        (lambda e: SpaceTurning(theta, v, a + e).acceleration, one.J),
+        (lambda e: SpaceTurning(theta + e, v, a).pulled(M), one.by_theta(M, -1.0)),
+    )
+    for function, expected in pairs:
+        assert np.abs(columns(function) - expected).max() < ROUNDING
+
+
+@pytest.mark.serial
+def test_small_rotations_keep_their_digits():
+    """J theta' - theta' of 1e-6 rad is 5e-7: right to all of its digits, not to 1e-16."""
+    theta, v = np.array([[1e-6], [0.0], [0.0]]), np.array([[0.0], [1.0], [0.0]])
+    one = SpaceTurning(theta, v, v)
+    assert one.velocity[2, 0] == pytest.approx(5e-7 * (1.0 - 1e-12 / 12.0), rel=1e-15)
+    assert one.by_theta(v)[2, 0, 0] == pytest.approx(0.5, rel=1e-11)
+
+
+@pytest.mark.serial
+def test_frames_of_urdf():
+    """Roll about x, then pitch about y, then yaw about z, all of them fixed axes."""
+    roll, pitch, yaw = (expm(skew(x)) for x in np.diag([0.3, -0.4, 0.5]))
+    assert np.abs(roll_pitch_yaw((0.3, -0.4, 0.5)) - yaw @ pitch @ roll).max() < ROUNDING

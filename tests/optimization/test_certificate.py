@@ -313,12 +313,14 @@ def test_projection_goes_on_from_where_it_is():
     assert result.certificate.further.iterations == 3
 
 
-def test_finished_run_is_judged_later(shared_tmp_path):
-    """--resume of a finished run adds what was not asked for before, and interrupts nothing."""
-    asked = "optimizer.exact_iterations=4"
-    whole = do.optimize(quick(LIGHT, asked, iterations=3))
-    do.optimize(quick(LIGHT, iterations=3), shared_tmp_path)
-    later = do.optimize(quick(LIGHT, asked, iterations=3), shared_tmp_path, resume=True)
+@pytest.mark.parametrize("before", ["optimizer.exact_iterations=0", "optimizer.max_iterations=2"])
+def test_finished_run_is_judged_later(shared_tmp_path, before):
+    """--resume adds what was not asked for before; iterations of another design do not count."""
+    asked = quick(LIGHT, "optimizer.exact_iterations=3", iterations=3)
+    whole = do.optimize(asked)
+    changed = (LIGHT, "optimizer.exact_iterations=3", "optimizer.max_iterations=3", before)
+    do.optimize(quick(*changed), shared_tmp_path)
+    later = do.optimize(asked, shared_tmp_path, resume=True)
     assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
     assert_same_bits(later, whole)
 
@@ -365,14 +367,6 @@ def test_interrupted_further_iterations_go_on(shared_tmp_path, monkeypatch, kept
     again = do.optimize(asked, shared_tmp_path, resume=True)
     assert replace(again.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
     assert_same_bits(again, whole)
-
-
-def test_further_iterations_of_another_design_do_not_count(shared_tmp_path):
-    asked = "optimizer.exact_iterations=2"
-    whole = do.optimize(quick(LIGHT, asked, iterations=2))
-    do.optimize(quick(LIGHT, asked, iterations=1), shared_tmp_path)
-    later = do.optimize(quick(LIGHT, asked, iterations=2), shared_tmp_path, resume=True)
-    assert replace(later.certificate, seconds=0.0) == replace(whole.certificate, seconds=0.0)
 
 
 def test_summary_and_screen(shared_tmp_path):

@@ -17,7 +17,6 @@ from runs import (
     overrides,
     run,
     scene,
-    shell,
 )
 
 import dolfinopt as do
@@ -270,42 +269,21 @@ def test_sigkill_and_resume(tmp_path):
     changes = [*QUICK, "arms.cells=[24,3]", "optimizer.max_iterations=20"]
     line = ["optimize", TWO_ARM, *overrides(*changes), "--no-plots", "--out"]
     run(*line, tmp_path / "whole")
-    for rows in (1, 6):
-        folder = tmp_path / str(rows)
-        process = subprocess.Popen(command(*line, folder), env=environment())
-        deadline = time.monotonic() + 60.0
-        while rows_of(folder) < rows and time.monotonic() < deadline:
-            time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL  # it was still at work
-        run(*line, folder, "--resume")
-        with np.load(tmp_path / "whole" / "design.npz") as a, np.load(folder / "design.npz") as b:
-            assert a.files == b.files
-            for key in a.files:
-                np.testing.assert_array_equal(a[key], b[key])
+    folder = tmp_path / "killed"
+    process = subprocess.Popen(command(*line, folder), env=environment())
+    deadline = time.monotonic() + 60.0
+    while rows_of(folder) < 4 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL  # it was still at work
+    run(*line, folder, "--resume")
+    with np.load(tmp_path / "whole" / "design.npz") as a, np.load(folder / "design.npz") as b:
+        assert a.files == b.files
+        for key in a.files:
+            np.testing.assert_array_equal(a[key], b[key])
 
 
 def test_damaged_checkpoint(shared_tmp_path):
     by_root(lambda: (shared_tmp_path / checkpoint.NAME).write_bytes(b"PK\x03\x04 no archive"))
     with pytest.raises(do.InputError, match="cannot read this checkpoint"):
         do.optimize(small(), shared_tmp_path, resume=True)
-
-
-@pytest.mark.serial
-@pytest.mark.slow
-def test_same_design_on_any_number_of_ranks(tmp_path):
-    """One rank, and three of which one has no arm: sums run in the arms' order."""
-    designs = []
-    for ranks in (1, 3):
-        folder = tmp_path / str(ranks)
-        line = ["optimize", TWO_ARM, "--no-plots", "--out", folder]
-        line += overrides(*SMALLEST, "optimizer.max_iterations=2")
-        if ranks == 1:
-            run(*line)
-        else:
-            assert shell(*line, ranks=ranks).returncode == 0
-        with np.load(folder / "design.npz") as data:
-            keys = [key for key in data.files if key != "units"]
-            designs.append(np.concatenate([data[key].ravel() for key in keys]))
-    for other in designs[1:]:
-        np.testing.assert_array_equal(other, designs[0])

@@ -14,7 +14,6 @@ from runs import scene
 import dolfinopt as do
 from dolfinopt.arms.arm import build_arms
 from dolfinopt.arms.modes import buckling_modes
-from dolfinopt.errors import InputError
 from dolfinopt.fem.stress import Prestress, StressedModulus
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -230,8 +229,3 @@ def test_what_it_costs_and_that_others_pay_nothing():
         counts.append((before.eigenproblems, built.profile.counts.solves - before.solves))
     assert counts[0][0] == 0 < counts[1][0] <= 48
     assert counts[1][1] <= counts[0][1] + 2
-
-
-def test_reductions_without_adjoint_are_refused():
-    with pytest.raises(InputError, match=r"reduction\.method.*constraints\.buckling"):
-        build("constraints.buckling=1.5", "reduction.method=balanced", "objective.gradient=esl")

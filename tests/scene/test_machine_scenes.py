@@ -1,42 +1,88 @@
 """Control, closed loops and soft joints in a scene: what cannot be combined is refused."""
 
+import copy
 import os
+import re
+from typing import Any
 
 import numpy as np
 import pytest
-from machines import CRANK, ROD, controlled, fork, loop, two_arm
+from loops import BOOM_TABLE, boom, closed, four_bar
+from machines import CRANK, ROD, controlled, fork, loop, loop_tree, two_arm, with_keys
 from mpi4py import MPI
 from remainders import built_of
-from runs import ROOT, TWO_ARM, refusal, refused
+from runs import ROOT, TWO_ARM, refusal, refused, scene
+from scenes import put_at
 
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
+from dolfinopt.multibody.machine import loops_of
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 
 pytestmark = pytest.mark.serial
+POLES, EFFORT = "constraints.damping_ratio=0.05", "objective.kind=effort"
+KEPT = "constraints.deviation=9"
+BALANCED, ALPHA = "reduction.method=balanced", "simulation.integrator=generalized-alpha"
+ESL = "objective.gradient=esl"
+
+
+# What is wrong of the two-arm machine under control, key and value that are shown, remedy.
+CONTROLLED = [
+    ("control.stiffness=[1, 2]", "control.stiffness = [1, 2]", "3 numbers, for cart, arm1"),
+    ("control.damping=[1]", "control.damping = [1]", "3 numbers, for cart, arm1, arm2"),
+    ("control.limits=[1, 2]", "control.limits = [1, 2]", "3 numbers, for cart, arm1, arm2"),
+    ("control.limits=[1, 2, 0]", "control.limits = [1, 2, 0]", "1e-09"),
+    ("control.stiffness=[1, 2, -3]", "control.stiffness = [1, 2, -3]", ">= 0"),
+    ("control.feed_forward=flexible", 'feed_forward = "flexible"', '"rigid" | "elastic"'),
+    ("control.feed_forward=elastic", 'feed_forward = "elastic"', "gear_stiffness"),
+    ("arms.joint_damping=3", "arms.0.joint_damping", "without arms.joint_stiffness"),
+    ("arms.gear_damping=3", "arms.0.gear_damping", "without arms.gear_stiffness"),
+    ("arms.friction=[-1, 0]", "arms.0.friction", "two numbers >= 0"),
+    ("arms.bearing_stiffness=[0, 0, 1e6, 0, 0, 0]", "arms.0.bearing_stiffness", "along z"),
+    ("arms.bearing_stiffness=[0, 0, 0, 0, 1e6, inf]", "arms.0.bearing_stiffness", "about y"),
+    ("control.forces=nothing.csv", 'forces = "nothing.csv"', "the path of a file"),
+    ("control.gain=3", "control.gain", "unknown key"),
+    ("closure.kind=slider", 'motion.base = "cart"', '"fixed" with [closure]'),
+    ("constraints.damping_below=10.0", "damping_below = 10.0", "without constraints.damping_ratio"),
+    (POLES, "constraints.poles_at=[0.5,9.0]", "constraints.poles_at", "motion.horizon"),
+    ("constraints.damping_ratio=1.5", "damping_ratio = 1.5", "<= 0.99"),
+    ("objective.kind=pole_frequency", "control.stiffness=[1,1]", "control.stiffness", "3 numbers"),
+]
+# The same without control.
+PRESCRIBED = [
+    (POLES, "constraints.damping_ratio = 0.05", "[control]"),
+    ("constraints.peak_force=[9.0]", "constraints.peak_force", "3 numbers, for cart, arm1, arm2"),
+    (BALANCED, "constraints.effort=9", "reduction.method", "effort"),
+    (EFFORT, KEPT, "objective.effort_weights=[1.0]", "effort_weights", "3 numbers, for cart, arm1"),
+    (EFFORT, KEPT, "objective.effort_weights=[0.0,0.0,0.0]", "effort_weights", "not all of them 0"),
+    (EFFORT, KEPT, BALANCED, 'objective.kind = "effort"', '"craig-bampton"'),
+    (EFFORT, KEPT, ALPHA, 'objective.kind = "effort"', '"radau"'),
+    # Without a limit of what arms do none of them would be left.
+    (EFFORT, "constraints={mass=3.0}", 'kind = "effort"', "limit under [constraints]"),
+    ("objective.kind=peak_force", "constraints={mass=3.0}", "peak_force", "[constraints]"),
+    ("constraints.peak_force=[inf,inf,inf]", "peak_force", "one drive at least"),
+    ("constraints.peak_force=[inf,1.0]", "peak_force", "3 numbers"),
+    ("constraints.buckling=1.5", BALANCED, ESL, "reduction.method", "constraints.buckling"),
+    (BALANCED, "optimizer.exact_iterations=1", "reduction.method", "exact_iterations"),
+    (ALPHA, "optimizer.exact_iterations=1", "simulation.integrator", "exact_iterations"),
+    *((f"constraints.stiffness=[{one}]", *words) for one, *words in (
+        ("{arm='arm3', moment=1.0, rotation=1.0}", "stiffness.0.arm", '"arm3"', "arm1, arm2"),
+        ("{arm='arm1', moment=1.0}", "stiffness.0", "displacement or rotation"),
+        ("{arm='arm1', rotation=1.0}", "stiffness.0", "force or moment"),
+        ("{arm='arm1', force=[1.0,0.0,0.0], rotation=1.0}", "stiffness.0", "two components"),
+        ("{arm='arm1', moment=1.0, rotatoin=1.0}", "rotatoin", "stiffness.0.rotation"),
+        ("", "stiffness = []", "[[constraints.stiffness]]"))),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("change", "shown", "allowed"),
-    [
-        ("control.stiffness=[1, 2]", "control.stiffness = [1, 2]", "3 numbers, for cart, arm1"),
-        ("control.damping=[1]", "control.damping = [1]", "3 numbers, for cart, arm1, arm2"),
-        ("control.limits=[1, 2]", "control.limits = [1, 2]", "3 numbers, for cart, arm1, arm2"),
-        ("control.limits=[1, 2, 0]", "control.limits = [1, 2, 0]", "1e-09"),
-        ("control.stiffness=[1, 2, -3]", "control.stiffness = [1, 2, -3]", ">= 0"),
-        ("control.feed_forward=flexible", 'feed_forward = "flexible"', '"rigid" | "elastic"'),
-        ("control.feed_forward=elastic", 'feed_forward = "elastic"', "gear_stiffness"),
-        ("arms.joint_damping=3", "arms.0.joint_damping", "without arms.joint_stiffness"),
-        ("arms.gear_damping=3", "arms.0.gear_damping", "without arms.gear_stiffness"),
-        ("arms.friction=[-1, 0]", "arms.0.friction", "two numbers >= 0"),
-        ("arms.bearing_stiffness=[0, 0, 1e6, 0, 0, 0]", "arms.0.bearing_stiffness", "along z"),
-        ("arms.bearing_stiffness=[0, 0, 0, 0, 1e6, inf]", "arms.0.bearing_stiffness", "about y"),
-        ("control.forces=nothing.csv", 'forces = "nothing.csv"', "the path of a file"),
-        ("control.gain=3", "control.gain", "unknown key"),
-        ("closure.kind=slider", 'motion.base = "cart"', '"fixed" with [closure]'),
-    ],
+    ("make", "told"),
+    [*((controlled, one) for one in CONTROLLED), *((scene, one) for one in PRESCRIBED)],
+    ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
 )
-def test_controlled_machines_that_cannot_be(change, shown, allowed):
-    refusal(lambda: controlled(change), str(TWO_ARM), shown, allowed)
+def test_two_arms_that_cannot_be(make, told):
+    """Changes are "key=value", words of the message are not."""
+    changes = [one for one in told if re.match(r"[a-z_.]+=", one)]
+    refusal(lambda: make(*changes), str(TWO_ARM), *told[len(changes) :])
 
 
 STEPPED = {"simulation": {"integrator": "generalized-alpha"},
@@ -69,6 +115,9 @@ STEPPED = {"simulation": {"integrator": "generalized-alpha"},
         ("slider", {"arms": [CRANK | {"joint_stiffness": 1.0, "gear_stiffness": 1.0}, ROD]},
          ["arms.0.joint_stiffness (crank) = 1.0", "only one of"]),
         # Where it cannot be assembled the instant is named.
+        ("slider", {"control": {"stiffness": [2e3], "damping": [20.0]},
+                    "constraints": {"pole_frequency": 3.0}},
+         ["constraints.pole_frequency", "closure"]),
         ("slider", {"closure": {"point": [0.0, 1.0]}}, ["closure: at t = 0 s", "across the line"]),
         ("slider", {"closure": {"point": [0.0, 0.25]}}, ["closure: at t = 0.", "across the line"]),
         ("pin", {"closure": {"point": [1.25, 0.0]}}, ["closure: at t = ", "the arms' lengths"]),
@@ -177,3 +226,122 @@ def test_tables_of_applied_forces_need_time_and_columns(tmp_path):
 def test_a_wrong_interface_of_a_force_is_told_before_that_the_right_one_is_idle():
     with refused("forces.0.interface", "nose", "lug"):
         load_scene(ROOT / "demos" / "lifting_arm.toml", ('forces.0.interface="nose"',))
+
+
+# -- [[closures]]: what they state, and what is refused  ------------------------------------------
+
+
+TURN = "t,turn\n0,0.5\n1,1.0\n"
+
+
+def changed(tree: dict, path: tuple[Any, ...], value: Any) -> dict:
+    """Return a scene with another value at a path; None takes it away."""
+    new = copy.deepcopy(tree)
+    put_at(new, path, value)
+    return new
+
+
+def test_coordinates_and_drives(tmp_path):
+    """Rods whose length changes are coordinates behind the joints; passive joints have no drive."""
+    scene = closed(tmp_path, BOOM_TABLE, boom())
+    assert scene.driven == ("slew", "cylinder")
+    assert scene.rigid_units == {"slew": "rad", "luff": "rad", "cylinder": "m"}
+    assert scene.driven_columns == [0, 2] and scene.num_rigid == 3
+    assert scene.used_interfaces == {(1, 0), (0, 1), (0, 2), (1, 1)}
+    rigid = closed(tmp_path, "t,slew\n0,0\n1,1\n", changed(boom(), ("closures", 0, "length"), 1.0))
+    assert rigid.driven == ("slew",) and rigid.num_rigid == 2
+    other = ["closures.cylinder.stiffness=1e6", "joints.luff.passive=true"]
+    soft = load_from(tmp_path, boom(), other)
+    assert soft.closures[0].is_spring
+
+
+def load_from(folder, tree, overrides):
+    (folder / "boom.csv").write_text(BOOM_TABLE)
+    motion = {"path": "joints", "file": "boom.csv"}
+    data = with_keys({"material": {"name": "steel S235"}}, tree)
+    return scene_from_dict(with_keys(data, {"motion": motion}), str(folder / "a.toml"), overrides)
+
+
+@pytest.mark.parametrize(
+    ("keys", "count"),
+    [
+        ({"kind": "ball"}, 3),
+        ({"kind": "pin", "axis": [0, 0, 2]}, 5),
+        ({"kind": "slider", "axis": [1, 1, 0]}, 5),
+        ({"kind": "universal", "axis": [0, 0, 1], "cross_axis": [1, 0, 0]}, 4),
+        ({"kind": "rod", "length": 0.1}, 1),
+    ],
+)
+def test_kinds(tmp_path, keys, count):
+    """As many equations as the field has, all of them zero where both frames are the same."""
+    one = {"name": "foot", "between": ["rocker", "crank"]} | keys
+    loops = loops_of(closed(tmp_path, TURN, with_keys(four_bar(), {"closures": [one]})))
+    assert loops is not None and len(loops.given) == count
+    assert np.isfinite(loops.lengths).all()
+
+
+def in_plane(kind: str, **keys: Any) -> dict:
+    """Return the plane slider-crank or four-bar that states its loop as [[closures]]."""
+    tree = {key: value for key, value in loop_tree(kind).items() if key != "closure"}
+    one = {"name": "end", "kind": kind, "between": [tree["arms"][-1]["name"], "ground"]}
+    return tree | {"closures": [one | keys]}
+
+
+def test_the_plane_has_closures_that_are_its_closure():
+    found = scene_from_dict(in_plane("slider", axis=[2.0, 0.0, 0.0]))
+    assert found == loop("slider", closure={"direction": [2.0, 0.0]}) and not found.closures
+    found = scene_from_dict(in_plane("pin", point=[0.25, 0.0, 0.0], side=-1))
+    assert found == loop("pin")
+    up = {"axis": [0, 0, 1]}
+    for keys in ({"point": [0.2, 0.0, 0.1]}, {"axis": [1, 0, 0]}, {"between": ["crank", "ground"]}):
+        with refused("closures.0.kind", "the last arm and the ground", "[[joints]]"):
+            scene_from_dict(in_plane("pin", **(up | keys)))
+
+
+CLOSURE = ("closures", 0)
+REFUSED = [
+    ((*CLOSURE, "kind"), "hinge", ("closures.0.kind", '"ball"')),
+    ((*CLOSURE, "axis"), None, ("closures.0.axis", "pin")),
+    ((*CLOSURE, "axis"), [0, 0, 0], ("closures.0.axis", "length zero")),
+    ((*CLOSURE, "cross_axis"), [1, 0, 0], ("closures.0.cross_axis", "closures.kind")),
+    ((*CLOSURE, "length"), 0.2, ("closures.0.length", "none", "closures.kind")),
+    ((*CLOSURE, "stiffness"), 1e5, ("closures.0.stiffness", "closures.kind")),
+    ((*CLOSURE, "side"), -1, ("closures.0.side", "motion.initial_joints")),
+    ((*CLOSURE, "name"), "knee", ("closures.0.name", "no joint or other closure")),
+    ((*CLOSURE, "name"), "t", ("closures.0.name", "the time")),
+    ((*CLOSURE, "between"), ["rocker.tip", "ground"], ("closures.0.between", '"outboard"')),
+    ((*CLOSURE, "between"), ["ground", "rocker"], ("closures.0.between", '"crank.outboard"')),
+    ((*CLOSURE, "between"), ["rocker", "wall"], ("closures.0.between", '"ground"')),
+    ((*CLOSURE, "between"), ["rocker", "rocker"], ("closures.0.between", "two arms")),
+    (("closures",), [], ("joints.1.passive", "[[closures]]")),
+    (("joints", 0, "passive"), True, ("joints.0.passive", "driven")),
+    (("simulation", "integrator"), "generalized-alpha", ("simulation.integrator", '"radau"')),
+    (("motion", "initial_joints"), [0.1], ("motion.initial_joints", "3 numbers")),
+    (("objective", "kind"), "eigenfrequency", ("objective.attached", '"none"')),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("path", "value", "words"), REFUSED)
+def test_refused(tmp_path, path, value, words):
+    with refused("scene.toml", *words):
+        closed(tmp_path, TURN, changed(four_bar(), path, value))
+
+
+def test_refused_with_others(tmp_path):
+    """A spring under control, a universal joint of one direction, closures in the plane."""
+    spring = changed(boom(), (*CLOSURE, "stiffness"), 1e6)
+    with refused("closures.0.stiffness", "[control]"):
+        gains = {"stiffness": [1e5, 1e7], "damping": [1e3, 1e5]}
+        closed(tmp_path, BOOM_TABLE, spring, control=gains)
+    cross = {"kind": "universal", "axis": [0, 0, 1], "cross_axis": [0, 0.1, 1]}
+    one = four_bar()["closures"][0] | cross
+    with refused("closures.0.cross_axis", "across"):
+        closed(tmp_path, TURN, with_keys(four_bar(), {"closures": [one]}))
+    tree = load_scene(TWO_ARM).to_tree()
+    end = {"name": "end", "kind": "ball", "between": ["arm2", "ground"]}
+    with refused("closures.0.kind", "one pin or slider", "[[joints]]"):
+        scene_from_dict(tree | {"closures": [end]})
+    with refused("motion.initial_joints", "[[closures]]"):
+        tree = four_bar()
+        joints = [{k: v for k, v in one.items() if k != "passive"} for one in tree["joints"]]
+        closed(tmp_path, TURN, with_keys(tree, {"joints": joints, "closures": []}))

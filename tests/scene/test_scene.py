@@ -119,7 +119,7 @@ def test_round_trip_through_json():
 )  # fmt: skip
 def test_borders_of_the_ranges_are_allowed(paths, value):
     for data in [changed(path, value) for path in paths.split()] or [minimal(**value)]:
-        scene_from_dict(data, overrides=["arms.passive=0"])
+        assert isinstance(scene_from_dict(data, overrides=["arms.passive=0"]), Scene)
 
 
 def test_reducible_dofs():
@@ -468,8 +468,7 @@ def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
     tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    # In files of their own: test_regions, test_joints, test_machine_scenes, test_stiffness,
-    # test_inp.
+    # In files of their own: test_regions, test_joints, test_machine_scenes, test_inp.
     elsewhere = ("arms.regions", "control", "closure", "joints", "forces", "arms.interfaces",
                  "arms.inboard_bore", "arms.outboard_bore", "arms.mesh_scale",
                  "constraints.stiffness.")  # fmt: skip
