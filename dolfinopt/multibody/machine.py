@@ -9,7 +9,6 @@ import numpy as np
 
 from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
-from dolfinopt.multibody.dimension import series
 from dolfinopt.multibody.mechanism import (
     GROUND,
     Friction,
@@ -103,13 +102,6 @@ def skew(v: np.ndarray) -> np.ndarray:
 def times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return A v (n, 3) of matrices (n, 3, 3), or one (3, 3), and vectors (n, 3)."""
     return v @ A.T if A.ndim == 2 else np.einsum("nij,nj->ni", A, v)
-
-
-def exponential(theta: np.ndarray) -> np.ndarray:
-    """Return R (..., 3, 3) of rotation vectors (..., 3)."""
-    c = series((theta * theta).sum(axis=-1), 3)
-    A = skew(theta)
-    return ONE + c[1][..., None, None] * A + c[2][..., None, None] * (A @ A)
 
 
 def about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from dolfinopt.multibody.machine import (
     GROUND,
     Joint,
-    exponential,
     skew,
     spatial_mechanism,
 )
@@ -393,7 +393,12 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     joints = []
     for kind, parent, coordinate, rotor, *interface in kinds:
         axis, origin, turn = rng.normal(size=(3, 3))
-        place = axis / np.linalg.norm(axis), 0.3 * origin, exponential(turn), rotor
+        place = (
+            axis / np.linalg.norm(axis),
+            0.3 * origin,
+            Rotation.from_rotvec(turn).as_matrix(),
+            rotor,
+        )
         joints.append(Joint("joint", kind, parent, coordinate, *place, *interface))
     loads = {site: random_cloud(rng, 0, 3) for site in sorted({(1, 0), (1, last), (3, 0), (4, 0)})}
     clouds = rigid, fork, *outer, rigid
