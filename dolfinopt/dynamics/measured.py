@@ -68,6 +68,9 @@ DENSE_COORDINATES_LIMIT = 24
 # The same of matrices whose tangent is held over a step, which cost a tenth.
 HELD_COORDINATES_LIMIT = 48
 EXACT_COORDINATES_LIMIT = 12  # up to so many the exact matrix costs less than more iterations
+# Of the tolerance, that Newton's method may leave when the error is estimated: where that is above
+# the tolerance, the steps are refined at once. What is left moves the estimate by less than 1e-3.
+NEWTON_ROUGH_SHARE = 1e-4
 NEWTON_ROUNDING_ERROR = 1e-9  # relative steps and errors below it that do not fall are rounding
 # Step below which a poor contraction is blamed on the matrix, no more on the nonlinearity.
 NEWTON_SETTLED_STEP = 0.01

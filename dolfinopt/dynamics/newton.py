@@ -34,6 +34,7 @@ from dolfinopt.dynamics.measured import (
     FACTORS_BYTES,
     HELD_COORDINATES_LIMIT,
     INVERTED_MATRICES_CHUNK,
+    NEWTON_ROUGH_SHARE,
     NEWTON_ROUNDING_ERROR,
     NEWTON_SETTLED_STEP,
     SLOW_ANGLES,
@@ -409,12 +410,14 @@ class Iterate:
         converged: (runs,).
         rate: (runs,) worst contraction seen, inf of one that diverges.
         iterations: (runs,).
+        errors: (runs,) estimated errors of the steps, if they are known already.
     """
 
     a: np.ndarray
     converged: np.ndarray
     rate: np.ndarray
     iterations: np.ndarray
+    errors: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,8 +443,8 @@ def newton(
     a: np.ndarray,
     tolerance: float,
     tuning: Tuning = ONE_RUN,
-    *,
     simplified: bool = True,
+    stop: Callable[[np.ndarray], bool] | None = None,
 ) -> Iterate:
     """Solve the residual of all stages of one run = 0 by Newton's method, damped on the residual.
 
@@ -456,8 +459,10 @@ def newton(
         tolerance: relative error of the coordinates that is asked for.
         tuning: see there.
         simplified: whether to begin with the simplified matrix.
+        stop: asked once, about accelerations that leave `NEWTON_ROUGH_SHARE` of the tolerance,
+            whether they will do.
     """
-    run = _Run(stages, state, a, tolerance, tuning, simplified)
+    run = _Run(stages, state, a, tolerance, tuning, simplified, stop)
     for _ in range(tuning.matrices):
         if len(windows(stages, run.slow)) > 1:
             break  # no room for a matrix of all steps
@@ -506,8 +511,10 @@ class _Run:
         tolerance: float,
         tuning: Tuning,
         simplified: bool,
+        stop: Callable[[np.ndarray], bool] | None,
     ) -> None:
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
+        self.stop = stop
         # Of few coordinates the exact matrix costs less than the iterations that it saves, if it is
         # made near the solution.
         few = a.shape[2] <= EXACT_COORDINATES_LIMIT and bool(a.any())
@@ -516,7 +523,8 @@ class _Run:
         limits = tuning.limits[-1:] if few else tuning.limits
         self.slow, self.limits = next_slow_coordinates(stages, limits, 0, most)
         self.at = _point(stages, state, a)
-        self.before, self.norm_before = np.inf, self.at.norm[0]
+        self.before = (np.inf, np.inf)  # sizes of the last two steps, the last one first
+        self.norm_before = self.at.norm[0]
         self.converged, self.rate, self.iterations = False, 0.0, 0
 
     def with_one_matrix(self) -> bool:
@@ -532,24 +540,33 @@ class _Run:
             step, shift = matrix.solve(self.at.residual, rest)
             size = self.stages.relative(shift, self.at.q + shift)[0]
             with np.errstate(all="ignore"):  # inf / inf of what diverges
-                contraction = size / self.before
+                contraction = size / self.before[0]
                 worst = np.maximum(contraction, self.at.norm[0] / self.norm_before)
-            if np.isfinite(self.before) and np.isfinite(size):
+            if np.isfinite(self.before[0]) and np.isfinite(size):
                 self.rate = max(self.rate, float(contraction))
-            ends = _left(worst, self.tuning) * size <= self.tuning.goal * self.tolerance
-            if ends or (exact and age == 0 and size <= 1e-3 * self.tolerance):
+            left = _left(worst, self.tuning) * size / self.tolerance
+            ends = left <= self.tuning.goal or (
+                exact and age == 0 and size <= 1e-3 * self.tolerance
+            )
+            if not ends and self.stop is not None and left <= NEWTON_ROUGH_SHARE:
+                ends, self.stop = self.stop(self.at.a + step), None
+            if ends:
                 self.at = replace(self.at, a=self.at.a + step)
                 self.converged = True
                 return False
             keep = self.tuning.keep_mixed if many and mixed.serves else least
-            if (age > 0 and size > keep * self.before) or not np.isfinite(size):
+            if (age > 0 and self._is_poor(size, keep)) or not np.isfinite(size):
                 return self._after_failure(size, age, exact)
             better = mixed.step(self.at.a, step, shift) if mixed.serves else None
             if better is not None and age > 0:
                 mixed.serves = self._damped(better, 1.0)
             if (age == 0 or not mixed.serves) and not self._damped(step):
                 return self._after_failure(size, age, exact)
-            self.before, age = size, age + 1
+            self.before, age = (size, self.before[0]), age + 1
+
+    def _is_poor(self, size: float, keep: float) -> bool:
+        last, older = self.before
+        return size > (keep * last if older == np.inf else keep**2 * older)
 
     def _matrix(self) -> NewtonMatrix:
         if self.simplified:
@@ -563,7 +580,7 @@ class _Run:
         while length >= (self.tuning.shortest if shortest is None else shortest):
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
                 new = _point(self.stages, self.state, self.at.a + length * step)
-            if new.norm[0] <= (1.0 - 0.1 * length) * self.at.norm[0]:
+            if new.norm[0] <= (1.0 - 0.1 * length) * max(self.at.norm[0], self.norm_before):
                 self.at, self.norm_before = new, self.at.norm[0]
                 return True
             length *= 0.5
@@ -574,7 +591,7 @@ class _Run:
         if exact and age == 0:  # rounding, where the step is small: nothing is left to gain
             self.converged = bool(size <= max(self.tolerance, NEWTON_ROUNDING_ERROR))
             return False
-        if age == 0 or (age == 1 and self.before <= NEWTON_SETTLED_STEP):
+        if age == 0 or (age == 1 and self.before[0] <= NEWTON_SETTLED_STEP):
             if self.simplified:
                 self.simplified = False
             elif self.limits:
