@@ -851,7 +851,7 @@ def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: b
         return parts
     K, D, M = np.split(jacobian, 3, axis=2)
     for own, value in zip(parts, values, strict=True):
-        hl = (value * h)[:, None, None]
+        hl = ((value if value.imag > 1e-12 else value.real) * h)[:, None, None]
         try:
             own[:] = np.linalg.inv(M + hl * (D + hl * K))
         except np.linalg.LinAlgError:
