@@ -379,8 +379,8 @@ class Tuning:
         limits: angles w h up to which coordinates are slow, tried in turn.
         least_rate: contraction that is believed when the error left is foretold.
         keep: least contraction that keeps a simplified matrix, and one that follows the stages.
-        keep_mixed: the same as long as steps are mixed, see `_Mixed`, of a matrix that is dense in
-            more than `DENSE_COORDINATES_LIMIT` coordinates and costs as much as many steps.
+        keep_many: the same of a matrix that is dense in more than `DENSE_COORDINATES_LIMIT`
+            coordinates and costs as much as many steps.
         near: of a matrix made within this distance of the solution, a new one would be no better:
         keep_near: it is kept with this contraction.
         shortest: of a damped step, as a share of Newton's; then it has failed.
@@ -391,7 +391,7 @@ class Tuning:
     limits: tuple[float, ...] = SLOW_ANGLES
     least_rate: float = 0.01
     keep: tuple[float, float] = (0.15, 0.3)  # half of it, or twice, take as long
-    keep_mixed: float = 0.7
+    keep_many: float = 0.7
     near: float = 0.0
     keep_near: float = 0.0
     shortest: float = 1.0 / 64.0
@@ -472,34 +472,6 @@ def newton(
     return Iterate(run.at.a, *found)
 
 
-class _Mixed:
-    """Steps of one matrix, mixed so that they leave least: Anderson's acceleration.
-
-    Source: Walker & Ni (2011), doi:10.1137/10078356X, in the norm of the changes of q.
-    """
-
-    def __init__(self) -> None:
-        self.serves = True  # as long as mixed steps lower the residual
-        self._last: tuple[np.ndarray, ...] = ()  # a, its step, and the change of q
-        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []  # changes of these, orthonormal
-
-    def step(self, a: np.ndarray, step: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """Return the mixed step from an iterate a, its step and change of q, each (n, s, N)."""
-        if self._last:
-            old_a, old_step, old_shift = self._last
-            lost, moved = shift - old_shift, a - old_a + step - old_step
-            for other, other_moved in self._pairs:
-                share = np.vdot(other, lost)
-                lost, moved = lost - share * other, moved - share * other_moved
-            size = np.linalg.norm(lost)
-            if size > 0.0:
-                self._pairs.append((lost / size, moved / size))
-        self._last = a, step, shift
-        for lost, moved in self._pairs:
-            step = step - np.vdot(lost, shift) * moved
-        return step
-
-
 class _Run:
     """Newton's method at work on one run of steps."""
 
@@ -531,18 +503,23 @@ class _Run:
         """Iterate with one matrix; return whether it is worth while to go on with another."""
         exact = len(self.slow) == self.at.a.shape[2] and not self.simplified
         matrix, rest = self._matrix(), np.zeros((2, self.at.a.shape[2]))
-        least = self.tuning.keep[0 if self.simplified else 1]
-        many = len(self.slow) > DENSE_COORDINATES_LIMIT
-        self.rate, age, mixed = 0.0, 0, _Mixed()
+        keep = self.tuning.keep[0 if self.simplified else 1]
+        if len(self.slow) > DENSE_COORDINATES_LIMIT:
+            keep = self.tuning.keep_many
+        self.rate, age = 0.0, 0
         while True:
             self.iterations += 1
             spend(float(self.stages.length))
             step, shift = matrix.solve(self.at.residual, rest)
             size = self.stages.relative(shift, self.at.q + shift)[0]
             with np.errstate(all="ignore"):  # inf / inf of what diverges
-                contraction = size / self.before[0]
-                worst = np.maximum(contraction, self.at.norm[0] / self.norm_before)
-            if np.isfinite(self.before[0]) and np.isfinite(size):
+                # Over two steps, where there are two: what a step leaves in slow coordinates the
+                # next leaves in fast ones, so that every other one seems to contract poorly.
+                last, older = self.before
+                contraction = size / last
+                mean = contraction if older == np.inf else np.sqrt(size / older)
+                worst = max(contraction, mean, self.at.norm[0] / self.norm_before)
+            if np.isfinite(last) and np.isfinite(size):
                 self.rate = max(self.rate, float(contraction))
             left = _left(worst, self.tuning) * size / self.tolerance
             ends = left <= self.tuning.goal or (
@@ -554,19 +531,10 @@ class _Run:
                 self.at = replace(self.at, a=self.at.a + step)
                 self.converged = True
                 return False
-            keep = self.tuning.keep_mixed if many and mixed.serves else least
-            if (age > 0 and self._is_poor(size, keep)) or not np.isfinite(size):
+            poor = (age > 0 and mean > keep) or not np.isfinite(size)
+            if poor or not self._damped(step):
                 return self._after_failure(size, age, exact)
-            better = mixed.step(self.at.a, step, shift) if mixed.serves else None
-            if better is not None and age > 0:
-                mixed.serves = self._damped(better, 1.0)
-            if (age == 0 or not mixed.serves) and not self._damped(step):
-                return self._after_failure(size, age, exact)
-            self.before, age = (size, self.before[0]), age + 1
-
-    def _is_poor(self, size: float, keep: float) -> bool:
-        last, older = self.before
-        return size > (keep * last if older == np.inf else keep**2 * older)
+            self.before, age = (size, last), age + 1
 
     def _matrix(self) -> NewtonMatrix:
         if self.simplified:
@@ -574,13 +542,15 @@ class _Run:
             return simplified_newton_matrix(self.stages, begin, self.at.a, self.slow)
         return factorise(self.stages, self.at.q, self.at.qd, self.at.a, self.slow)
 
-    def _damped(self, step: np.ndarray, shortest: float | None = None) -> bool:
+    def _damped(self, step: np.ndarray) -> bool:
         """Take the longest step that lowers the residual; return whether there is one."""
-        length = 1.0
-        while length >= (self.tuning.shortest if shortest is None else shortest):
+        # Below the larger one of the last two, for the same reason. Source: Grippo, Lampariello &
+        # Lucidi (1986), doi:10.1137/0723046.
+        largest, length = max(self.at.norm[0], self.norm_before), 1.0
+        while length >= self.tuning.shortest:
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
                 new = _point(self.stages, self.state, self.at.a + length * step)
-            if new.norm[0] <= (1.0 - 0.1 * length) * max(self.at.norm[0], self.norm_before):
+            if new.norm[0] <= (1.0 - 0.1 * length) * largest:
                 self.at, self.norm_before = new, self.at.norm[0]
                 return True
             length *= 0.5

@@ -53,6 +53,7 @@ from dolfinopt.dynamics.measured import (
     FIRST_GRID_ERROR,
     FIRST_GRID_GROWTH_LIMIT,
     FIRST_GRID_ITERATIONS_LIMIT,
+    FIRST_REFINEMENT_ORDER,
     FIRST_REFINEMENT_RATIO,
     HELD_COORDINATES_LIMIT,
     LATER_REFINEMENT_RATIO,
@@ -213,7 +214,10 @@ def _on_few_steps(
 def _least_growth(found: Solution, before: float, coarse: int, tolerance: float) -> float:
     """Return the least growth of the steps by the order that the last refinement has shown."""
     if not before < np.inf:
-        return FIRST_REFINEMENT_RATIO
+        if found.a.shape[2] <= DENSE_COORDINATES_LIMIT:
+            return FIRST_REFINEMENT_RATIO
+        over = found.error / (RADAU_AIM_SHARE * tolerance)
+        return max(FIRST_REFINEMENT_RATIO, over ** (1.0 / FIRST_REFINEMENT_ORDER))
     growth = np.log(len(found.a) / coarse)
     order = np.log(before / found.error) / growth if growth > 0.0 else 0.0
     if order <= 0.0:
