@@ -98,8 +98,8 @@ STALLED_ERROR_RATIO = 0.9
 # is seen decides: as long as vibrations are not resolved the error falls more slowly.
 FIRST_REFINEMENT_RATIO = 1.1
 LATER_REFINEMENT_RATIO = 2.0
-# Order that the first refinement counts on with more than `DENSE_COORDINATES_LIMIT` coordinates,
-# of which a grid costs most: chains of 5 to 8 arms show 4.1 to 5.0 with four stages.
+# Order that the first refinement counts on with more than `DENSE_COORDINATES_LIMIT` slow
+# coordinates, whose grids cost most: chains of 5 to 8 arms show 4.1 to 5.0 with four stages.
 FIRST_REFINEMENT_ORDER = 4.4
 # Newton iterations times time steps, of all grids: 50 to 190 microseconds each with 8 to 20
 # coordinates; and of long motions so many iterations of their first grid.

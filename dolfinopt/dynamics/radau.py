@@ -75,6 +75,7 @@ from dolfinopt.dynamics.measured import (
     RADAU_WORK_LIMIT,
     RESTING_GROUP_SHARE,
     SHORTEST_WINDOW_STEPS,
+    SLOW_ANGLES,
     STALLED_ERROR_RATIO,
     STALLED_GRIDS_LIMIT,
     STEP_GROWTH_LIMIT,
@@ -160,7 +161,7 @@ def integrate(
             raise ConvergenceError(_lost_motion(system, guess))
         stalled = stalled + 1 if guess.error > STALLED_ERROR_RATIO * before else 0
         work -= guess.iterations * len(guess.a)
-        least = _least_growth(guess, before, coarse, tolerance)
+        least = _least_growth(preconditioner, guess, before, coarse, tolerance)
         before, coarse = guess.error, len(guess.a)
         try:
             time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages, least, most)
@@ -211,10 +212,13 @@ def _on_few_steps(
     return found
 
 
-def _least_growth(found: Solution, before: float, coarse: int, tolerance: float) -> float:
+def _least_growth(
+    preconditioner: Preconditioner, found: Solution, before: float, coarse: int, tolerance: float
+) -> float:
     """Return the least growth of the steps by the order that the last refinement has shown."""
     if not before < np.inf:
-        if found.a.shape[2] <= DENSE_COORDINATES_LIMIT:
+        angles = preconditioner.frequencies * np.median(np.diff(found.time_grid))
+        if np.count_nonzero(angles <= SLOW_ANGLES[0]) <= DENSE_COORDINATES_LIMIT:
             return FIRST_REFINEMENT_RATIO
         over = found.error / (RADAU_AIM_SHARE * tolerance)
         return max(FIRST_REFINEMENT_RATIO, over ** (1.0 / FIRST_REFINEMENT_ORDER))

@@ -10,6 +10,7 @@ the matrices of `kinematics.Passage`, which BLAS multiplies four to ten times as
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -259,13 +260,15 @@ class _Change:
 
     def passed_on(self, matrix: np.ndarray, more: _Change) -> _Change:
         """Return matrix times the derivatives, and behind them those by further coordinates."""
+        if len(self.columns) == 0:
+            return more
         old = self.values.shape[2]
         out = np.empty((*more.values.shape[:2], old + more.values.shape[2]))
         np.matmul(matrix, self.values, out=out[:, :, :old])
         out[:, :, old:] = more.values
         return _Change(np.concatenate([self.columns, more.columns]), out)
 
-    @property
+    @cached_property
     def places(self) -> np.ndarray | slice:
         """Places (3 c,) among the 3 S, as a slice where they lie side by side."""
         columns = self.columns
@@ -306,12 +309,12 @@ class _Felt:
 
     Attributes:
         by_motion: by a frame's motion (n, d + r, m).
-        by_own: by the coordinates of the body itself; None of an interface by its own motion.
+        by_own: by the coordinates of the body itself; of an interface by its own motion, none.
         by_outboard: by those outboard.
     """
 
     by_motion: np.ndarray
-    by_own: np.ndarray | None
+    by_own: np.ndarray
     by_outboard: _Change
 
 
@@ -353,20 +356,23 @@ def _outward_derivatives(tree: Mechanism, links: list[Link], places: _Places) ->
     by_cart = np.zeros((dim.d + 2 * dim.r, 3, len(on_ground), count))
     by_cart[0, 2] = 1.0
     ground = _moved_by(tree, on_ground, by_cart)
+    nothing = _moved_by(tree, on_ground[:0], none)
     moved, ends = _Moved(ground, {}, {}, {}), {(GROUND, 0): ground}
     for i in tree.order:
         link, joint, kept = links[i], tree.joints[i], places.kept[i]
-        own = places.of_joint(joint.coordinate)
-        by_joint = np.stack(link.joint.moved_by_joint, axis=1)[:, :, None] if len(own) else none
-        moved.joints[i] = _moved_by(tree, own, by_joint)
-        inner, carrier = ends[joint.parent, joint.interface], _carrier(tree, link.joint.passage)
-        moved.frames[i] = inner.passed_on(carrier, moved.joints[i])
+        by_joint, by_own = nothing, nothing
+        if len(own := places.of_joint(joint.coordinate)):
+            by_joint = _moved_by(tree, own, np.stack(link.joint.moved_by_joint, axis=1)[:, :, None])
+        moved.joints[i] = by_joint
+        inner = ends[joint.parent, joint.interface]
+        moved.frames[i] = inner.passed_on(_carrier(tree, link.joint.passage), by_joint)
         for s, interface in link.interfaces.items():
-            by_own = interface.moved_by_rates(kept) if len(kept) else none
-            moved.interfaces[i, s] = _moved_by(tree, places.of_body(i), by_own)
+            if len(kept):
+                by_own = _moved_by(tree, places.of_body(i), interface.moved_by_rates(kept))
+            moved.interfaces[i, s] = by_own
             if tree.hanging[i, s]:
                 carrier = _carrier(tree, interface.passage)
-                ends[i, s] = moved.frames[i].passed_on(carrier, moved.interfaces[i, s])
+                ends[i, s] = moved.frames[i].passed_on(carrier, by_own)
     return moved
 
 
@@ -436,7 +442,7 @@ def _on_interface(
     if i != GROUND and s in links[i].carried:
         carried = links[i].carried[s].load_by_motion
         by_motion[:, :, : carried.shape[1]] += _by_instant(carried)
-    return _Felt(by_motion, None, _side_by_side(behind))
+    return _Felt(by_motion, by_motion[:, :, :0], _side_by_side(behind))
 
 
 def _on_frame(
@@ -510,7 +516,6 @@ def _body_tangent(
     own = np.empty((count, q, len(kept), 3))
     rates = body.rows_by_rates(kept, interface_pushes(link, loads.outboard[i]))
     own[..., 0], own[..., 1], own[..., 2] = rates
-    left = _widened(tree, body.rows_by_motion.swapaxes(0, 1))
     parts = [Part(_Change(places.of_body(i), own).places, None, own.reshape(count, q, -1))]
     for s, interface in link.interfaces.items():
         turning = interface.pushes_by_e(loads.outboard[i][s], kept)
@@ -523,11 +528,15 @@ def _body_tangent(
         by_own_load = _by_instant(interface.rows_by_own_load.swapaxes(0, 1))
         felt = outboard[s]
         parts[0].right[:] += by_own_load @ felt.by_own
-        left += by_own_load @ felt.by_motion
-        if s in link.applied:
-            left[:, :, -dim.r :] += by_load @ _given(link, s)
         parts.append(Part(felt.by_outboard.places, by_own_load, felt.by_outboard.values))
-    parts.append(Part(inboard.places, left, inboard.values))
+    if len(inboard.columns):
+        left = _widened(tree, body.rows_by_motion.swapaxes(0, 1))
+        for s, interface in link.interfaces.items():
+            left += _by_instant(interface.rows_by_own_load.swapaxes(0, 1)) @ outboard[s].by_motion
+            if s in link.applied:
+                by_load = _by_instant(interface.rows_by_load.swapaxes(0, 1))
+                left[:, :, -dim.r :] += by_load @ _given(link, s)
+        parts.append(Part(inboard.places, left, inboard.values))
     parts = [part for part in parts if part.right.shape[2]]
     if q <= sum(part.right.shape[1] for part in parts if part.left is not None):
         whole = np.zeros((count, q, 3 * places.size))
