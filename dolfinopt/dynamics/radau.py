@@ -218,7 +218,8 @@ def _least_growth(
     """Return the least growth of the steps by the order that the last refinement has shown."""
     if not before < np.inf:
         angles = preconditioner.frequencies * np.median(np.diff(found.time_grid))
-        if np.count_nonzero(angles <= SLOW_ANGLES[0]) <= DENSE_COORDINATES_LIMIT:
+        slow = np.count_nonzero(angles <= SLOW_ANGLES[0])
+        if slow <= DENSE_COORDINATES_LIMIT or not preconditioner.definite:
             return FIRST_REFINEMENT_RATIO
         over = found.error / (RADAU_AIM_SHARE * tolerance)
         return max(FIRST_REFINEMENT_RATIO, over ** (1.0 / FIRST_REFINEMENT_ORDER))
