@@ -38,6 +38,7 @@ from dolfinopt.scene.load import load_scene
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+MANY = (9, 8, 9)  # more than a motion and a load have numbers
 # Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
 HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
@@ -76,10 +77,15 @@ class Machine:
         return linearise(self.mechanism, motion, *rates, keep, rigid)
 
 
-def chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
+def chain(
+    rng: np.random.Generator,
+    arms: int,
+    bent: bool = False,
+    coordinates: tuple[int, ...] = COORDINATES,
+) -> Chain:
     """Return a chain of random clouds with payload and gravity in both directions."""
-    clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
-    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms] * bent]
+    clouds = tuple(random_cloud(rng, q) for q in coordinates[:arms])
+    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in coordinates[:arms] * bent]
     stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
     return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
 
@@ -104,7 +110,7 @@ def machine_of(kind: str, count: int = 4) -> Machine:
             bodies = tuple(stiffened(rng, b) if b.num_modes else b for b in mechanism.bodies)
             mechanism = replace(mechanism, bodies=bodies)
     else:
-        model = chain(rng, int(arms[0]), bent)
+        model = chain(rng, int(arms[0]), bent, MANY if arms.endswith("many") else COORDINATES)
         mechanism = model.mechanism()
     size = mechanism.num_rigid + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
@@ -116,6 +122,7 @@ PUSHED = ", pushed"
 OF_POINTS = [*CHAINS, "tree"]  # a stiffened tree: by what it has of the plane's
 # Terms of stiffening and of forces are added to those of linear bodies: with all of them, and none.
 KINDS = ["1 arm", "3 arms", "tree", "3 arms, stiffened" + PUSHED, "tree, stiffened" + PUSHED]
+FACTORED = "3 arms of many"
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -156,8 +163,10 @@ def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
     assert_close(np.hstack([drives, rows]), expected, ROUNDING)
 
 
-def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
+@pytest.mark.parametrize("kind", [*KINDS, FACTORED, FACTORED + PUSHED])
+def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
     """Dense, by parts and from both sides, whatever rigid and elastic coordinates are asked for."""
+    machine = machine_of(kind)
     states, R = machine.states, machine.rigid
     _, count, size = states.shape
     columns = []
@@ -190,7 +199,20 @@ def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
         assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def test_bodies_have_columns_of_what_is_inboard_and_outboard() -> None:
+    """By a motion and by a load of few numbers; nothing moves the first, or loads the last."""
+    found = []
+    for body in machine_of(FACTORED).tangent().bodies:
+        sizes = {"own": 0, "load": 0, "motion": 0}
+        for part in body.parts:
+            kind = "own" if part.left is None else {3: "load", 4: "motion"}[part.right.shape[1]]
+            sizes[kind] += part.right.shape[2] // 3
+        found.append(tuple(sizes.values()))
+    a, b, c = MANY
+    assert found == [(a, b + c, 0), (b, c, a), (c, 0, a + b)]
+
+
+@pytest.mark.parametrize("kind", [*KINDS, FACTORED])
 def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
     """The same as of all at once."""
     one = machine_of(kind, 3 * measured.LEAST_INSTANTS)
