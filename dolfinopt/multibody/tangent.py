@@ -3,8 +3,9 @@
 Both passes of `inverse_dynamics` are differentiated by the coordinates that are asked for. A body
 feels those inboard of it through the motion (a, w, wd) of its frame, those outboard of it
 through the load on each of its interfaces: its rows are a block of its own coordinates and a low
-rank. Derivatives of motions and loads are (n, ., 3 S): what carries them on is one product with
-the matrices of `kinematics.Passage`, which BLAS multiplies four to ten times as fast as `einsum`.
+rank. Derivatives of motions go outwards by what is inboard alone, those of loads inwards by what is
+outboard: what carries them on is one product with the matrices of `kinematics.Passage`, which BLAS
+multiplies four to ten times as fast as `einsum`.
 """
 
 from __future__ import annotations
