@@ -503,6 +503,10 @@ class _Run:
         """Iterate with one matrix; return whether it is worth while to go on with another."""
         exact = len(self.slow) == self.at.a.shape[2] and not self.simplified
         matrix, rest = self._matrix(), np.zeros((2, self.at.a.shape[2]))
+        # What a step by another matrix leaves in slow coordinates the next leaves in fast ones: two
+        # are judged together. Not with free coordinates, which that leads astray where drives have
+        # limits.
+        pairs = self.stages.preconditioner.definite and not exact
         keep = self.tuning.keep[0 if self.simplified else 1]
         if len(self.slow) > DENSE_COORDINATES_LIMIT:
             keep = self.tuning.keep_many
@@ -513,11 +517,9 @@ class _Run:
             step, shift = matrix.solve(self.at.residual, rest)
             size = self.stages.relative(shift, self.at.q + shift)[0]
             with np.errstate(all="ignore"):  # inf / inf of what diverges
-                # Over two steps, where there are two: what a step leaves in slow coordinates the
-                # next leaves in fast ones, so that every other one seems to contract poorly.
                 last, older = self.before
                 contraction = size / last
-                mean = contraction if older == np.inf else np.sqrt(size / older)
+                mean = np.sqrt(size / older) if pairs and older < np.inf else contraction
                 worst = max(contraction, mean, self.at.norm[0] / self.norm_before)
             if np.isfinite(last) and np.isfinite(size):
                 self.rate = max(self.rate, float(contraction))
@@ -532,7 +534,7 @@ class _Run:
                 self.converged = True
                 return False
             poor = (age > 0 and mean > keep) or not np.isfinite(size)
-            if poor or not self._damped(step):
+            if poor or not self._damped(step, pairs):
                 return self._after_failure(size, age, exact)
             self.before, age = (size, last), age + 1
 
@@ -542,11 +544,13 @@ class _Run:
             return simplified_newton_matrix(self.stages, begin, self.at.a, self.slow)
         return factorise(self.stages, self.at.q, self.at.qd, self.at.a, self.slow)
 
-    def _damped(self, step: np.ndarray) -> bool:
+    def _damped(self, step: np.ndarray, pairs: bool) -> bool:
         """Take the longest step that lowers the residual; return whether there is one."""
-        # Below the larger one of the last two, for the same reason. Source: Grippo, Lampariello &
-        # Lucidi (1986), doi:10.1137/0723046.
-        largest, length = max(self.at.norm[0], self.norm_before), 1.0
+        # In pairs, below the larger one of the last two. Source: Grippo, Lampariello & Lucidi (1986),
+        # doi:10.1137/0723046.
+        largest, length = self.at.norm[0], 1.0
+        if pairs:
+            largest = max(largest, self.norm_before)
         while length >= self.tuning.shortest:
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
                 new = _point(self.stages, self.state, self.at.a + length * step)
