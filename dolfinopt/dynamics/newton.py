@@ -546,8 +546,8 @@ class _Run:
 
     def _damped(self, step: np.ndarray, pairs: bool) -> bool:
         """Take the longest step that lowers the residual; return whether there is one."""
-        # In pairs, below the larger one of the last two. Source: Grippo, Lampariello & Lucidi (1986),
-        # doi:10.1137/0723046.
+        # In pairs, below the larger one of the last two. Source: Grippo, Lampariello & Lucidi
+        # (1986), doi:10.1137/0723046.
         largest, length = self.at.norm[0], 1.0
         if pairs:
             largest = max(largest, self.norm_before)
