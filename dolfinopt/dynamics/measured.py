@@ -68,6 +68,9 @@ DENSE_COORDINATES_LIMIT = 24
 # The same of matrices whose tangent is held over a step, which cost a tenth.
 HELD_COORDINATES_LIMIT = 48
 EXACT_COORDINATES_LIMIT = 12  # up to so many the exact matrix costs less than more iterations
+# Of the tolerance, that Newton's method may leave when the error is estimated: where that is above
+# the tolerance, the steps are refined at once. What is left moves the estimate by less than 1e-3.
+NEWTON_ROUGH_SHARE = 1e-4
 NEWTON_ROUNDING_ERROR = 1e-9  # relative steps and errors below it that do not fall are rounding
 # Step below which a poor contraction is blamed on the matrix, no more on the nonlinearity.
 NEWTON_SETTLED_STEP = 0.01
@@ -95,6 +98,9 @@ STALLED_ERROR_RATIO = 0.9
 # is seen decides: as long as vibrations are not resolved the error falls more slowly.
 FIRST_REFINEMENT_RATIO = 1.1
 LATER_REFINEMENT_RATIO = 2.0
+# Order that the first refinement counts on with more than `DENSE_COORDINATES_LIMIT` slow
+# coordinates, whose grids cost most: chains of 5 to 8 arms show 4.1 to 5.0 with four stages.
+FIRST_REFINEMENT_ORDER = 4.4
 # Newton iterations times time steps, of all grids: 50 to 190 microseconds each with 8 to 20
 # coordinates; and of long motions so many iterations of their first grid.
 RADAU_WORK_LIMIT = 100_000

@@ -34,6 +34,7 @@ from dolfinopt.dynamics.measured import (
     FACTORS_BYTES,
     HELD_COORDINATES_LIMIT,
     INVERTED_MATRICES_CHUNK,
+    NEWTON_ROUGH_SHARE,
     NEWTON_ROUNDING_ERROR,
     NEWTON_SETTLED_STEP,
     SLOW_ANGLES,
@@ -378,8 +379,8 @@ class Tuning:
         limits: angles w h up to which coordinates are slow, tried in turn.
         least_rate: contraction that is believed when the error left is foretold.
         keep: least contraction that keeps a simplified matrix, and one that follows the stages.
-        keep_mixed: the same as long as steps are mixed, see `_Mixed`, of a matrix that is dense in
-            more than `DENSE_COORDINATES_LIMIT` coordinates and costs as much as many steps.
+        keep_many: the same of a matrix that is dense in more than `DENSE_COORDINATES_LIMIT`
+            coordinates and costs as much as many steps.
         near: of a matrix made within this distance of the solution, a new one would be no better:
         keep_near: it is kept with this contraction.
         shortest: of a damped step, as a share of Newton's; then it has failed.
@@ -390,7 +391,7 @@ class Tuning:
     limits: tuple[float, ...] = SLOW_ANGLES
     least_rate: float = 0.01
     keep: tuple[float, float] = (0.15, 0.3)  # half of it, or twice, take as long
-    keep_mixed: float = 0.7
+    keep_many: float = 0.7
     near: float = 0.0
     keep_near: float = 0.0
     shortest: float = 1.0 / 64.0
@@ -409,12 +410,14 @@ class Iterate:
         converged: (runs,).
         rate: (runs,) worst contraction seen, inf of one that diverges.
         iterations: (runs,).
+        errors: (runs,) estimated errors of the steps, if they are known already.
     """
 
     a: np.ndarray
     converged: np.ndarray
     rate: np.ndarray
     iterations: np.ndarray
+    errors: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,8 +443,8 @@ def newton(
     a: np.ndarray,
     tolerance: float,
     tuning: Tuning = ONE_RUN,
-    *,
     simplified: bool = True,
+    stop: Callable[[np.ndarray], bool] | None = None,
 ) -> Iterate:
     """Solve the residual of all stages of one run = 0 by Newton's method, damped on the residual.
 
@@ -456,8 +459,10 @@ def newton(
         tolerance: relative error of the coordinates that is asked for.
         tuning: see there.
         simplified: whether to begin with the simplified matrix.
+        stop: asked once, about accelerations that leave `NEWTON_ROUGH_SHARE` of the tolerance,
+            whether they will do.
     """
-    run = _Run(stages, state, a, tolerance, tuning, simplified)
+    run = _Run(stages, state, a, tolerance, tuning, simplified, stop)
     for _ in range(tuning.matrices):
         if len(windows(stages, run.slow)) > 1:
             break  # no room for a matrix of all steps
@@ -465,34 +470,6 @@ def newton(
             break
     found = np.array([run.converged]), np.array([run.rate]), np.array([run.iterations])
     return Iterate(run.at.a, *found)
-
-
-class _Mixed:
-    """Steps of one matrix, mixed so that they leave least: Anderson's acceleration.
-
-    Source: Walker & Ni (2011), doi:10.1137/10078356X, in the norm of the changes of q.
-    """
-
-    def __init__(self) -> None:
-        self.serves = True  # as long as mixed steps lower the residual
-        self._last: tuple[np.ndarray, ...] = ()  # a, its step, and the change of q
-        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []  # changes of these, orthonormal
-
-    def step(self, a: np.ndarray, step: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """Return the mixed step from an iterate a, its step and change of q, each (n, s, N)."""
-        if self._last:
-            old_a, old_step, old_shift = self._last
-            lost, moved = shift - old_shift, a - old_a + step - old_step
-            for other, other_moved in self._pairs:
-                share = np.vdot(other, lost)
-                lost, moved = lost - share * other, moved - share * other_moved
-            size = np.linalg.norm(lost)
-            if size > 0.0:
-                self._pairs.append((lost / size, moved / size))
-        self._last = a, step, shift
-        for lost, moved in self._pairs:
-            step = step - np.vdot(lost, shift) * moved
-        return step
 
 
 class _Run:
@@ -506,8 +483,10 @@ class _Run:
         tolerance: float,
         tuning: Tuning,
         simplified: bool,
+        stop: Callable[[np.ndarray], bool] | None,
     ) -> None:
         self.stages, self.state, self.tolerance, self.tuning = stages, state, tolerance, tuning
+        self.stop = stop
         # Of few coordinates the exact matrix costs less than the iterations that it saves, if it is
         # made near the solution.
         few = a.shape[2] <= EXACT_COORDINATES_LIMIT and bool(a.any())
@@ -516,40 +495,48 @@ class _Run:
         limits = tuning.limits[-1:] if few else tuning.limits
         self.slow, self.limits = next_slow_coordinates(stages, limits, 0, most)
         self.at = _point(stages, state, a)
-        self.before, self.norm_before = np.inf, self.at.norm[0]
+        self.before = (np.inf, np.inf)  # sizes of the last two steps, the last one first
+        self.norm_before = self.at.norm[0]
         self.converged, self.rate, self.iterations = False, 0.0, 0
 
     def with_one_matrix(self) -> bool:
         """Iterate with one matrix; return whether it is worth while to go on with another."""
         exact = len(self.slow) == self.at.a.shape[2] and not self.simplified
         matrix, rest = self._matrix(), np.zeros((2, self.at.a.shape[2]))
-        least = self.tuning.keep[0 if self.simplified else 1]
-        many = len(self.slow) > DENSE_COORDINATES_LIMIT
-        self.rate, age, mixed = 0.0, 0, _Mixed()
+        # What a step by another matrix leaves in slow coordinates the next leaves in fast ones: two
+        # are judged together. Not with free coordinates, which that leads astray where drives have
+        # limits.
+        pairs = self.stages.preconditioner.definite and not exact
+        keep = self.tuning.keep[0 if self.simplified else 1]
+        if len(self.slow) > DENSE_COORDINATES_LIMIT:
+            keep = self.tuning.keep_many
+        self.rate, age = 0.0, 0
         while True:
             self.iterations += 1
             spend(float(self.stages.length))
             step, shift = matrix.solve(self.at.residual, rest)
             size = self.stages.relative(shift, self.at.q + shift)[0]
             with np.errstate(all="ignore"):  # inf / inf of what diverges
-                contraction = size / self.before
-                worst = np.maximum(contraction, self.at.norm[0] / self.norm_before)
-            if np.isfinite(self.before) and np.isfinite(size):
+                last, older = self.before
+                contraction = size / last
+                mean = np.sqrt(size / older) if pairs and older < np.inf else contraction
+                worst = max(contraction, mean, self.at.norm[0] / self.norm_before)
+            if np.isfinite(last) and np.isfinite(size):
                 self.rate = max(self.rate, float(contraction))
-            ends = _left(worst, self.tuning) * size <= self.tuning.goal * self.tolerance
-            if ends or (exact and age == 0 and size <= 1e-3 * self.tolerance):
+            left = _left(worst, self.tuning) * size / self.tolerance
+            ends = left <= self.tuning.goal or (
+                exact and age == 0 and size <= 1e-3 * self.tolerance
+            )
+            if not ends and self.stop is not None and left <= NEWTON_ROUGH_SHARE:
+                ends, self.stop = self.stop(self.at.a + step), None
+            if ends:
                 self.at = replace(self.at, a=self.at.a + step)
                 self.converged = True
                 return False
-            keep = self.tuning.keep_mixed if many and mixed.serves else least
-            if (age > 0 and size > keep * self.before) or not np.isfinite(size):
+            poor = (age > 0 and mean > keep) or not np.isfinite(size)
+            if poor or not self._damped(step, pairs):
                 return self._after_failure(size, age, exact)
-            better = mixed.step(self.at.a, step, shift) if mixed.serves else None
-            if better is not None and age > 0:
-                mixed.serves = self._damped(better, 1.0)
-            if (age == 0 or not mixed.serves) and not self._damped(step):
-                return self._after_failure(size, age, exact)
-            self.before, age = size, age + 1
+            self.before, age = (size, last), age + 1
 
     def _matrix(self) -> NewtonMatrix:
         if self.simplified:
@@ -557,13 +544,17 @@ class _Run:
             return simplified_newton_matrix(self.stages, begin, self.at.a, self.slow)
         return factorise(self.stages, self.at.q, self.at.qd, self.at.a, self.slow)
 
-    def _damped(self, step: np.ndarray, shortest: float | None = None) -> bool:
+    def _damped(self, step: np.ndarray, pairs: bool) -> bool:
         """Take the longest step that lowers the residual; return whether there is one."""
-        length = 1.0
-        while length >= (self.tuning.shortest if shortest is None else shortest):
+        # In pairs, below the larger one of the last two. Source: Grippo, Lampariello & Lucidi
+        # (1986), doi:10.1137/0723046.
+        largest, length = self.at.norm[0], 1.0
+        if pairs:
+            largest = max(largest, self.norm_before)
+        while length >= self.tuning.shortest:
             with np.errstate(all="ignore"):  # trial steps may lead anywhere
                 new = _point(self.stages, self.state, self.at.a + length * step)
-            if new.norm[0] <= (1.0 - 0.1 * length) * self.at.norm[0]:
+            if new.norm[0] <= (1.0 - 0.1 * length) * largest:
                 self.at, self.norm_before = new, self.at.norm[0]
                 return True
             length *= 0.5
@@ -574,7 +565,7 @@ class _Run:
         if exact and age == 0:  # rounding, where the step is small: nothing is left to gain
             self.converged = bool(size <= max(self.tolerance, NEWTON_ROUNDING_ERROR))
             return False
-        if age == 0 or (age == 1 and self.before <= NEWTON_SETTLED_STEP):
+        if age == 0 or (age == 1 and self.before[0] <= NEWTON_SETTLED_STEP):
             if self.simplified:
                 self.simplified = False
             elif self.limits:
@@ -834,7 +825,7 @@ def _parts(method: Collocation, h: np.ndarray, jacobian: np.ndarray, definite: b
         return parts
     K, D, M = np.split(jacobian, 3, axis=2)
     for own, value in zip(parts, values, strict=True):
-        hl = (value * h)[:, None, None]
+        hl = ((value if value.imag > 1e-12 else value.real) * h)[:, None, None]
         try:
             own[:] = np.linalg.inv(M + hl * (D + hl * K))
         except np.linalg.LinAlgError:

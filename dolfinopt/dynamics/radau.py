@@ -53,6 +53,7 @@ from dolfinopt.dynamics.measured import (
     FIRST_GRID_ERROR,
     FIRST_GRID_GROWTH_LIMIT,
     FIRST_GRID_ITERATIONS_LIMIT,
+    FIRST_REFINEMENT_ORDER,
     FIRST_REFINEMENT_RATIO,
     HELD_COORDINATES_LIMIT,
     LATER_REFINEMENT_RATIO,
@@ -74,6 +75,7 @@ from dolfinopt.dynamics.measured import (
     RADAU_WORK_LIMIT,
     RESTING_GROUP_SHARE,
     SHORTEST_WINDOW_STEPS,
+    SLOW_ANGLES,
     STALLED_ERROR_RATIO,
     STALLED_GRIDS_LIMIT,
     STEP_GROWTH_LIMIT,
@@ -138,7 +140,9 @@ def integrate(
     for _ in range(RADAU_GRIDS_LIMIT):
         progress.tell(f"{len(time_grid) - 1} time steps")
         try:
-            found = _on_grid(preconditioner, time_grid, tolerance, stages, guess, progress)
+            found = _on_grid(
+                preconditioner, time_grid, tolerance, stages, guess, progress, tolerance
+            )
         except GivenUp:
             raise
         except ConvergenceError:
@@ -157,7 +161,7 @@ def integrate(
             raise ConvergenceError(_lost_motion(system, guess))
         stalled = stalled + 1 if guess.error > STALLED_ERROR_RATIO * before else 0
         work -= guess.iterations * len(guess.a)
-        least = _least_growth(guess, before, coarse, tolerance)
+        least = _least_growth(preconditioner, guess, before, coarse, tolerance)
         before, coarse = guess.error, len(guess.a)
         try:
             time_grid = next_time_grid(preconditioner.system, guess, tolerance, stages, least, most)
@@ -194,7 +198,7 @@ def _on_few_steps(
     most = int(MOST_FEW_STEPS_SHARE * len(time_grid))
     while grid is not None and len(grid) - 1 <= most:
         try:
-            found = _on_grid(preconditioner, grid, tolerance, stages, found)
+            found = _on_grid(preconditioner, grid, tolerance, stages, found, most_error=tolerance)
         except GivenUp:
             raise
         except ConvergenceError:
@@ -208,10 +212,17 @@ def _on_few_steps(
     return found
 
 
-def _least_growth(found: Solution, before: float, coarse: int, tolerance: float) -> float:
+def _least_growth(
+    preconditioner: Preconditioner, found: Solution, before: float, coarse: int, tolerance: float
+) -> float:
     """Return the least growth of the steps by the order that the last refinement has shown."""
     if not before < np.inf:
-        return FIRST_REFINEMENT_RATIO
+        angles = preconditioner.frequencies * np.median(np.diff(found.time_grid))
+        slow = np.count_nonzero(angles <= SLOW_ANGLES[0])
+        if slow <= DENSE_COORDINATES_LIMIT or not preconditioner.definite:
+            return FIRST_REFINEMENT_RATIO
+        over = found.error / (RADAU_AIM_SHARE * tolerance)
+        return max(FIRST_REFINEMENT_RATIO, over ** (1.0 / FIRST_REFINEMENT_ORDER))
     growth = np.log(len(found.a) / coarse)
     order = np.log(before / found.error) / growth if growth > 0.0 else 0.0
     if order <= 0.0:
@@ -309,11 +320,23 @@ def _on_grid(
     stages: int,
     guess: Solution | None,
     progress: SlowWork | None = None,
+    most_error: float = np.inf,
 ) -> Solution:
+    # Newton's method ends early on steps whose error is above `most_error`: they are refined. Not
+    # with free coordinates: that it fails in the end, at limits of drives, calls for `graded`.
     march = March(tolerance, len(time_grid) - 1, progress or SlowWork("simulation"))
 
     def newton(steps: Stages, state: State, first: np.ndarray) -> Iterate:
-        return march.run(steps, state, first, ONE_RUN)
+        errors: list[np.ndarray] = []
+
+        def is_too_large(a: np.ndarray) -> bool:
+            begin = step_beginnings(steps, state, a)
+            errors.append(estimated_errors(steps, time_grid, begin, a, ONE_RUN.limits))
+            return bool(errors[0] > most_error)
+
+        rough = preconditioner.definite and most_error < np.inf
+        ended = march.run(steps, state, first, is_too_large if rough else None)
+        return replace(ended, errors=errors[0]) if errors and march.windows == 1 else ended
 
     state = preconditioner.system.initial_state()
     (found,) = on_grids(preconditioner, time_grid[None], state, [guess], stages, newton)
@@ -356,7 +379,9 @@ def on_grids(
     steps, state = steps.chosen(chosen), (state[0][chosen], state[1][chosen])
     begin, grids = step_beginnings(steps, state, z), time_grids[chosen]
     rate = None if limits is None else iterate.rate[chosen]
-    errors = estimated_errors(steps, grids, begin, z, limits or ONE_RUN.limits, rate)
+    errors = iterate.errors
+    if errors is None:
+        errors = estimated_errors(steps, grids, begin, z, limits or ONE_RUN.limits, rate)
     q, qd = (preconditioner.from_modes(x).reshape(len(chosen), -1, size) for x in begin)
     a = preconditioner.from_modes(z).reshape(len(chosen), *shape[1:])
     for k, i in enumerate(chosen):
@@ -597,21 +622,27 @@ class March:
         self._done = self._work = 0  # steps; steps times Newton iterations
 
     def run(
-        self, stages: Stages, state: State, guess: np.ndarray, tuning: Tuning = ONE_RUN
+        self,
+        stages: Stages,
+        state: State,
+        guess: np.ndarray,
+        stop: Callable[[np.ndarray], bool] | None = None,
     ) -> Iterate:
         """Return where Newton's method ends for one run; its iterations are those of all windows.
+
+        `stop` is that of `newton` over all steps at once.
 
         Raises:
             ConvergenceError: Newton fails in a single step, or spends more than
                 `WINDOWS_ITERATIONS_LIMIT`.
         """
         if stages.preconditioner.guided or guess.any():
-            a, spent = self._run(stages, state, guess, tuning, True)
+            a, spent = self._run(stages, state, guess, ONE_RUN, True, stop)
         else:
-            a, spent = self._from_nothing(stages, state, tuning)
+            a, spent = self._from_nothing(stages, state)
         return Iterate(a, np.ones(1, dtype=bool), np.zeros(1), np.array([spent]))
 
-    def _from_nothing(self, stages: Stages, state: State, tuning: Tuning) -> tuple[np.ndarray, int]:
+    def _from_nothing(self, stages: Stages, state: State) -> tuple[np.ndarray, int]:
         """Solve a few steps after the other, each from the accelerations that the last end with."""
         # Free rigid coordinates go far: no guess holds over the whole horizon.
         count = len(stages.h)
@@ -621,7 +652,7 @@ class March:
         for first in range(0, count, UNKNOWN_MOTION_STEPS):
             window = stages.window(first, min(first + UNKNOWN_MOTION_STEPS, count))
             held = np.broadcast_to(guess, (len(window.h), s, size))
-            a, iterations = self._run(window, state, held, tuning, False)
+            a, iterations = self._run(window, state, held, ONE_RUN, False)
             q, qd = step_ends(window, state, a)
             state, guess = (q[-1:], qd[-1:]), a[-1:, -1:]
             pieces.append(a)
@@ -630,9 +661,15 @@ class March:
         return np.concatenate(pieces), round(spent / count)
 
     def _run(
-        self, stages: Stages, state: State, guess: np.ndarray, tuning: Tuning, simplified: bool
+        self,
+        stages: Stages,
+        state: State,
+        guess: np.ndarray,
+        tuning: Tuning,
+        simplified: bool,
+        stop: Callable[[np.ndarray], bool] | None = None,
     ) -> tuple[np.ndarray, int]:
-        found = newton(stages, state, guess, self._tolerance, tuning, simplified=simplified)
+        found = newton(stages, state, guess, self._tolerance, tuning, simplified, stop)
         count, spent = len(stages.h), int(found.iterations[0])
         simplified = simplified and spent == 0  # where it has not failed, but had no room
         self._work += spent * count

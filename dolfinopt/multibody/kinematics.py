@@ -63,8 +63,12 @@ class Passage:
             if block is not None:
                 out[:, rows, columns] = block if block.ndim == 2 else block.transpose(2, 0, 1)
         self.matrix = out
-        forces = np.r_[a, wd]  # work on displacements as accelerations go
-        self.of_loads = np.ascontiguousarray(out[:, forces[:, None], forces].swapaxes(1, 2))
+        # Forces and moments work on displacements and rotations as a and wd go.
+        loads = np.empty((len(out), d + r, d + r))
+        loads[:, :d, :d], loads[:, :d, d:] = out[:, a, a].swapaxes(1, 2), 0.0
+        loads[:, d:, :d] = out[:, a, wd].swapaxes(1, 2)
+        loads[:, d:, d:] = out[:, wd, wd].swapaxes(1, 2)
+        self.of_loads = loads
 
 
 class Interface:

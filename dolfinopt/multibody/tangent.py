@@ -3,13 +3,15 @@
 Both passes of `inverse_dynamics` are differentiated by the coordinates that are asked for. A body
 feels those inboard of it through the motion (a, w, wd) of its frame, those outboard of it
 through the load on each of its interfaces: its rows are a block of its own coordinates and a low
-rank. Derivatives of motions and loads are (n, ., 3 S): what carries them on is one product with
-the matrices of `kinematics.Passage`, which BLAS multiplies four to ten times as fast as `einsum`.
+rank. Derivatives of motions go outwards by what is inboard alone, those of loads inwards by what is
+outboard: what carries them on is one product with the matrices of `kinematics.Passage`, which BLAS
+multiplies four to ten times as fast as `einsum`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -23,7 +25,7 @@ from dolfinopt.multibody.inverse_dynamics import (
     inward_pass,
     outward_pass,
 )
-from dolfinopt.multibody.kinematics import Interface
+from dolfinopt.multibody.kinematics import Interface, Passage
 from dolfinopt.multibody.measured import DERIVATIVES_BYTES, LEAST_INSTANTS
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
@@ -31,79 +33,85 @@ from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
 
 @dataclass(frozen=True, eq=False)
-class BodyTangent:
-    """Derivative of one body's q elastic rows by S coordinates; arrays over n instants.
-
-    r' = K e' + D ed' + M edd' + sum_f left_f (right_f y') with y = [q, qd, qdd] of all S
-    coordinates and those k coordinates e of its own that have a column.
+class Part:
+    """Derivative left (right y) of a body's q rows by some coordinates, arrays over n instants.
 
     Attributes:
-        rows, columns: its place among all rows and among the S columns.
+        columns: their places (3 c,) among all 3 S, see `Tangent`.
+        left: (n, q, r); None where there is `right` alone.
+        right: (n, r, 3 c), a motion or a load; (n, q, 3 c) without `left`.
+    """
+
+    columns: np.ndarray | slice
+    left: np.ndarray | None
+    right: np.ndarray
+
+    def at(self, part: slice) -> Part:
+        """Return it at some of the instants."""
+        left = None if self.left is None else self.left[part]
+        return replace(self, left=left, right=self.right[part])
+
+    def write(self, wanted: np.ndarray | slice, rows: np.ndarray) -> None:
+        """Write some of the q rows where they stand among rows (n, W, 3 S)."""
+        if self.left is None:
+            rows[:, :, self.columns] = self.right[:, wanted]
+        elif isinstance(self.columns, slice):
+            np.matmul(self.left[:, wanted], self.right, out=rows[:, :, self.columns])
+        else:
+            rows[:, :, self.columns] = self.left[:, wanted] @ self.right
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTangent:
+    """Derivative of one body's q elastic rows by S coordinates.
+
+    Attributes:
+        rows, columns: its place among all rows and among the S coordinates.
         kept: (k,) those of its coordinates that have a column.
-        K, D: (n, q, k).
-        M: (n, q, k), or (q, k) of a body whose mass is the same in every shape.
-        factors: pairs left_f (n, q, r) and right_f (n, r, 3 S), a load or a motion each; of fewer
-            rows than those of all right_f one, their sum, with no left_f.
+        parts: by its own coordinates; by those inboard, which move it; by those outboard, which
+            load it. No two have a column in common. Where q is small they are one.
     """
 
     rows: slice
     columns: slice
     kept: np.ndarray
-    K: np.ndarray
-    D: np.ndarray
-    M: np.ndarray
-    factors: tuple[tuple[np.ndarray | None, np.ndarray], ...]
-
-    def at(self, part: slice) -> BodyTangent:
-        """Return it at some of the instants."""
-        M = self.M if self.M.ndim == 2 else self.M[part]
-        pairs = (
-            (None if left is None else left[part], right[part]) for left, right in self.factors
-        )
-        return replace(self, K=self.K[part], D=self.D[part], M=M, factors=tuple(pairs))
+    parts: tuple[Part, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
     """Derivative of the rows [joint forces asked for (R), elastic residual (N)] by S coordinates.
 
-    The S coordinates are the R joints, then those elastic ones that are kept; n instants.
+    The S coordinates are the R joints, then those elastic ones that are kept; n instants. Columns
+    are q, qd, qdd of one coordinate after the other.
 
     Attributes:
         bodies: the flexible ones, in the order of their rows.
-        size: S.
-        drives: (n, R, 3 S) of the forces of the joints, columns ordered q, qd, qdd.
+        drives: (n, R, 3 S) of the forces of the joints.
     """
 
     bodies: tuple[BodyTangent, ...]
-    size: int
     drives: np.ndarray
 
     def window(self, first: int, last: int) -> Tangent:
         """Return the instants first..last - 1."""
         part = slice(first, last)
-        bodies = tuple(body.at(part) for body in self.bodies)
-        return replace(self, bodies=bodies, drives=self.drives[part])
+        bodies = tuple(
+            replace(body, parts=tuple(one.at(part) for one in body.parts)) for body in self.bodies
+        )
+        return Tangent(bodies, self.drives[part])
 
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
-        size = self.size
-        jacobian = np.empty((len(self.drives), size, 3 * size))
-        jacobian[:, : self.drives.shape[1]] = self.drives
-        for part in self.bodies:
-            rows, kept = jacobian[:, part.columns], part.kept
-            if not part.factors:
-                rows[:] = 0.0
-            for k, (left, right) in enumerate(part.factors):
-                own = right[:, kept] if left is None else left[:, kept] @ right
-                if k == 0:
-                    rows[:] = own
-                else:
-                    rows += own
-            blocks = (part.K[:, kept], part.D[:, kept], part.M[..., kept, :])
-            for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
-                rows[:, :, columns] += block
-        return jacobian
+        count, rigid, every = self.drives.shape
+        jacobian = np.zeros((count, every // 3, every))
+        jacobian[:, :rigid] = self.drives
+        for body in self.bodies:
+            rows = jacobian[:, body.columns]
+            for part in body.parts:
+                part.write(body.kept, rows)
+        found = jacobian.reshape(count, every // 3, -1, 3).swapaxes(2, 3)
+        return found.reshape(jacobian.shape)
 
     def times(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
@@ -112,20 +120,19 @@ class Tangent:
 
         With m a multiple of the n instants, each of them stands for as many rows in turn.
         """
-        count, rigid = self.drives.shape[:2]
-        change = np.concatenate([q, qd, qdd], axis=1).reshape(count, -1, 3 * self.size)
+        count, rigid, every = self.drives.shape
+        change = np.stack([q, qd, qdd], axis=2).reshape(count, -1, every)
         change = change.swapaxes(1, 2)  # (n, 3 S, times)
-        out = []
-        if rigid:
-            out.append(self.drives[:, wanted[wanted < rigid]] @ change)
-        for part in self.bodies:
-            own = wanted[(wanted >= part.rows.start) & (wanted < part.rows.stop)] - part.rows.start
-            e, ed, edd = (change[:, columns] for columns in _columns(part.columns, self.size))
-            rows = part.K[:, own] @ e
-            for left, right in part.factors:
-                rows += right[:, own] @ change if left is None else left[:, own] @ (right @ change)
-            rows += part.D[:, own] @ ed
-            rows += part.M[..., own, :] @ edd
+        out = [self.drives[:, wanted[wanted < rigid]] @ change] if rigid else []
+        for body in self.bodies:
+            own = wanted[(wanted >= body.rows.start) & (wanted < body.rows.stop)] - body.rows.start
+            rows = np.zeros((count, len(own), change.shape[2]))
+            for part in body.parts:
+                moved = change[:, part.columns]
+                if part.left is None:
+                    rows += part.right[:, own] @ moved
+                else:
+                    rows += part.left[:, own] @ (part.right @ moved)
             out.append(rows)
         found: np.ndarray = np.concatenate(out, axis=1).swapaxes(1, 2)
         return found.reshape(len(q), len(wanted))
@@ -135,45 +142,35 @@ class Tangent:
 
         With m a multiple of the n instants, each of them stands for as many rows in turn.
         """
-        size, (count, rigid) = self.size, self.drives.shape[:2]
-        every = rows.reshape(count, -1, rows.shape[1])
-        gradient = every[:, :, :rigid] @ self.drives
-        for part in self.bodies:
-            y = every[:, :, part.rows]
-            for left, right in part.factors:
-                gradient += (y if left is None else y @ left) @ right
-            blocks = (part.K, part.D, part.M)
-            for columns, block in zip(_columns(part.columns, size), blocks, strict=True):
-                gradient[:, :, columns] += y @ block
-        by_q, by_v, by_a = np.split(gradient.reshape(len(rows), -1), 3, axis=1)
+        count, rigid, every = self.drives.shape
+        weights = rows.reshape(count, -1, rows.shape[1])
+        gradient = weights[:, :, :rigid] @ self.drives
+        for body in self.bodies:
+            y = weights[:, :, body.rows]
+            for part in body.parts:
+                gradient[:, :, part.columns] += (
+                    y if part.left is None else y @ part.left
+                ) @ part.right
+        by_q, by_v, by_a = np.moveaxis(gradient.reshape(len(rows), every // 3, 3), 2, 0)
         return by_q, by_v, by_a
-
-
-def _columns(part: slice, size: int) -> tuple[slice, slice, slice]:
-    a, b = part.start, part.stop
-    return slice(a, b), slice(size + a, size + b), slice(2 * size + a, 2 * size + b)
 
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where the coordinates asked for stand among the S columns."""
+    """Where the coordinates asked for stand among the S."""
 
     size: int  # S
     rigid: np.ndarray  # (R,) joint coordinates asked for, ascending
     kept: list[np.ndarray]  # of every body, those of its coordinates that have a column
     bodies: list[slice]  # of every body, their place among the S
 
-    def add(self, to: np.ndarray, i: int, derivatives: np.ndarray) -> None:
-        """Add derivatives by body i's coordinates and rates (., 3, k, n) to all, (n, ., 3 S)."""
-        every = to.reshape(*to.shape[:2], 3, self.size)
-        every[..., self.bodies[i]] += derivatives.transpose(3, 0, 1, 2)
+    def of_body(self, i: int) -> np.ndarray:
+        """Return the places of a body's coordinates."""
+        return np.arange(self.bodies[i].start, self.bodies[i].stop)
 
-    def of_joint(self, coordinate: int | None) -> tuple[int, int, int] | None:
-        """Return the columns of a joint's coordinate, if any."""
-        place = np.flatnonzero(self.rigid == coordinate)
-        if coordinate is None or len(place) == 0:
-            return None
-        return int(place[0]), self.size + int(place[0]), 2 * self.size + int(place[0])
+    def of_joint(self, coordinate: int | None) -> np.ndarray:
+        """Return the place of a joint's coordinate (1,), or none (0,)."""
+        return np.flatnonzero(self.rigid == (-1 if coordinate is None else coordinate))
 
 
 def _places(tree: Mechanism, keep: np.ndarray | None, rigid: np.ndarray | None) -> _Places:
@@ -204,8 +201,8 @@ def linearise(
             by default.
     """
     places, count, dim = _places(mechanism, keep, rigid), len(q), mechanism.dim
-    # Of motion and load of a frame and of an interface of every body.
-    size = 8 * 3 * places.size * (4 * dim.d + 6 * dim.r) * len(mechanism.order)
+    # Motion and load of a frame and of an interface of every body, each by half of the coordinates.
+    size = 8 * 3 * places.size * (2 * dim.d + 3 * dim.r) * len(mechanism.order)
     chunks = max(1, round(count * size / DERIVATIVES_BYTES))
     ends = np.linspace(0, count, min(chunks, max(count // LEAST_INSTANTS, 1)) + 1).astype(int)
     if len(ends) == 2:
@@ -218,126 +215,263 @@ def linearise(
     )
 
 
-def _joined(parts: list[Tangent]) -> Tangent:
+def _joined(pieces: list[Tangent]) -> Tangent:
     """Return the tangents of instants that follow each other as one."""
     bodies = []
-    for same in zip(*(one.bodies for one in parts), strict=True):
-        M = same[0].M if same[0].M.ndim == 2 else np.concatenate([one.M for one in same])
-        pairs = zip(*(one.factors for one in same), strict=True)
-        factors = tuple(
-            (
-                None if every[0][0] is None else np.concatenate([x for x, _ in every]),
-                np.concatenate([x for _, x in every]),
+    for same in zip(*(one.bodies for one in pieces), strict=True):
+        parts = []
+        for every in zip(*(one.parts for one in same), strict=True):
+            lefts = [one.left for one in every if one.left is not None]
+            left = np.concatenate(lefts) if lefts else None
+            parts.append(
+                replace(every[0], left=left, right=np.concatenate([x.right for x in every]))
             )
-            for every in pairs
-        )
-        K, D = (np.concatenate(x) for x in zip(*((one.K, one.D) for one in same), strict=True))
-        bodies.append(replace(same[0], K=K, D=D, M=M, factors=factors))
-    drives = np.concatenate([one.drives for one in parts])
-    return Tangent(tuple(bodies), parts[0].size, drives)
+        bodies.append(replace(same[0], parts=tuple(parts)))
+    return Tangent(tuple(bodies), np.concatenate([one.drives for one in pieces]))
 
 
 def _linearise(tree: Mechanism, motion: RigidMotion, rates: Rates, places: _Places) -> Tangent:
     """Return the derivative at some of the instants."""
     links = outward_pass(tree, motion, rates)
     loads = inward_pass(tree, links, driven=len(places.rigid) > 0)
-    motions, ends = _outward_derivatives(tree, links, places)
-    found = _inward_derivatives(tree, links, loads, places, motions, ends)
+    moved = _outward_derivatives(tree, links, places)
+    found = _inward_derivatives(tree, links, loads, places, moved)
     if tree.friction is not None and len(places.rigid):
         own = np.arange(len(places.rigid))
-        slopes = tree.friction.slope(motion.qd)[:, places.rigid]
-        found.drives[:, own, places.size + own] += slopes
+        found.drives[:, own, 3 * own + 1] += tree.friction.slope(motion.qd)[:, places.rigid]
     return found
 
 
-_Derivatives = dict[int, np.ndarray]  # of what moves
-_Ends = dict[Site, np.ndarray]
+# -- both passes: outwards by what is inboard of a body, inwards by what is outboard -------------
+#
+# What meets are the derivatives of loads by the motion of their own frame, all that hangs on it
+# moving along, as of composite rigid bodies (Featherstone 2008, ch. 6). A motion is (a, w, wd), and
+# with it the rotation where forces keep their direction in the world: m = d + 2 r or d + 3 r.
 
 
-def _outward_derivatives(
-    tree: Mechanism, links: list[Link], places: _Places
-) -> tuple[_Derivatives, _Ends]:
-    """Return the derivatives of the motion of every body and interface (n, d + 2 r, 3 S)."""
-    dim, count = links[0].body.dim, links[0].body.a.shape[1]
-    shape = (count, dim.d + 2 * dim.r, 3 * places.size)
-    motions: _Derivatives = {}
-    ends: _Ends = {}
-    if (columns := places.of_joint(tree.cart_coordinate)) is not None:
-        ends[GROUND, 0] = np.zeros(shape)
-        ends[GROUND, 0][:, 0, columns[2]] = 1.0
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """Derivatives (n, ., 3 c) by c coordinates and their rates, one coordinate after the other.
+
+    `columns` (c,) are the coordinates' places among the S.
+    """
+
+    columns: np.ndarray
+    values: np.ndarray
+
+    def passed_on(self, matrix: np.ndarray, more: _Change) -> _Change:
+        """Return matrix times the derivatives, and behind them those by further coordinates."""
+        if len(self.columns) == 0:
+            return more
+        old = self.values.shape[2]
+        out = np.empty((*more.values.shape[:2], old + more.values.shape[2]))
+        np.matmul(matrix, self.values, out=out[:, :, :old])
+        out[:, :, old:] = more.values
+        return _Change(np.concatenate([self.columns, more.columns]), out)
+
+    @cached_property
+    def places(self) -> np.ndarray | slice:
+        """Places (3 c,) among the 3 S, as a slice where they lie side by side."""
+        columns = self.columns
+        if len(columns) and (np.diff(columns) == 1).all():
+            return slice(3 * columns[0], 3 * (columns[-1] + 1))
+        out: np.ndarray = (3 * columns[:, None] + np.arange(3)).ravel()
+        return out
+
+
+def _side_by_side(changes: list[_Change]) -> _Change:
+    some = [one for one in changes if len(one.columns)] or changes[:1]
+    if len(some) == 1:
+        return some[0]
+    columns = np.concatenate([one.columns for one in some])
+    return _Change(columns, np.concatenate([one.values for one in some], axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """Derivatives of motions (n, m, .), each in its own components.
+
+    Attributes:
+        ground: of what the first joints sit on.
+        frames: of every body.
+        joints: of every body by its joint's coordinate, the interface held.
+        interfaces: by the coordinates of their own body.
+    """
+
+    ground: _Change
+    frames: dict[int, _Change]
+    joints: dict[int, _Change]
+    interfaces: dict[Site, _Change]
+
+
+@dataclass(frozen=True, eq=False)
+class _Felt:
+    """Derivatives of the load (n, d + r, .) on a frame or an interface, in its components.
+
+    Attributes:
+        by_motion: by a frame's motion (n, d + r, m).
+        by_own: by the coordinates of the body itself; of an interface by its own motion, none.
+        by_outboard: by those outboard.
+    """
+
+    by_motion: np.ndarray
+    by_own: np.ndarray
+    by_outboard: _Change
+
+
+def _motion_size(tree: Mechanism) -> int:
+    """Return m."""
+    return tree.dim.d + (3 if tree.forces else 2) * tree.dim.r
+
+
+def _by_coordinate(x: np.ndarray) -> np.ndarray:
+    """Return derivatives (n, ., 3 k) of (., 3, k, n)."""
+    return np.ascontiguousarray(x.transpose(3, 0, 2, 1)).reshape(x.shape[3], len(x), -1)
+
+
+def _moved_by(tree: Mechanism, columns: np.ndarray, x: np.ndarray) -> _Change:
+    """Return the derivatives of a motion from those of (a, w, wd) (d + 2 r, 3, k, n)."""
+    if tree.forces:
+        spin = x[tree.dim.d : tree.dim.d + tree.dim.r]
+        turned = np.zeros_like(spin)
+        turned[:, 0] = spin[:, 1]  # by q, as the spin by q'
+        x = np.concatenate([x, turned])
+    return _Change(columns, _by_coordinate(x))
+
+
+def _carrier(tree: Mechanism, passage: Passage) -> np.ndarray:
+    """Return the matrix (n, m, m), or one, that carries a motion on."""
+    dim, inner = tree.dim, passage.matrix
+    if not tree.forces:
+        return inner
+    spin, size = slice(dim.d, dim.d + dim.r), inner.shape[1]
+    out = np.zeros((len(inner), size + dim.r, size + dim.r))
+    out[:, :size, :size], out[:, size:, size:] = inner, inner[:, spin, spin]
+    return out
+
+
+def _outward_derivatives(tree: Mechanism, links: list[Link], places: _Places) -> _Moved:
+    dim, count = tree.dim, links[0].body.a.shape[1]
+    none = np.zeros((dim.d + 2 * dim.r, 3, 0, count))
+    on_ground = places.of_joint(tree.cart_coordinate)
+    by_cart = np.zeros((dim.d + 2 * dim.r, 3, len(on_ground), count))
+    by_cart[0, 2] = 1.0
+    ground = _moved_by(tree, on_ground, by_cart)
+    nothing = _moved_by(tree, on_ground[:0], none)
+    moved, ends = _Moved(ground, {}, {}, {}), {(GROUND, 0): ground}
     for i in tree.order:
-        link, joint = links[i], tree.joints[i]
-        inner = ends.get((joint.parent, joint.interface))
-        moved = None if inner is None else link.joint.passage.matrix @ inner
-        if (columns := places.of_joint(joint.coordinate)) is not None:
-            moved = np.zeros(shape) if moved is None else moved
-            for column, one in zip(columns, link.joint.moved_by_joint, strict=True):
-                moved[:, :, column] += one.T
-        if moved is not None:
-            motions[i] = moved
+        link, joint, kept = links[i], tree.joints[i], places.kept[i]
+        by_joint, by_own = nothing, nothing
+        if len(own := places.of_joint(joint.coordinate)):
+            by_joint = _moved_by(tree, own, np.stack(link.joint.moved_by_joint, axis=1)[:, :, None])
+        moved.joints[i] = by_joint
+        inner = ends[joint.parent, joint.interface]
+        moved.frames[i] = inner.passed_on(_carrier(tree, link.joint.passage), by_joint)
         for s, interface in link.interfaces.items():
-            end = None if moved is None else interface.passage.matrix @ moved
-            if len(kept := places.kept[i]):
-                end = np.zeros(shape) if end is None else end
-                places.add(end, i, interface.moved_by_rates(kept))
-            if end is not None:
-                ends[i, s] = end
-    return motions, ends
+            if len(kept):
+                by_own = _moved_by(tree, places.of_body(i), interface.moved_by_rates(kept))
+            moved.interfaces[i, s] = by_own
+            if tree.hanging[i, s]:
+                carrier = _carrier(tree, interface.passage)
+                ends[i, s] = moved.frames[i].passed_on(carrier, by_own)
+    return moved
 
 
 def _inward_derivatives(
-    tree: Mechanism,
-    links: list[Link],
-    loads: Loads,
-    places: _Places,
-    motions: _Derivatives,
-    ends: _Ends,
+    tree: Mechanism, links: list[Link], loads: Loads, places: _Places, moved: _Moved
 ) -> Tangent:
     """Return the tangent from the derivatives of all motions."""
-    dim, count = links[0].body.dim, links[0].body.a.shape[1]
-    size, rigid, d = places.size, places.rigid, links[0].body.dim.d
-    drives = np.zeros((count, len(rigid), 3 * size))
-    on_joints: _Derivatives = {}  # of every joint's load (n, d + r, 3 S)
-    tangents: list[BodyTangent] = []
+    dim, count, rigid = tree.dim, links[0].body.a.shape[1], places.rigid
+    drives = np.zeros((count, len(rigid), 3 * places.size))
+    frames: dict[int, _Felt] = {}
+    bodies: list[BodyTangent] = []
+
+    def drive(coordinate: int | None, axis: np.ndarray, felt: _Felt, motion: _Change) -> None:
+        for row in places.of_joint(coordinate):
+            by_inboard = (axis @ felt.by_motion)[:, None] @ motion.values
+            drives[:, row, motion.places] = by_inboard[:, 0]
+            drives[:, row, felt.by_outboard.places] = axis @ felt.by_outboard.values
+            drives[:, row, 3 * row + 2] += tree.rotors[coordinate]
+
     for i in reversed(tree.order):
         link, felt = links[i], rigid.size > 0 or tree.is_felt(i)
         if not (felt or link.body.is_flexible):
             continue
-        outboard = {
-            s: _on_interface(tree, links, loads, places, (i, s), on_joints, ends.get((i, s)))
-            for s in link.interfaces
-        }
-        given = _given(link, places, motions.get(i))
-        if link.body.is_flexible:
-            every = outboard, given
-            tangents.append(_body_tangent(tree, link, loads, places, i, *every, motions.get(i)))
-        if not felt:
-            continue
-        load = np.zeros((count, d + dim.r, 3 * size))
-        if i in motions:
-            np.matmul(_by_instant(link.body.load_by_motion), motions[i], out=load)
-        if len(kept := places.kept[i]):
-            places.add(load, i, _load_by_rates(link, loads.outboard[i], kept))
+        outboard = {}
         for s, interface in link.interfaces.items():
-            load += interface.passage.of_loads @ outboard[s]
-            if s in given:
-                load[:, :, :size] += given[s]
-                lever = _by_instant(dim.by_spin(interface.place)).swapaxes(1, 2)
-                load[:, d:, :size] += lever @ given[s][:, :d]
-        on_joints[i] = load
-        if (columns := places.of_joint(link.joint.joint.coordinate)) is not None:
-            joint = link.joint
-            drives[:, columns[0]] = joint.joint.axis @ (
-                load[:, :d] if joint.slides else load[:, d:]
-            )
-            drives[:, columns[0], columns[2]] += tree.rotors[joint.joint.coordinate]
-    if (columns := places.of_joint(tree.cart_coordinate)) is not None:
-        drives[:, columns[0], columns[2]] = tree.rotors[0]
-        for k in tree.hanging[GROUND, 0]:
-            passed = _passed_on(links[k], loads.joints[k], places, on_joints[k])
-            drives[:, columns[0]] += passed[:, 0]
-    tangents.sort(key=lambda part: part.rows.start)
-    return Tangent(tuple(tangents), size, drives)
+            on = _on_interface(tree, links, loads, places, (i, s), frames, moved)
+            by_frame = on.by_motion @ _carrier(tree, interface.passage)
+            by_own = on.by_motion @ moved.interfaces[i, s].values
+            outboard[s] = _Felt(by_frame, by_own, on.by_outboard)
+        if link.body.is_flexible:
+            inboard = moved.frames[i]
+            bodies.append(_body_tangent(tree, link, loads, places, i, outboard, inboard))
+        if felt:
+            frames[i] = _on_frame(tree, link, loads, places, i, outboard)
+            axis, joint = np.zeros(dim.d + dim.r), link.joint.joint
+            axis[slice(dim.d) if link.joint.slides else slice(dim.d, None)] = joint.axis
+            drive(joint.coordinate, axis, frames[i], moved.frames[i])
+    if len(moved.ground.columns):
+        on = _on_interface(tree, links, loads, places, (GROUND, 0), frames, moved)
+        drive(tree.cart_coordinate, np.eye(dim.d + dim.r)[0], on, moved.ground)
+    bodies.sort(key=lambda part: part.rows.start)
+    return Tangent(tuple(bodies), drives)
+
+
+def _on_interface(
+    tree: Mechanism,
+    links: list[Link],
+    loads: Loads,
+    places: _Places,
+    site: Site,
+    frames: dict[int, _Felt],
+    moved: _Moved,
+) -> _Felt:
+    """Return the derivative of what hangs on an interface, by its own motion."""
+    (i, s), dim, count = site, tree.dim, links[0].body.a.shape[1]
+    by_motion = np.zeros((count, dim.d + dim.r, _motion_size(tree)))
+    behind = [_Change(np.zeros(0, dtype=int), by_motion[:, :, :0])]
+    for k in tree.hanging[site]:
+        joint, felt, by_joint = links[k].joint, frames[k], moved.joints[k]
+        of_loads = joint.passage.of_loads
+        by_motion += of_loads @ (felt.by_motion @ _carrier(tree, joint.passage))
+        if len(by_joint.columns):
+            own = of_loads @ (felt.by_motion @ by_joint.values)
+            own[:, :, 0] += joint.load_by_joint(loads.joints[k]).T
+            behind.append(_Change(by_joint.columns, own))
+        behind.append(_Change(felt.by_outboard.columns, of_loads @ felt.by_outboard.values))
+    if i != GROUND and s in links[i].carried:
+        carried = links[i].carried[s].load_by_motion
+        by_motion[:, :, : carried.shape[1]] += _by_instant(carried)
+    return _Felt(by_motion, by_motion[:, :, :0], _side_by_side(behind))
+
+
+def _on_frame(
+    tree: Mechanism,
+    link: Link,
+    loads: Loads,
+    places: _Places,
+    i: int,
+    outboard: dict[int, _Felt],
+) -> _Felt:
+    """Return the derivative of what a joint feels of the body and all behind it."""
+    dim, kept, body = tree.dim, places.kept[i], link.body
+    by_motion = _widened(tree, body.load_by_motion)
+    own = np.zeros((len(by_motion), dim.d + dim.r, 0))
+    if len(kept):
+        own = _by_coordinate(_load_by_rates(link, loads.outboard[i], kept))
+    behind = [_Change(places.of_body(i), own)]
+    for s, interface in link.interfaces.items():
+        of_loads, felt = interface.passage.of_loads, outboard[s]
+        by_motion += of_loads @ felt.by_motion
+        own += of_loads @ felt.by_own
+        behind.append(_Change(felt.by_outboard.columns, of_loads @ felt.by_outboard.values))
+        if s in link.applied:
+            given = _given(link, s)
+            lever = _by_instant(dim.by_spin(interface.place)).swapaxes(1, 2)
+            by_motion[:, :, -dim.r :] += given
+            by_motion[:, dim.d :, -dim.r :] += lever @ given[:, : dim.d]
+    return _Felt(by_motion, own, _side_by_side(behind))
 
 
 def _load_by_rates(link: Link, outboard: dict[int, Load], kept: np.ndarray) -> np.ndarray:
@@ -354,51 +488,17 @@ def _load_by_rates(link: Link, outboard: dict[int, Load], kept: np.ndarray) -> n
     return found
 
 
-def _given(link: Link, places: _Places, moved: np.ndarray | None) -> dict[int, np.ndarray]:
-    """Return the derivatives (n, d + r, S) by q of the forces of the world on the interfaces."""
-    found: dict[int, np.ndarray] = {}
-    if moved is None:
-        return found
-    dim, d, size = link.body.dim, link.body.dim.d, places.size
-    turned = moved[:, d : d + dim.r, size : 2 * size]  # by q, as the spin by q'
-    for s, applied in link.applied.items():
-        force, moment = applied.in_world
-        parts = [-_by_instant(dim.by_spin(force)) @ turned, np.zeros_like(turned)]
-        if dim.r > 1:
-            parts[1] = -_by_instant(dim.by_spin(moment)) @ turned
-        found[s] = np.concatenate(parts, axis=1)
-    return found
+def _given(link: Link, s: int) -> np.ndarray:
+    """Return the derivative (n, d + r, r) of the forces of the world by the body's rotation."""
+    dim, (force, moment) = link.body.dim, link.applied[s].in_world
+    of_moment = dim.by_spin(moment) if dim.r > 1 else np.zeros((1, 1, moment.shape[1]))
+    return -_by_instant(np.concatenate([dim.by_spin(force), of_moment]))
 
 
-def _on_interface(
-    tree: Mechanism,
-    links: list[Link],
-    loads: Loads,
-    places: _Places,
-    site: Site,
-    on_joints: dict[int, np.ndarray],
-    end: np.ndarray | None,
-) -> np.ndarray:
-    """Return the derivative of what hangs on a body's interface, in the interface's components."""
-    i, s = site
-    dim, count = links[i].body.dim, links[0].body.a.shape[1]
-    parts = [
-        _passed_on(links[k], loads.joints[k], places, on_joints[k]) for k in tree.hanging[site]
-    ]
-    if s in links[i].carried and end is not None:
-        parts.append(_by_instant(links[i].carried[s].load_by_motion) @ end)
-    if not parts:
-        return np.zeros((count, dim.d + dim.r, 3 * places.size))
-    for more in parts[1:]:
-        parts[0] += more
-    return parts[0]
-
-
-def _passed_on(link: Link, load: Load, places: _Places, moved: np.ndarray) -> np.ndarray:
-    """Return the derivative of what an interface feels of a body on it, from that on its joint."""
-    out: np.ndarray = link.joint.passage.of_loads @ moved
-    if (columns := places.of_joint(link.joint.joint.coordinate)) is not None:
-        out[:, :, columns[0]] += link.joint.load_by_joint(load).T
+def _widened(tree: Mechanism, by_motion: np.ndarray) -> np.ndarray:
+    """Return derivatives (n, ., m) by a motion of those by (a, w, wd), (., d + 2 r, n)."""
+    out = np.zeros((by_motion.shape[2], len(by_motion), _motion_size(tree)))
+    out[:, :, : by_motion.shape[1]] = by_motion.transpose(2, 0, 1)
     return out
 
 
@@ -408,36 +508,45 @@ def _body_tangent(
     loads: Loads,
     places: _Places,
     i: int,
-    outboard: dict[int, np.ndarray],
-    given: dict[int, np.ndarray],
-    moved: np.ndarray | None,
+    outboard: dict[int, _Felt],
+    inboard: _Change,
 ) -> BodyTangent:
     """Return the derivative of body i's rows."""
-    part, body, kept = tree.slices[i], link.body, places.kept[i]
-    K, D, M = body.rows_by_rates(kept, interface_pushes(link, loads.outboard[i]))
-    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    body, dim, kept = link.body, tree.dim, places.kept[i]
+    count, q = body.a.shape[1], body.constants.num_modes
+    own = np.empty((count, q, len(kept), 3))
+    rates = body.rows_by_rates(kept, interface_pushes(link, loads.outboard[i]))
+    own[..., 0], own[..., 1], own[..., 2] = rates
+    parts = [Part(_Change(places.of_body(i), own).places, None, own.reshape(count, q, -1))]
     for s, interface in link.interfaces.items():
         turning = interface.pushes_by_e(loads.outboard[i][s], kept)
         if turning is not None:
-            theta = body.V[interface.places][body.dim.d :]
-            K = K + _by_instant(theta.swapaxes(0, 1)) @ _by_instant(turning)
+            theta = body.V[interface.places][dim.d :]
+            own[..., 0] += _by_instant(theta.swapaxes(0, 1)) @ _by_instant(turning)
         by_load = _by_instant(interface.rows_by_load.swapaxes(0, 1))
         turned = interface.load_by_rates(carried_load(link, loads.outboard[i], s), kept)
-        K = K + by_load @ _by_instant(turned)
-        pairs.append((_by_instant(interface.rows_by_own_load.swapaxes(0, 1)), outboard[s]))
-        if s in given:
-            pairs.append((by_load, np.pad(given[s], ((0, 0), (0, 0), (0, 2 * places.size)))))
-    if moved is not None:
-        pairs.append((_by_instant(body.rows_by_motion.swapaxes(0, 1)), moved))
-    factors: tuple[tuple[np.ndarray | None, np.ndarray], ...] = tuple(pairs)
-    if pairs and body.constants.num_modes <= sum(right.shape[1] for _, right in pairs):
-        whole = pairs[0][0] @ pairs[0][1]
-        for left, right in pairs[1:]:
-            whole += left @ right
-        factors = ((None, whole),)
-    first = len(places.rigid)
-    rows = slice(first + part.start, first + part.stop)
-    return BodyTangent(rows, places.bodies[i], kept, K, D, M, factors)
+        own[..., 0] += by_load @ _by_instant(turned)
+        by_own_load = _by_instant(interface.rows_by_own_load.swapaxes(0, 1))
+        felt = outboard[s]
+        parts[0].right[:] += by_own_load @ felt.by_own
+        parts.append(Part(felt.by_outboard.places, by_own_load, felt.by_outboard.values))
+    if len(inboard.columns):
+        left = _widened(tree, body.rows_by_motion.swapaxes(0, 1))
+        for s, interface in link.interfaces.items():
+            left += _by_instant(interface.rows_by_own_load.swapaxes(0, 1)) @ outboard[s].by_motion
+            if s in link.applied:
+                by_load = _by_instant(interface.rows_by_load.swapaxes(0, 1))
+                left[:, :, -dim.r :] += by_load @ _given(link, s)
+        parts.append(Part(inboard.places, left, inboard.values))
+    parts = [part for part in parts if part.right.shape[2]]
+    if q <= sum(part.right.shape[1] for part in parts if part.left is not None):
+        whole = np.zeros((count, q, 3 * places.size))
+        for part in parts:
+            part.write(slice(None), whole)
+        parts = [Part(slice(None), None, whole)]
+    first, own_rows = len(places.rigid), tree.slices[i]
+    rows = slice(first + own_rows.start, first + own_rows.stop)
+    return BodyTangent(rows, places.bodies[i], kept, tuple(parts))
 
 
 def _by_instant(x: np.ndarray) -> np.ndarray:

@@ -262,6 +262,8 @@ def _distance(
 ) -> float:
     """Return max_t |u_few - u_many| / max_t |u_many| of the worst arm, |u|^2 = u' K u."""
     errors, sizes = [], []
+    t = max(few.t, many.t, key=len)  # the faster of the two motions may be looked at more closely
+    few, many = few.at(t), many.at(t)
     parts = zip(few.mechanism.slices, many.mechanism.slices, strict=True)
     for place, (a, b) in enumerate(parts):
         q, richer = few.q_e[:, a], many.q_e[:, b]

@@ -267,10 +267,15 @@ COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
 HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
 
 
-def random_chain(rng: np.random.Generator, arms: int, bent: bool = False) -> Chain:
+def random_chain(
+    rng: np.random.Generator,
+    arms: int,
+    bent: bool = False,
+    coordinates: tuple[int, ...] = COORDINATES,
+) -> Chain:
     """Return a chain of random clouds with payload and gravity in both directions."""
-    clouds = tuple(random_cloud(rng, q) for q in COORDINATES[:arms])
-    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in COORDINATES[:arms] * bent]
+    clouds = tuple(random_cloud(rng, q) for q in coordinates[:arms])
+    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in coordinates[:arms] * bent]
     stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
     return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
 

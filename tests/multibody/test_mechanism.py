@@ -43,6 +43,7 @@ from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
 
+MANY = (9, 8, 9)  # more than a motion and a load have numbers
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
 ROUNDING = 1e-12
 
@@ -99,7 +100,8 @@ def machine_of(kind: str, count: int = 4) -> Machine:
             bodies = tuple(stiffened(rng, b) if b.num_modes else b for b in mechanism.bodies)
             mechanism = replace(mechanism, bodies=bodies)
     else:
-        model = random_chain(rng, int(arms[0]), bent)
+        more = {"coordinates": MANY} if arms.endswith("many") else {}
+        model = random_chain(rng, int(arms[0]), bent, **more)
         mechanism = model.mechanism()
     size = mechanism.num_rigid + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
@@ -111,6 +113,7 @@ PUSHED = ", pushed"
 OF_POINTS = [*CHAINS, "tree"]  # a stiffened tree: by what it has of the plane's
 # Terms of stiffening and of forces are added to those of linear bodies: with all of them, and none.
 KINDS = ["1 arm", "3 arms", "tree", "3 arms, stiffened" + PUSHED, "tree, stiffened" + PUSHED]
+FACTORED = "3 arms of many"
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -154,8 +157,10 @@ def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
 
 
 @pytest.mark.serial
-def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
+@pytest.mark.parametrize("kind", [*KINDS, FACTORED, FACTORED + PUSHED])
+def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
     """Dense, by parts and from both sides, whatever rigid and elastic coordinates are asked for."""
+    machine = machine_of(kind)
     states, R = machine.states, machine.rigid
     _, count, size = states.shape
     columns = []
@@ -189,7 +194,21 @@ def test_tangent_is_the_derivative_of_the_forces(machine: Machine) -> None:
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("kind", KINDS)
+def test_bodies_have_columns_of_what_is_inboard_and_outboard() -> None:
+    """By a motion and by a load of few numbers; nothing moves the first, or loads the last."""
+    found = []
+    for body in machine_of(FACTORED).tangent().bodies:
+        sizes = {"own": 0, "load": 0, "motion": 0}
+        for part in body.parts:
+            kind = "own" if part.left is None else {3: "load", 4: "motion"}[part.right.shape[1]]
+            sizes[kind] += part.right.shape[2] // 3
+        found.append(tuple(sizes.values()))
+    a, b, c = MANY
+    assert found == [(a, b + c, 0), (b, c, a), (c, 0, a + b)]
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("kind", [*KINDS, FACTORED])
 def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
     """The same as of all at once."""
     one = machine_of(kind, 3 * measured.LEAST_INSTANTS)

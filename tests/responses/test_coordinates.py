@@ -125,6 +125,17 @@ def test_scenarios_count():
     assert error(built, x, 4) == pytest.approx(max(parts), rel=0.02)
 
 
+@pytest.mark.serial  # ranks have no part in it
+def test_motions_are_compared_at_the_same_instants():
+    """Where the richer one is looked at half as often: the instants of the other."""
+    built = auto()
+    parts = built.scene, built.partition, built.arms, built.fields(wave), built.profile
+    comparison = coordinates._Comparison(*parts)
+    found = comparison.error(4)
+    comparison.motions = [one.at(one.t[::2]) for one in comparison.motions]
+    assert comparison.error(4) == pytest.approx(found, rel=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "tolerance"),
