@@ -144,12 +144,13 @@ def test_contrast(name: str) -> None:
                 assert "interpolation.floor" in str(refusal) and "\n" not in str(refusal)
                 assert contrast < 0.9e-9
                 continue
-            # Rounding of the element matrices holds floating solids with 1e-16 of their stiffness.
+            # Rounding of the element matrices holds floating solids with 1e-16 of their stiffness:
+            # 2e-14 to 1.3e-13 over the contrast, by the kernels of OpenBLAS.
             floating = name not in ("solid", "void", "tip cut off")
             assert floats(arm.elastic) == (floating and contrast < 1e-7)
             if floating:
                 assert error < rounding_error(arm.elastic, arm.elastic.constraint_modes())
-            assert error < (max(1e-8, 1e-13 / contrast) if floating else 1e-8)
+            assert error < (max(1e-8, 2e-13 / contrast) if floating else 1e-8)
             assert error < 1e-3
 
 
