@@ -250,7 +250,7 @@ def _linearise(tree: Mechanism, motion: RigidMotion, rates: Rates, places: _Plac
 
 
 @dataclass(frozen=True, eq=False)
-class _Change:
+class _Derivative:
     """Derivatives (n, ., 3 c) by c coordinates and their rates, one coordinate after the other.
 
     `columns` (c,) are the coordinates' places among the S.
@@ -259,7 +259,7 @@ class _Change:
     columns: np.ndarray
     values: np.ndarray
 
-    def passed_on(self, matrix: np.ndarray, more: _Change) -> _Change:
+    def passed_on(self, matrix: np.ndarray, more: _Derivative) -> _Derivative:
         """Return matrix times the derivatives, and behind them those by further coordinates."""
         if len(self.columns) == 0:
             return more
@@ -267,7 +267,7 @@ class _Change:
         out = np.empty((*more.values.shape[:2], old + more.values.shape[2]))
         np.matmul(matrix, self.values, out=out[:, :, :old])
         out[:, :, old:] = more.values
-        return _Change(np.concatenate([self.columns, more.columns]), out)
+        return _Derivative(np.concatenate([self.columns, more.columns]), out)
 
     @cached_property
     def places(self) -> np.ndarray | slice:
@@ -279,16 +279,16 @@ class _Change:
         return out
 
 
-def _side_by_side(changes: list[_Change]) -> _Change:
+def _side_by_side(changes: list[_Derivative]) -> _Derivative:
     some = [one for one in changes if len(one.columns)] or changes[:1]
     if len(some) == 1:
         return some[0]
     columns = np.concatenate([one.columns for one in some])
-    return _Change(columns, np.concatenate([one.values for one in some], axis=2))
+    return _Derivative(columns, np.concatenate([one.values for one in some], axis=2))
 
 
 @dataclass(frozen=True, eq=False)
-class _Moved:
+class _MotionDerivatives:
     """Derivatives of motions (n, m, .), each in its own components.
 
     Attributes:
@@ -298,14 +298,14 @@ class _Moved:
         interfaces: by the coordinates of their own body.
     """
 
-    ground: _Change
-    frames: dict[int, _Change]
-    joints: dict[int, _Change]
-    interfaces: dict[Site, _Change]
+    ground: _Derivative
+    frames: dict[int, _Derivative]
+    joints: dict[int, _Derivative]
+    interfaces: dict[Site, _Derivative]
 
 
 @dataclass(frozen=True, eq=False)
-class _Felt:
+class _LoadDerivative:
     """Derivatives of the load (n, d + r, .) on a frame or an interface, in its components.
 
     Attributes:
@@ -316,7 +316,7 @@ class _Felt:
 
     by_motion: np.ndarray
     by_own: np.ndarray
-    by_outboard: _Change
+    by_outboard: _Derivative
 
 
 def _motion_size(tree: Mechanism) -> int:
@@ -329,14 +329,14 @@ def _by_coordinate(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(x.transpose(3, 0, 2, 1)).reshape(x.shape[3], len(x), -1)
 
 
-def _moved_by(tree: Mechanism, columns: np.ndarray, x: np.ndarray) -> _Change:
+def _moved_by(tree: Mechanism, columns: np.ndarray, x: np.ndarray) -> _Derivative:
     """Return the derivatives of a motion from those of (a, w, wd) (d + 2 r, 3, k, n)."""
     if tree.forces:
         spin = x[tree.dim.d : tree.dim.d + tree.dim.r]
         turned = np.zeros_like(spin)
         turned[:, 0] = spin[:, 1]  # by q, as the spin by q'
         x = np.concatenate([x, turned])
-    return _Change(columns, _by_coordinate(x))
+    return _Derivative(columns, _by_coordinate(x))
 
 
 def _carrier(tree: Mechanism, passage: Passage) -> np.ndarray:
@@ -350,7 +350,7 @@ def _carrier(tree: Mechanism, passage: Passage) -> np.ndarray:
     return out
 
 
-def _outward_derivatives(tree: Mechanism, links: list[Link], places: _Places) -> _Moved:
+def _outward_derivatives(tree: Mechanism, links: list[Link], places: _Places) -> _MotionDerivatives:
     dim, count = tree.dim, links[0].body.a.shape[1]
     none = np.zeros((dim.d + 2 * dim.r, 3, 0, count))
     on_ground = places.of_joint(tree.cart_coordinate)
@@ -358,7 +358,7 @@ def _outward_derivatives(tree: Mechanism, links: list[Link], places: _Places) ->
     by_cart[0, 2] = 1.0
     ground = _moved_by(tree, on_ground, by_cart)
     nothing = _moved_by(tree, on_ground[:0], none)
-    moved, ends = _Moved(ground, {}, {}, {}), {(GROUND, 0): ground}
+    moved, ends = _MotionDerivatives(ground, {}, {}, {}), {(GROUND, 0): ground}
     for i in tree.order:
         link, joint, kept = links[i], tree.joints[i], places.kept[i]
         by_joint, by_own = nothing, nothing
@@ -378,19 +378,21 @@ def _outward_derivatives(tree: Mechanism, links: list[Link], places: _Places) ->
 
 
 def _inward_derivatives(
-    tree: Mechanism, links: list[Link], loads: Loads, places: _Places, moved: _Moved
+    tree: Mechanism, links: list[Link], loads: Loads, places: _Places, moved: _MotionDerivatives
 ) -> Tangent:
     """Return the tangent from the derivatives of all motions."""
     dim, count, rigid = tree.dim, links[0].body.a.shape[1], places.rigid
     drives = np.zeros((count, len(rigid), 3 * places.size))
-    frames: dict[int, _Felt] = {}
+    frames: dict[int, _LoadDerivative] = {}
     bodies: list[BodyTangent] = []
 
-    def drive(coordinate: int | None, axis: np.ndarray, felt: _Felt, motion: _Change) -> None:
+    def drive(
+        coordinate: int | None, axis: np.ndarray, load: _LoadDerivative, motion: _Derivative
+    ) -> None:
         for row in places.of_joint(coordinate):
-            by_inboard = (axis @ felt.by_motion)[:, None] @ motion.values
+            by_inboard = (axis @ load.by_motion)[:, None] @ motion.values
             drives[:, row, motion.places] = by_inboard[:, 0]
-            drives[:, row, felt.by_outboard.places] = axis @ felt.by_outboard.values
+            drives[:, row, load.by_outboard.places] = axis @ load.by_outboard.values
             drives[:, row, 3 * row + 2] += tree.rotors[coordinate]
 
     for i in reversed(tree.order):
@@ -402,7 +404,7 @@ def _inward_derivatives(
             on = _on_interface(tree, links, loads, places, (i, s), frames, moved)
             by_frame = on.by_motion @ _carrier(tree, interface.passage)
             by_own = on.by_motion @ moved.interfaces[i, s].values
-            outboard[s] = _Felt(by_frame, by_own, on.by_outboard)
+            outboard[s] = _LoadDerivative(by_frame, by_own, on.by_outboard)
         if link.body.is_flexible:
             inboard = moved.frames[i]
             bodies.append(_body_tangent(tree, link, loads, places, i, outboard, inboard))
@@ -424,26 +426,26 @@ def _on_interface(
     loads: Loads,
     places: _Places,
     site: Site,
-    frames: dict[int, _Felt],
-    moved: _Moved,
-) -> _Felt:
+    frames: dict[int, _LoadDerivative],
+    moved: _MotionDerivatives,
+) -> _LoadDerivative:
     """Return the derivative of what hangs on an interface, by its own motion."""
     (i, s), dim, count = site, tree.dim, links[0].body.a.shape[1]
     by_motion = np.zeros((count, dim.d + dim.r, _motion_size(tree)))
-    behind = [_Change(np.zeros(0, dtype=int), by_motion[:, :, :0])]
+    behind = [_Derivative(np.zeros(0, dtype=int), by_motion[:, :, :0])]
     for k in tree.hanging[site]:
-        joint, felt, by_joint = links[k].joint, frames[k], moved.joints[k]
+        joint, load, by_joint = links[k].joint, frames[k], moved.joints[k]
         of_loads = joint.passage.of_loads
-        by_motion += of_loads @ (felt.by_motion @ _carrier(tree, joint.passage))
+        by_motion += of_loads @ (load.by_motion @ _carrier(tree, joint.passage))
         if len(by_joint.columns):
-            own = of_loads @ (felt.by_motion @ by_joint.values)
+            own = of_loads @ (load.by_motion @ by_joint.values)
             own[:, :, 0] += joint.load_by_joint(loads.joints[k]).T
-            behind.append(_Change(by_joint.columns, own))
-        behind.append(_Change(felt.by_outboard.columns, of_loads @ felt.by_outboard.values))
+            behind.append(_Derivative(by_joint.columns, own))
+        behind.append(_Derivative(load.by_outboard.columns, of_loads @ load.by_outboard.values))
     if i != GROUND and s in links[i].carried:
         carried = links[i].carried[s].load_by_motion
         by_motion[:, :, : carried.shape[1]] += _by_instant(carried)
-    return _Felt(by_motion, by_motion[:, :, :0], _side_by_side(behind))
+    return _LoadDerivative(by_motion, by_motion[:, :, :0], _side_by_side(behind))
 
 
 def _on_frame(
@@ -452,26 +454,26 @@ def _on_frame(
     loads: Loads,
     places: _Places,
     i: int,
-    outboard: dict[int, _Felt],
-) -> _Felt:
+    outboard: dict[int, _LoadDerivative],
+) -> _LoadDerivative:
     """Return the derivative of what a joint feels of the body and all behind it."""
     dim, kept, body = tree.dim, places.kept[i], link.body
     by_motion = _widened(tree, body.load_by_motion)
     own = np.zeros((len(by_motion), dim.d + dim.r, 0))
     if len(kept):
         own = _by_coordinate(_load_by_rates(link, loads.outboard[i], kept))
-    behind = [_Change(places.of_body(i), own)]
+    behind = [_Derivative(places.of_body(i), own)]
     for s, interface in link.interfaces.items():
-        of_loads, felt = interface.passage.of_loads, outboard[s]
-        by_motion += of_loads @ felt.by_motion
-        own += of_loads @ felt.by_own
-        behind.append(_Change(felt.by_outboard.columns, of_loads @ felt.by_outboard.values))
+        of_loads, load = interface.passage.of_loads, outboard[s]
+        by_motion += of_loads @ load.by_motion
+        own += of_loads @ load.by_own
+        behind.append(_Derivative(load.by_outboard.columns, of_loads @ load.by_outboard.values))
         if s in link.applied:
             given = _given(link, s)
             lever = _by_instant(dim.by_spin(interface.place)).swapaxes(1, 2)
             by_motion[:, :, -dim.r :] += given
             by_motion[:, dim.d :, -dim.r :] += lever @ given[:, : dim.d]
-    return _Felt(by_motion, own, _side_by_side(behind))
+    return _LoadDerivative(by_motion, own, _side_by_side(behind))
 
 
 def _load_by_rates(link: Link, outboard: dict[int, Load], kept: np.ndarray) -> np.ndarray:
@@ -508,8 +510,8 @@ def _body_tangent(
     loads: Loads,
     places: _Places,
     i: int,
-    outboard: dict[int, _Felt],
-    inboard: _Change,
+    outboard: dict[int, _LoadDerivative],
+    inboard: _Derivative,
 ) -> BodyTangent:
     """Return the derivative of body i's rows."""
     body, dim, kept = link.body, tree.dim, places.kept[i]
@@ -517,7 +519,7 @@ def _body_tangent(
     own = np.empty((count, q, len(kept), 3))
     rates = body.rows_by_rates(kept, interface_pushes(link, loads.outboard[i]))
     own[..., 0], own[..., 1], own[..., 2] = rates
-    parts = [Part(_Change(places.of_body(i), own).places, None, own.reshape(count, q, -1))]
+    parts = [Part(_Derivative(places.of_body(i), own).places, None, own.reshape(count, q, -1))]
     for s, interface in link.interfaces.items():
         turning = interface.pushes_by_e(loads.outboard[i][s], kept)
         if turning is not None:
@@ -527,9 +529,9 @@ def _body_tangent(
         turned = interface.load_by_rates(carried_load(link, loads.outboard[i], s), kept)
         own[..., 0] += by_load @ _by_instant(turned)
         by_own_load = _by_instant(interface.rows_by_own_load.swapaxes(0, 1))
-        felt = outboard[s]
-        parts[0].right[:] += by_own_load @ felt.by_own
-        parts.append(Part(felt.by_outboard.places, by_own_load, felt.by_outboard.values))
+        load = outboard[s]
+        parts[0].right[:] += by_own_load @ load.by_own
+        parts.append(Part(load.by_outboard.places, by_own_load, load.by_outboard.values))
     if len(inboard.columns):
         left = _widened(tree, body.rows_by_motion.swapaxes(0, 1))
         for s, interface in link.interfaces.items():

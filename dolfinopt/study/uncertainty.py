@@ -381,7 +381,7 @@ class Sampling:
 
     samples: int = 1000  # that the statistics rest on
     seed: int = 1  # of all that is random
-    sampler: Sampler = "sobol"  # see `statistics.unit_points`
+    sampler: Sampler = "sobol"  # see `unit_points`
     indices: Literal["polynomial", "saltelli"] = "polynomial"
 
     def points(self, dimensions: int) -> np.ndarray:
@@ -425,7 +425,7 @@ def study_random(
 
     Args:
         scene: with the nominal values; its scenarios are left out.
-        random: texts "key.path=distribution", see `statistics.parse_distribution`.
+        random: texts "key.path=distribution", see `parse_distribution`.
         designs, folder, world, shown: see `studies.study`; InputError as there.
         sampling: how many samples, and how they are drawn.
     """
