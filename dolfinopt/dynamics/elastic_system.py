@@ -40,7 +40,7 @@ class ElasticInstants:
 
     def __getitem__(self, part: slice | np.ndarray) -> ElasticInstants:
         """Return it at some of the instants."""
-        return ElasticInstants(self.mechanism[part], self.motion[part])
+        return ElasticInstants(self.mechanism, self.motion[part])
 
     def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the elastic residual (n, N)."""

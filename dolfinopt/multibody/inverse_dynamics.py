@@ -69,7 +69,7 @@ def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Lin
         if joint.parent != GROUND:
             inner = links[joint.parent].interfaces[joint.interface].motion
         moving = MovingJoint(joint, inner, own)
-        body = BodyMotion(tree.constants[i], moving.motion, elastic[tree.slices[i]], tree.scale(i))
+        body = BodyMotion(tree.constants[i], moving.motion, elastic[tree.slices[i]])
         interfaces = {s: Interface(body, s) for s in tree.sites[i]}
         carried = {
             s: BodyMotion(tree.loads[i, s], interface.motion, none)

@@ -20,14 +20,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import (
-    UNSCALED,
-    Constants,
-    Load,
-    Motion,
-    PerInstant,
-    Scale,
-)
+from dolfinopt.multibody.body_motion import Constants, Load, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -231,10 +224,7 @@ class Closure:
         return cls(point, np.array([1.0, 1j]))
 
 
-# -- values that are the same at all instants, or given at each: several mechanisms in one batch
-#
-# Scenarios of the same bodies (other payloads, gravity, materials) lie one after the other in the
-# arrays of instants; what they share is stored once.
+# -- few instants: the same bits wherever arrays lie in memory
 
 
 def repeated(count: int) -> np.ndarray | None:
@@ -314,17 +304,14 @@ def product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
 class Mechanism:
     """Bodies, the joints that hold them, what they carry, and gravity; in the plane or in space.
 
-    Loads, gravity and scales may differ from instant to instant: several mechanisms in one.
-
     Attributes:
         bodies: in the order of the elastic coordinates.
         joints: that hold them, in the same order.
         loads: what they carry at interfaces without a joint, in the interfaces' frames.
-        gravity: (d, 1), or (d, n) of instants that differ, m/s2.
+        gravity: (d, 1) m/s2.
         end: the end-effector's interface.
         origin: (d,) of the ground's frame, which a cart moves along x, m.
         cart: its mass, kg, of the first rigid coordinate; None without one.
-        scales: of every body's elastic rows, forces and moments, or none.
         forces: given ones on interfaces.
         bearings: the bodies whose joints sit on bearings, see `joints.with_bearings`: the last
             bodies, massless, in this order.
@@ -339,21 +326,10 @@ class Mechanism:
     end: Site
     origin: np.ndarray
     cart: float | None = None
-    scales: tuple[Scale, ...] = ()
     forces: tuple[AppliedForce, ...] = ()
     bearings: tuple[int, ...] = ()
     friction: Friction | None = None
     rods: int = 0
-
-    def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
-        """Return it at some of the instants."""
-        loads = {site: one[part] for site, one in self.loads.items()}
-        alike = all(one is self.loads[site] for site, one in loads.items())
-        if alike and not self.scales and self.gravity.shape[1] == 1:
-            return self
-        gravity = self.gravity if self.gravity.shape[1] == 1 else self.gravity[:, part]
-        scales = tuple(scale[part] for scale in self.scales)
-        return replace(self, loads=loads, gravity=gravity, scales=scales)
 
     @property
     def rigid(self) -> Mechanism:
@@ -482,10 +458,6 @@ class Mechanism:
             return False
         return self.bodies[parent].num_modes > 0 or self.is_felt(parent)
 
-    def scale(self, i: int) -> Scale:
-        """Return that of a body."""
-        return self.scales[i] if self.scales else UNSCALED
-
     def base(self, q_r: np.ndarray) -> np.ndarray:
         """Return where the ground's frame is (d, n), m, for rigid coordinates (n, R)."""
         place = np.repeat(self.origin[:, None], len(q_r), axis=1)
@@ -605,9 +577,9 @@ class JointHardware:
 
 def plane_chain(
     bodies: Sequence[ShapeIntegrals],
-    payload_mass: PerInstant,
-    payload_inertia: PerInstant,
-    gravity: tuple[PerInstant, PerInstant],
+    payload_mass: float,
+    payload_inertia: float,
+    gravity: Sequence[float],
     joint_height: float,
     *,
     hardware: Sequence[JointHardware] = (),
@@ -642,7 +614,7 @@ def plane_chain(
         bodies=tuple(bodies),
         joints=tuple(joints),
         loads=loads,
-        gravity=np.stack(np.broadcast_arrays(*map(np.atleast_1d, gravity))),
+        gravity=np.array(gravity, dtype=float)[:, None],
         end=(last, 0),
         origin=np.array([0.0, joint_height]),
         cart=cart_mass,

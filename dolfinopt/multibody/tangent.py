@@ -209,7 +209,7 @@ def linearise(
         return _linearise(mechanism, motion, (q, qd, qdd), places)
     return _joined(
         [
-            _linearise(mechanism[part], motion[part], (q[part], qd[part], qdd[part]), places)
+            _linearise(mechanism, motion[part], (q[part], qd[part], qdd[part]), places)
             for part in (slice(a, b) for a, b in pairwise(ends))
         ]
     )
