@@ -24,7 +24,8 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.tangent import linearise
 
 
 @dataclass(frozen=True, eq=False)

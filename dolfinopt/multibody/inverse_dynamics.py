@@ -14,7 +14,7 @@ import numpy as np
 from dolfinopt.multibody.body_motion import BodyMotion, Load
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.dimension import compose, product
-from dolfinopt.multibody.kinematics import Interface, MovingJoint
+from dolfinopt.multibody.kinematics import Interface, MovingJoint, MovingRotor
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
@@ -32,6 +32,7 @@ class Link:
         interfaces: its outboard ones on which something sits, by number.
         carried: what it carries there without a joint, as it moves, by number.
         applied: what given forces ask of it there, by number.
+        rotor: of the joint's motor, on what the joint sits on; or None.
     """
 
     joint: MovingJoint
@@ -39,6 +40,7 @@ class Link:
     interfaces: dict[int, Interface]
     carried: dict[int, BodyMotion]
     applied: dict[int, Applied]
+    rotor: MovingRotor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +78,23 @@ def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Lin
             for s, interface in interfaces.items()
             if (i, s) in tree.loads
         }
-        links[i] = Link(moving, body, interfaces, carried, {})
+        rotor = None
+        if i in tree.rotors:
+            rotor = MovingRotor(joint, inner, _motor_rates(tree, motion, i))
+        links[i] = Link(moving, body, interfaces, carried, {}, rotor)
     found = [links[i] for i in range(len(links))]
     if tree.forces:
         _apply_forces(tree, found, motion)
     return found
+
+
+def _motor_rates(tree: Mechanism, motion: RigidMotion, i: int) -> np.ndarray:
+    """Return speed and acceleration (2, n) of the motor of body i's joint."""
+    motor = tree.rotors[i] - tree.num_rigid
+    if motor >= 0 and motion.motors is not None:
+        return motion.motors[:, :, motor]
+    k = tree.joints[i].coordinate
+    return np.stack([motion.qd[:, k], motion.qdd[:, k]])
 
 
 def _apply_forces(tree: Mechanism, links: list[Link], motion: RigidMotion) -> None:
@@ -153,7 +167,9 @@ def inward_pass(
         if not (felt or link.body.is_flexible):
             continue
         for s, interface in link.interfaces.items():
+            on_it = [links[k] for k in tree.hanging[i, s]]
             parts = [links[k].joint.at_interface(joints[k]) for k in tree.hanging[i, s]]
+            parts += [one.rotor.load for one in on_it if one.rotor is not None]
             if s in link.carried:
                 parts.append(link.carried[s].load)
             if (i, s) in pull:
@@ -209,22 +225,24 @@ def inverse_dynamics(
         q, qd, qdd: (n, N) elastic coordinates and derivatives.
 
     Returns:
-        Elastic residual (n, N), zero when the equations of motion hold, and what drives the joints
-        (n, joints), N m of revolute and N of prismatic ones.
+        Elastic residual (n, N), zero when the equations of motion hold, and what drives the rigid
+        coordinates and the motors behind springs (n, R + M), N m of revolute and N of prismatic
+        joints.
     """
     tree: Mechanism = mechanism
     links = outward_pass(tree, motion, (q, qd, qdd))
     loads = inward_pass(tree, links)
-    drives = [links[i].joint.drive(loads.joints[i]) for i in tree.movable]
+    forces = np.zeros((len(q), tree.num_rigid + len(tree.motor_joints)))
+    for i in tree.movable:
+        forces[:, tree.joints[i].coordinate] = links[i].joint.drive(loads.joints[i])
+    for i, k in tree.rotors.items():
+        forces[:, k] += links[i].rotor.force
     if tree.cart is not None:
-        on_ground = tree.hanging[GROUND, 0]
-        pulls = [links[i].joint.at_interface(loads.joints[i])[0][0] for i in on_ground]
-        drives.insert(0, np.sum(pulls, axis=0))
-    drives += [np.zeros(len(q))] * tree.rods  # weigh nothing
-    forces = np.stack(drives, axis=1) if drives else np.zeros((len(q), 0))
-    forces = forces + tree.rotors * motion.qdd
+        forces[:, 0] = tree.cart * motion.qdd[:, 0]
+        for i in tree.hanging[GROUND, 0]:
+            forces[:, 0] += links[i].joint.at_interface(loads.joints[i])[0][0]
     if tree.friction is not None:
-        forces = forces + tree.friction.force(motion.qd)
+        forces[:, : tree.num_rigid] += tree.friction.force(motion.qd)
     return elastic_rows(links, loads), forces
 
 

@@ -425,6 +425,72 @@ class MovingJoint:
         return np.concatenate([force, moment])
 
 
+class MovingRotor:
+    """A rotor whose axis n is fixed to the interface that carries it, in whose components all is.
+
+    Its angular momentum is h = J s n beside what the interface's body has, s = n . w + N v with the
+    interface's angular velocity w and the motor's speed v as the joint would have it. To move it,
+    the motor gives N J s', and the interface the moment
+
+        dh/dt = J s' n + w x J s n.
+
+    Attributes:
+        load: force (zero) and moment on the interface (., n).
+        force: of the motor (n,), N m, N.
+    """
+
+    def __init__(self, joint: Joint, inner: Motion, rates: np.ndarray) -> None:
+        """Take the joint, the interface's motion, the motor's speed and acceleration (2, n)."""
+        assert joint.rotor is not None
+        a, self.w, wd = inner
+        self.dim = dim = DIMENSIONS[len(joint.origin)][0]
+        self.axis = dim.rotated(joint.rotation, joint.axis[:, None])
+        self.inertia, self.ratio = joint.rotor.inertia, joint.rotor.ratio
+        speed, change = ((self.axis * x).sum(axis=0) for x in (self.w, wd))
+        self.momentum = self.inertia * (speed + self.ratio * rates[0])
+        moment = self.inertia * (change + self.ratio * rates[1])
+        self.force = self.ratio * moment
+        self.load = np.zeros_like(a), self.axis * moment
+        if dim.r > 1:
+            self.load = self.load[0], self.load[1] + self._gyroscopic(self.momentum)
+
+    def _gyroscopic(self, momentum: np.ndarray | float) -> np.ndarray:
+        """Return w x n times a momentum (r, n): zero in the plane."""
+        return self.dim.commutator(self.w, np.asarray(self.axis * momentum))
+
+    @cached_property
+    def load_by_motion(self) -> np.ndarray:
+        """Derivative of force and moment by the interface's motion (d + r, d + 2 r, n)."""
+        dim, d, r, J = self.dim, self.dim.d, self.dim.r, self.inertia
+        out = np.zeros((d + r, d + 2 * r, self.w.shape[1]))
+        out[d:, d + r :] = (J * self.axis @ self.axis.T)[:, :, None]
+        if dim.r > 1:
+            out[d:, d : d + r] = self._gyroscopic(J)[:, None] * self.axis[:, :, None].swapaxes(0, 1)
+            out[d:, d : d + r] -= dim.skew(self.axis[:, 0])[:, :, None] * self.momentum
+        return out
+
+    @cached_property
+    def force_by_motion(self) -> np.ndarray:
+        """Derivative of the motor's force by the interface's motion (d + 2 r,)."""
+        d, r = self.dim.d, self.dim.r
+        return np.concatenate([np.zeros(d + r), self.ratio * self.inertia * self.axis[:, 0]])
+
+    @cached_property
+    def load_by_motor(self) -> np.ndarray:
+        """Derivative of force and moment by the motor's angle and its rates (d + r, 3, n)."""
+        d, own = self.dim.d, self.ratio * self.inertia
+        out = np.zeros((d + self.dim.r, 3, self.w.shape[1]))
+        out[d:, 2] = own * self.axis
+        if self.dim.r > 1:
+            out[d:, 1] = self._gyroscopic(own)
+        return out
+
+    @property
+    def force_by_motor(self) -> float:
+        """Derivative of the motor's force by its acceleration, kg m2."""
+        return self.ratio**2 * self.inertia
+
+
 # -- the end-effector: where it is, how far off the equivalent rigid machine's, derivatives --
 
 

@@ -15,6 +15,7 @@ from dolfinopt.multibody.mechanism import (
     Joint,
     JointHardware,
     Mechanism,
+    Rotor,
     Site,
     bearing_body,
     plane_chain,
@@ -307,7 +308,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     index = {arm.name: k for k, arm in enumerate(scene.arms)}
     coordinates = {joint.name: i for i, joint in enumerate(scene.movable)}
     by_child = {index[joint.child]: joint for joint in scene.joints}
-    joints, parts = [], joint_parts(scene)
+    joints, rotors = [], rotors_of(scene)
     for k in range(len(scene.arms)):
         one = by_child[k]
         parent, interface = GROUND, 0
@@ -324,7 +325,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
                 axis=axis / np.linalg.norm(axis),
                 origin=np.array(one.origin, dtype=float),
                 rotation=roll_pitch_yaw(one.rpy),
-                rotor=_rigid_rotor(parts[k]),
+                rotor=rotors[k],
                 interface=interface,
             )
         )
@@ -448,17 +449,28 @@ def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
         (scene.motion.gravity[0], scene.motion.gravity[1]),
         scene.motion.joint_height,
         hardware=[
-            JointHardware(arm.joint_mass, arm.joint_inertia, _rigid_rotor(parts))
-            for arm, parts in zip(scene.arms, joint_parts(scene), strict=True)
+            JointHardware(arm.joint_mass, arm.joint_inertia, rotor)
+            for arm, rotor in zip(scene.arms, rotors_of(scene), strict=True)
         ],
         cart_mass=scene.motion.cart_mass,
     )
     return _with_parts(mechanism, scene)
 
 
-def _rigid_rotor(parts: JointParts) -> float:
-    """Return the rotor's inertia that moves with the joint: none behind a gear's spring."""
-    return 0.0 if parts.stiffness > 0.0 else parts.rotor
+def soft_joints(scene: Scene) -> dict[int, JointParts]:
+    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
+    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
+    return dict(sorted(found.items()))
+
+
+def rotors_of(scene: Scene) -> list[Rotor | None]:
+    """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
+    motors = {k: place for place, k in enumerate(soft_joints(scene))}
+    return [
+        Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
+        for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
+    ]
 
 
 @dataclass(frozen=True)

@@ -96,19 +96,17 @@ class Springs:
     Attributes:
         joints: (M,) places of their joints among the free rigid coordinates.
         stiffness, damping: (M,) N m/rad, N m s/rad.
-        rotor: (M,) inertia of the motors as the joints feel it, kg m2.
         friction: of the motors, as the joints feel it.
     """
 
     joints: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
-    rotor: np.ndarray
     friction: Friction
 
 
 NOTHING = np.zeros(0)
-NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, NOTHING, Friction.none(0))
+NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, Friction.none(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +127,7 @@ class Drives:
             springs give under u_ff.
         table: of instants t (n,), s, forces (n, R) that are added; or None.
         springs: between drives and arms, where a drive is controlled.
-        rotors: (R,) inertia of rotors on the desired motion, before springs, which their motors
-            move as well, kg m2; or None.
-        friction: (R,) of these motors; or None.
+        friction: (R,) of motors before springs that are on the desired motion; or None.
     """
 
     free: np.ndarray
@@ -142,7 +138,6 @@ class Drives:
     rigid_feed_forward: bool = False
     table: Callable[[np.ndarray], np.ndarray] | None = None
     springs: Springs = NO_SPRINGS
-    rotors: np.ndarray | None = None
     friction: Friction | None = None
     winding: bool = False
 
@@ -239,6 +234,23 @@ JointType = Literal["revolute", "prismatic", "fixed"]
 Site = tuple[int, int]  # body, and which of its outboard interfaces
 
 
+@dataclass(frozen=True)
+class Rotor:
+    """The rotor of a joint's motor, carried by what the joint sits on, its axis along the joint's.
+
+    Attributes:
+        inertia: J about its axis, which is not part of any body's inertia, kg m2.
+        ratio: turns of the rotor for one of the joint, against what carries it; rad/m of a
+            prismatic joint, whose screw is right-handed.
+        motor: its place among the motors behind springs, which have coordinates of their own;
+            None: it turns with the joint.
+    """
+
+    inertia: float
+    ratio: float
+    motor: int | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Joint:
     """What holds a body.
@@ -251,7 +263,7 @@ class Joint:
         axis: (3,) unit vector in the joint's frame; (1,) of a plane's joint, which turns.
         origin: (d,) of the joint's frame in the parent's interface frame, m.
         rotation: (d, d) from the joint's frame to the parent's interface frame.
-        rotor: inertia of what drives it, times the gear ratio squared, kg m2 (prismatic: kg).
+        rotor: of what drives it, or None.
         interface: number of the parent's outboard interface, 0 for the first.
     """
 
@@ -262,7 +274,7 @@ class Joint:
     axis: np.ndarray
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    rotor: float = 0.0
+    rotor: Rotor | None = None
     interface: int = 0
 
     @cached_property
@@ -376,10 +388,31 @@ class Mechanism:
         """Number N of elastic coordinates of all bodies."""
         return sum(body.num_modes for body in self.bodies)
 
-    @property
+    @cached_property
     def num_rigid(self) -> int:
         """Number R of rigid coordinates, of cart, joints and rods."""
-        return len(self.rotors)
+        return (self.cart is not None) + len(self.movable) + self.rods
+
+    @cached_property
+    def rotors(self) -> Mapping[int, int]:
+        """Coordinates of all rotors by the bodies whose joints they drive.
+
+        That of the joint, or R + its place of a motor behind a spring.
+        """
+        return {
+            i: joint.coordinate if joint.rotor.motor is None else self.num_rigid + joint.rotor.motor
+            for i, joint in enumerate(self.joints)
+            if joint.rotor is not None and joint.coordinate is not None
+        }
+
+    @cached_property
+    def motor_joints(self) -> np.ndarray:
+        """Coordinates (M,) of the joints whose motors are behind springs.
+
+        The motors' own coordinates follow the R rigid ones.
+        """
+        pairs = [(k, self.joints[i].coordinate) for i, k in self.rotors.items()]
+        return np.array([own for k, own in sorted(pairs) if k >= self.num_rigid], dtype=int)
 
     @cached_property
     def movable(self) -> tuple[int, ...]:
@@ -391,12 +424,6 @@ class Mechanism:
     def cart_coordinate(self) -> int | None:
         """Place of the cart among the rigid coordinates, None without one."""
         return None if self.cart is None else 0
-
-    @cached_property
-    def rotors(self) -> np.ndarray:
-        """Mass of the cart and reflected inertia of every rigid coordinate's drive (R,)."""
-        cart = [] if self.cart is None else [self.cart]
-        return np.array([*cart, *(self.joints[i].rotor for i in self.movable), *[0.0] * self.rods])
 
     # -- how the recursions go along it ------------------------------------------------------
 
@@ -427,16 +454,17 @@ class Mechanism:
 
     @cached_property
     def order(self) -> tuple[int, ...]:
-        """The bodies, every one behind its parent."""
+        """The bodies depth first: behind its parent every one with all that hangs on it."""
         found: list[int] = []
-        while len(found) < len(self.joints):
-            more = [
-                i
-                for i, joint in enumerate(self.joints)
-                if i not in found and (joint.parent == GROUND or joint.parent in found)
-            ]
-            assert more, "joints form a loop"
-            found += more
+
+        def visit(site: Site) -> None:
+            for k in self.hanging[site]:
+                found.append(k)
+                for s in self.sites[k]:
+                    visit((k, s))
+
+        visit((GROUND, 0))
+        assert len(found) == len(self.joints), "joints form a loop"
         return tuple(found)
 
     @cached_property
@@ -566,13 +594,12 @@ class JointHardware:
 
     Attributes:
         mass, inertia: at the outboard interface, kg, kg m2.
-        rotor: inertia of the rotor that drives the inboard joint, times its gear ratio squared,
-            kg m2.
+        rotor: that drives the inboard joint, or None.
     """
 
     mass: float = 0.0
     inertia: float = 0.0
-    rotor: float = 0.0
+    rotor: Rotor | None = None
 
 
 def plane_chain(
@@ -676,7 +703,7 @@ def with_bearings(mechanism: Mechanism, bearings: Mapping[int, ShapeIntegrals]) 
     for place, k in enumerate(bearings, len(joints)):
         held = joints[k]
         name = f"bearing of {held.name}"
-        more.append(replace(held, name=name, kind="fixed", coordinate=None, rotor=0.0))
+        more.append(replace(held, name=name, kind="fixed", coordinate=None, rotor=None))
         joints[k] = replace(held, parent=place, interface=0, origin=np.zeros(d), rotation=np.eye(d))
     return replace(
         mechanism,

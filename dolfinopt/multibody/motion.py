@@ -58,17 +58,21 @@ class RigidMotion:
             x_cart is its constant position.
         applied: (n, F, d + r) force and moment of every `mechanism.AppliedForce`, N and N m, in
             the components it has; None without.
+        motors: (2, n, M) speeds and accelerations of motors behind springs, as their joints would
+            have them, rad/s, rad/s2; None: those of the joints.
     """
 
     q: np.ndarray
     qd: np.ndarray
     qdd: np.ndarray
     applied: np.ndarray | None = None
+    motors: np.ndarray | None = None
 
     def __getitem__(self, part: slice | np.ndarray) -> RigidMotion:
         """Return it at some of the instants."""
         applied = None if self.applied is None else self.applied[part]
-        return RigidMotion(self.q[part], self.qd[part], self.qdd[part], applied)
+        motors = None if self.motors is None else self.motors[:, part]
+        return RigidMotion(self.q[part], self.qd[part], self.qdd[part], applied, motors)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,6 @@ from remainders import substructure
 from runs import ROOT
 from scipy.linalg import expm
 
-from dolfinopt.multibody import measured
-from dolfinopt.multibody import tangent as tangents
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.kinematics import (
@@ -39,7 +37,8 @@ from dolfinopt.multibody.machine import roll_pitch_yaw, skew
 from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import shape_integrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.tangent import linearise
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
 
@@ -58,12 +57,14 @@ class Machine:
 
     @property
     def rigid(self) -> int:
-        return self.mechanism.num_rigid
+        return self.mechanism.num_rigid + len(self.mechanism.motor_joints)
 
     def split(self, states: np.ndarray) -> tuple[RigidMotion, list[np.ndarray]]:
         """Return rigid motion and elastic coordinates with rates."""
         forces, (count, b) = self.mechanism.forces, (states.shape[1], self.mechanism.dim.b)
-        motion = RigidMotion(*states[:, :, : self.rigid])
+        motion = RigidMotion(*states[:, :, : self.mechanism.num_rigid])
+        motors = states[1:, :, self.mechanism.num_rigid : self.rigid]
+        motion = replace(motion, motors=motors)
         if forces:
             values = np.random.default_rng(11).normal(size=(count, len(forces), b))
             motion = replace(motion, applied=values)
@@ -103,7 +104,7 @@ def machine_of(kind: str, count: int = 4) -> Machine:
         more = {"coordinates": MANY} if arms.endswith("many") else {}
         model = random_chain(rng, int(arms[0]), bent, **more)
         mechanism = model.mechanism()
-    size = mechanism.num_rigid + mechanism.num_coordinates
+    size = mechanism.num_rigid + len(mechanism.motor_joints) + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
     return Machine(model, mechanism, states)
 
@@ -152,7 +153,8 @@ def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
     force = np.einsum("ijn,nj->ni", np.broadcast_to(R, (d, d, len(q))), values[:, :d])
     moment = one.mechanism.dim.rotated(R * np.ones(len(q)), values[:, d:].T).T
     of_q, of_rigid, _ = end_effector_gradient(one.mechanism, motion, q, force, moment)
-    expected = one.forces(one.states) - np.hstack([of_rigid, of_q])
+    of_motors = np.zeros((len(q), one.rigid - one.mechanism.num_rigid))
+    expected = one.forces(one.states) - np.hstack([of_rigid, of_motors, of_q])
     assert_close(np.hstack([drives, rows]), expected, ROUNDING)
 
 
@@ -196,28 +198,13 @@ def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
 @pytest.mark.serial
 def test_bodies_have_columns_of_what_is_inboard_and_outboard() -> None:
     """By a motion and by a load of few numbers; nothing moves the first, or loads the last."""
-    found = []
-    for body in machine_of(FACTORED).tangent().bodies:
-        sizes = {"own": 0, "load": 0, "motion": 0}
-        for part in body.parts:
-            kind = "own" if part.left is None else {3: "load", 4: "motion"}[part.right.shape[1]]
-            sizes[kind] += part.right.shape[2] // 3
-        found.append(tuple(sizes.values()))
+    found: dict[int, dict[str, int]] = {}
+    for one in machine_of(FACTORED).tangent().blocks:
+        kind = "own" if one.left is None else {3: "load", 4: "motion"}[one.right.shape[1]]
+        found.setdefault(one.rows.start, {})[kind] = one.right.shape[2] // 3
     a, b, c = MANY
-    assert found == [(a, b + c, 0), (b, c, a), (c, 0, a + b)]
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("kind", [*KINDS, FACTORED])
-def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
-    """The same as of all at once."""
-    one = machine_of(kind, 3 * measured.LEAST_INSTANTS)
-    rigid = np.arange(one.rigid)
-    whole = one.tangent(None, rigid)
-    monkeypatch.setattr(tangents, "DERIVATIVES_BYTES", 1.0)
-    parts = one.tangent(None, rigid)
-    assert_close(parts.dense(), whole.dense(), ROUNDING)
-    assert_close(parts.drives, whole.drives, ROUNDING)
+    first, second = {"own": a, "load": b + c}, {"own": b, "load": c, "motion": a}
+    assert list(found.values()) == [first, second, {"own": c, "motion": a + b}]
 
 
 @pytest.mark.serial
