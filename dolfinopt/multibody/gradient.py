@@ -37,13 +37,14 @@ def body_gradient(
     Returns:
         The derivative by every body's integrals.
     """
-    tree, size = mechanism, mechanism.num_rigid + len(mechanism.motor_joints)
-    given = np.zeros((len(q), 0)) if of_forces is None else of_forces
-    of_forces = np.pad(given, ((0, 0), (0, size - given.shape[1])))
+    tree = mechanism
+    drives = np.zeros((len(q), tree.num_rigid + len(tree.motor_joints)))
+    if of_forces is not None:
+        drives[:, : of_forces.shape[1]] = of_forces
     links = outward_pass(tree, motion, (q, qd, qdd))
     loads = inward_pass(tree, links)
     zeta = np.ascontiguousarray(multipliers.T)
-    moves, ends = _virtual_motion(tree, links, zeta, of_forces)
+    moves, ends = _virtual_motion(tree, links, zeta, drives)
     by_motion: dict[int, Motion] = {}
     by_rotation = _by_rotation(tree, links, moves, zeta)
     gradient: dict[int, ShapeIntegrals] = {}
@@ -57,7 +58,7 @@ def body_gradient(
         for s, interface in link.interfaces.items():
             parts = [links[k].joint.pulled_back(by_motion[k]) for k in tree.hanging[i, s]]
             parts += [
-                _rotor_gradient(links[k], ends[i, s], of_forces[:, tree.rotors[k]])
+                _rotor_gradient(links[k], ends[i, s], drives[:, tree.rotors[k]])
                 for k in tree.hanging[i, s]
                 if k in tree.rotors
             ]

@@ -66,12 +66,12 @@ class Tangent:
     Attributes:
         blocks: no two have an entry in common.
         own: (S,) ascending, the coordinates' own rows.
-        order: (S,) places of the coordinates among the blocks' columns.
+        order: (S,) places of the coordinates among the blocks' columns, or all as they stand.
     """
 
     blocks: tuple[Block, ...]
     own: np.ndarray
-    order: np.ndarray
+    order: np.ndarray | slice
 
     def window(self, first: int, last: int) -> Tangent:
         """Return the instants first..last - 1."""
@@ -89,8 +89,8 @@ class Tangent:
             ends = np.searchsorted(self.own, [one.rows.start, one.rows.stop])
             rows = self.own[slice(*ends)] - one.rows.start
             found[:, slice(*ends), one.columns] = one.part(rows)
-        by_rate = 3 * self.order + np.arange(3)[:, None]
-        return found[:, :, by_rate.ravel()]
+        every = found.reshape(len(found), size, size, 3)[:, :, self.order]
+        return every.swapaxes(2, 3).reshape(found.shape)
 
     def times(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
@@ -230,7 +230,9 @@ def linearise(
     blocks = [Block(slice(0, first), slice(None), None, walk.drives)] * (first > 0)
     kept = [part.start + own for part, own in zip(tree.slices, columns.kept, strict=True)]
     own = np.concatenate([np.arange(first), *(first + rows for rows in kept)]).astype(int)
-    return Tangent((*blocks, *walk.blocks), own, columns.order)
+    order = columns.order
+    as_they_stand = bool((order == np.arange(len(order))).all())
+    return Tangent((*blocks, *walk.blocks), own, slice(None) if as_they_stand else order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +246,21 @@ class _LoadDerivative:
     """
 
     by_motion: np.ndarray
+    outboard: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _OutboardLoad:
+    """Derivatives of the load on an interface, in its components.
+
+    Attributes:
+        by_frame: by the motion of the body's frame, all that hangs on it moving along.
+        by_modes: by the coordinates of the body (n, d + r, 3 k).
+        outboard: by those of all behind it.
+    """
+
+    by_frame: np.ndarray
+    by_modes: np.ndarray
     outboard: np.ndarray
 
 
@@ -292,11 +309,14 @@ class _Walk:
                 frame[:, :, 3 * k : 3 * k + 3] = self.by_joints[i]
             self.frames[i] = frame
             for s, interface in link.interfaces.items():
-                end = self._passed_on(interface.passage, frame, columns.modes[i].stop)
+                by_modes = np.zeros((self.count, self.motion_size, 0))
                 if link.body.is_flexible:
-                    moved = self._of_motion(interface.moved_by_rates(columns.kept[i]))
-                    self.by_modes[i, s] = end[:, :, _three(columns.modes[i])] = moved
-                self.ends[i, s] = end
+                    by_modes = self._of_motion(interface.moved_by_rates(columns.kept[i]))
+                self.by_modes[i, s] = by_modes
+                if tree.hanging[i, s]:
+                    end = self._passed_on(interface.passage, frame, columns.modes[i].stop)
+                    end[:, :, _three(columns.modes[i])] = by_modes
+                    self.ends[i, s] = end
 
     def _passed_on(self, passage: Passage, inner: np.ndarray, width: int) -> np.ndarray:
         """Return the derivatives of a motion by that of the one that carries it."""
@@ -337,7 +357,7 @@ class _Walk:
             link, felt = self.links[i], len(rigid) > 0 or tree.is_felt(i)
             if not (felt or link.body.is_flexible):
                 continue
-            outboard = {s: self._on_interface((i, s)) for s in link.interfaces}
+            outboard = {s: self._outboard(i, s) for s in link.interfaces}
             if link.body.is_flexible:
                 self._add_rows(i, outboard)
             if felt:
@@ -348,6 +368,12 @@ class _Walk:
             self.drives[:, row, :3] = (on.by_motion[:, :1] @ self.ends[GROUND, 0])[:, 0]
             self.drives[:, row, _three(behind)] = on.outboard[:, 0]
             self.drives[:, row, 2] += tree.cart
+
+    def _outboard(self, i: int, s: int) -> _OutboardLoad:
+        """Return the derivatives of the load on a body's interface by all that is not inboard."""
+        on = self._on_interface((i, s))
+        by_frame = on.by_motion @ self._carrier(self.links[i].interfaces[s].passage)
+        return _OutboardLoad(by_frame, on.by_motion @ self.by_modes[i, s], on.outboard)
 
     def _on_interface(self, site: Site) -> _LoadDerivative:
         """Return the derivative of what hangs on an interface, by its own motion."""
@@ -376,7 +402,7 @@ class _Walk:
             by_motion += self._widened(self.links[i].carried[s].load_by_motion)
         return _LoadDerivative(by_motion, outboard)
 
-    def _on_frame(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
+    def _on_frame(self, i: int, outboard: dict[int, _OutboardLoad]) -> _LoadDerivative:
         """Return the derivative of what a joint feels of the body and all behind it."""
         link, columns, dim = self.links[i], self.columns, self.dim
         by_motion = self._widened(link.body.load_by_motion)
@@ -387,9 +413,8 @@ class _Walk:
             behind[:, :, modes] = _by_coordinate(by_own)
         for s, interface in link.interfaces.items():
             of_loads, on = interface.passage.of_loads, outboard[s]
-            by_motion += of_loads @ (on.by_motion @ self._carrier(interface.passage))
-            if link.body.is_flexible:
-                behind[:, :, modes] += of_loads @ (on.by_motion @ self.by_modes[i, s])
+            by_motion += of_loads @ on.by_frame
+            behind[:, :, modes] += of_loads @ on.by_modes
             place = _three(columns.behind(self.tree, (i, s)), first)
             if on.outboard.shape[2]:
                 behind[:, :, place] = of_loads @ on.outboard
@@ -417,13 +442,13 @@ class _Walk:
         self.drives[:, row, : inner.shape[2]] += by_motion @ inner[:, : len(by_motion)]
         self.drives[:, row, 3 * columns.rigid[tree.rotors[i]] + 2] += link.rotor.force_by_motor
 
-    def _add_rows(self, i: int, outboard: dict[int, _LoadDerivative]) -> None:
+    def _add_rows(self, i: int, outboard: dict[int, _OutboardLoad]) -> None:
         """Add the derivative of a body's rows: by its own modes, what is inboard, outboard."""
         link, columns, loads = self.links[i], self.columns, self.loads.outboard[i]
         body, kept, dim = link.body, columns.kept[i], self.dim
-        own = np.stack(
-            np.broadcast_arrays(*body.rows_by_rates(kept, interface_pushes(link, loads))), axis=-1
-        )
+        own = np.empty((self.count, body.constants.num_modes, len(kept), 3))
+        rates = body.rows_by_rates(kept, interface_pushes(link, loads))
+        own[..., 0], own[..., 1], own[..., 2] = rates
         by_frame, parts = self._widened(body.rows_by_motion.swapaxes(0, 1)), []
         flat = own.reshape(self.count, body.constants.num_modes, -1)
         for s, interface in link.interfaces.items():
@@ -435,8 +460,8 @@ class _Walk:
             turned = interface.load_by_rates(carried_load(link, loads, s), kept)
             own[..., 0] += by_load @ _by_instant(turned)
             by_own_load, on = _by_instant(interface.rows_by_own_load.swapaxes(0, 1)), outboard[s]
-            flat += by_own_load @ (on.by_motion @ self.by_modes[i, s])
-            by_frame += by_own_load @ (on.by_motion @ self._carrier(interface.passage))
+            flat += by_own_load @ on.by_modes
+            by_frame += by_own_load @ on.by_frame
             if s in link.applied:
                 by_frame[:, :, -dim.r :] += by_load @ _given(link, s)
             parts.append((columns.behind(self.tree, (i, s)), by_own_load, on.outboard))
