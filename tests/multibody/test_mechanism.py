@@ -33,10 +33,23 @@ from dolfinopt.multibody.kinematics import (
     end_effector_gradient,
     end_rotation,
 )
-from dolfinopt.multibody.machine import roll_pitch_yaw, skew
-from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
+from dolfinopt.multibody.machine import (
+    rigid_spatial_body,
+    roll_pitch_yaw,
+    skew,
+    spatial_mechanism,
+)
+from dolfinopt.multibody.mechanism import (
+    GROUND,
+    AppliedForce,
+    Joint,
+    JointHardware,
+    Mechanism,
+    Rotor,
+    plane_chain,
+)
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
-from dolfinopt.multibody.shape_integrals import shape_integrals
+from dolfinopt.multibody.shape_integrals import rigid_bar, shape_integrals
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.reduction import Options, craig_bampton, modal
@@ -319,6 +332,51 @@ def test_few_instants_do_not_depend_on_memory() -> None:
             ]
             found.add(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
         assert len(found) == 1
+
+
+# -- rotors that turn with what carries them, in closed form ---------------------------------------
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ratio", [1.0, 100.0])
+def test_geared_double_pendulum(ratio: float) -> None:
+    """T = J (n q1')^2 / 2 + J (q1' + n q2')^2 / 2 beside the links' own."""
+    J, rng = 0.3, np.random.default_rng(4)
+    links = [rigid_bar(1.0, 0.1, 2.0), rigid_bar(0.8, 0.1, 1.5)]
+    with_rotors, without = (
+        plane_chain(links, 0.5, 0.0, (0.0, -9.81), 0.0, hardware=[JointHardware(rotor=one)] * 2)
+        for one in (Rotor(J, ratio), None)
+    )
+    q, qd, qdd = rng.normal(size=(3, 5, 3))
+    none = np.zeros((5, 0))
+    found, bare = (
+        inverse_dynamics(one, RigidMotion(q, qd, qdd), none, none, none)[1]
+        for one in (with_rotors, without)
+    )
+    spins = ratio * qdd[:, 1], qdd[:, 1] + ratio * qdd[:, 2]
+    expected = J * np.column_stack([0.0 * spins[0], ratio * spins[0] + spins[1], ratio * spins[1]])
+    assert_close(found - bare, expected, ROUNDING, float(np.abs(found).max()))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("motor", [None, 0])
+def test_gyroscopic_moment_of_a_rotor(motor: int | None) -> None:
+    """A frame that turns about z by W and holds a rotor about y feels -W h about x."""
+    none = np.zeros(3)
+    body = rigid_spatial_body(0.0, none, np.zeros(6))
+    x, y, z = np.eye(3)
+    joints = [
+        Joint("yaw", "revolute", GROUND, 0, z),
+        Joint("roll", "revolute", 0, 1, x),
+        Joint("spun", "revolute", 1, 2, y, rotor=Rotor(2e-3, 50.0, motor)),
+    ]
+    machine = spatial_mechanism([body] * 3, joints, {}, none, (2, 0))
+    q, qdd, W, spin = np.zeros((1, 3)), np.zeros((1, 3)), 3.0, 8.0
+    motion = RigidMotion(q, np.array([[W, 0.0, spin]]), qdd)
+    forces = inverse_dynamics(machine, motion, *np.zeros((3, 1, 0)))[1]
+    h = 2e-3 * 50.0 * spin
+    expected = [0.0, -W * h, 0.0, *[0.0] * (motor is not None)]
+    assert_close(forces[0], np.array(expected), 1e-15)
 
 
 # -- inertia shape integrals: rigid figures in closed form, modes by brute-force quadrature  ------

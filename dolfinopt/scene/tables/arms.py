@@ -322,7 +322,7 @@ class Arm(Table):
         description="moment of inertia at the outboard interface [kg m2]",
     )
     rotor_inertia: RotorInertia = 0.0
-    gear_ratio: GearRatio | None = None
+    gear_ratio: GearRatio = None
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0
     joint_stiffness: JointStiffness = 0.0

@@ -224,14 +224,15 @@ RotorInertia = Annotated[
     Inertia,
     Field(
         description="moment of inertia of the rotor that drives the inboard joint, about its own "
-        "axis [kg m2]",
+        "axis, which is the joint's; not part of joint_inertia [kg m2]",
     ),
 ]
 GearRatio = Annotated[
-    Ratio,
+    Ratio | None,
     Field(
-        description="revolutions of the rotor per revolution of the inboard joint; of a "
-        "prismatic joint in space radians per metre [-]",
+        description="revolutions of the rotor per revolution of the inboard joint, against what "
+        "the joint sits on; of a prismatic joint in space radians per metre; stated with "
+        "rotor_inertia [-]",
     ),
 ]
 GearStiffness = Annotated[
