@@ -340,13 +340,24 @@ class FrozenTree:
         self, body: int, interface: int
     ) -> Iterator[tuple[ShapeIntegrals, np.ndarray]]:
         """Yield what is carried at an interface and outboard of it, and its motion likewise."""
-        loads = self.mechanism.loads
-        if (body, interface) in loads:
-            yield loads[body, interface].body, np.eye(6)
+        sites = [((body, interface), np.eye(6))]
         for i, T in self._beyond(body, interface):
-            for s in self.mechanism.sites[i]:
-                if (i, s) in loads:
-                    yield loads[i, s].body, self._shift(i, s) @ T
+            sites += [((i, s), self._shift(i, s) @ T) for s in self.mechanism.sites[i]]
+        for site, T in sites:
+            if site in self.mechanism.loads:
+                yield self.mechanism.loads[site].body, T
+            for k in self.mechanism.hanging[site]:
+                if (rotor := self._rotor(k)) is not None:
+                    yield rotor, T
+
+    def _rotor(self, body: int) -> ShapeIntegrals | None:
+        """Return the rotor of a body's joint in the frame of the interface that carries it."""
+        joint = self.mechanism.joints[body]
+        if joint.rotor is None:
+            return None
+        n = joint.rotation @ joint.axis
+        x, y, z = np.outer(n, n) * joint.rotor.inertia
+        return rigid_spatial_body(0.0, np.zeros(3), (x[0], y[1], z[2], x[1], x[2], y[2]))
 
     def carried(self) -> list[CarriedInertia]:
         """Return what every body carries, about its interfaces' points, in its own frame."""
