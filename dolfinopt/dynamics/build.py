@@ -123,7 +123,7 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
     if scene.forces:
         mechanism = replace(mechanism, forces=forces_of(scene))
         motion = under_forces(lambda _: motion, scene)(t)
-    if scene.closure is None:
+    if scene.closure is None and not scene.closures:
         return largest_change(mechanism, motion)
     drives = _drives(scene)
     loops = _loops(scene, mechanism, desired_motion(scene), drives)[1]

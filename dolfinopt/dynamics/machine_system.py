@@ -23,11 +23,11 @@ from dolfinopt.dynamics.measured import EQUILIBRIUM_ITERATIONS, MACHINE_EQUILIBR
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
+from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Drives, Mechanism
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
-from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.tangent import linearise
 
 
@@ -192,7 +192,7 @@ class MachineInstants:
         if len(springs.joints):
             motors += forces[:, machine.mechanism.num_rigid :]
         if springs.friction.acts:
-            motors += springs.friction.force(motion.motors[0])
+            motors += springs.friction.force(self.motor_rates(yd, ydd)[0])
         out = np.concatenate([rigid, rows, np.zeros_like(multipliers), motors], axis=1)
         if machine.loops is None:
             return out
@@ -225,7 +225,7 @@ class MachineInstants:
                 matrix[:, rows, order, springs.joints] += sign * value
                 matrix[:, rows, order, motors] -= sign * value
         if springs.friction.acts:
-            matrix[:, motors, 1, motors] += springs.friction.slope(motion.motors[0])
+            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_rates(yd, ydd)[0])
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
             J = here.jacobian[:, :, machine.columns]  # (n, m, R + N)

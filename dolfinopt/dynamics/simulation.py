@@ -27,6 +27,7 @@ from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
+from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
 from dolfinopt.multibody.kinematics import (
@@ -44,7 +45,6 @@ from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     add_integrals,
 )
-from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene

@@ -6,7 +6,7 @@ Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 5; Schwertassek & Wallr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,8 +56,15 @@ class Applied:
     in_world: Load
 
 
-def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Link]:
-    """Return all bodies as they move, in the tree's order."""
+def outward_pass(
+    tree: Mechanism, motion: RigidMotion, rates: Rates, held: Iterable[Site] = ()
+) -> list[Link]:
+    """Return all bodies as they move, in the tree's order.
+
+    Args:
+        tree, motion, rates: n instants.
+        held: interfaces that something outside the tree pulls.
+    """
     count = len(motion.q)
     joints, elastic = instants_last((motion.q, motion.qd, motion.qdd)), instants_last(rates)
     none = np.zeros((0, 3, count))
@@ -72,7 +79,8 @@ def outward_pass(tree: Mechanism, motion: RigidMotion, rates: Rates) -> list[Lin
             inner = links[joint.parent].interfaces[joint.interface].motion
         moving = MovingJoint(joint, inner, own)
         body = BodyMotion(tree.constants[i], moving.motion, elastic[tree.slices[i]])
-        interfaces = {s: Interface(body, s) for s in tree.sites[i]}
+        more = {s for k, s in held if k == i}
+        interfaces = {s: Interface(body, s) for s in sorted({*tree.sites[i], *more})}
         carried = {
             s: BodyMotion(tree.loads[i, s], interface.motion, none)
             for s, interface in interfaces.items()
@@ -167,8 +175,9 @@ def inward_pass(
         if not (felt or link.body.is_flexible):
             continue
         for s, interface in link.interfaces.items():
-            on_it = [links[k] for k in tree.hanging[i, s]]
-            parts = [links[k].joint.at_interface(joints[k]) for k in tree.hanging[i, s]]
+            hanging = tree.hanging.get((i, s), ())
+            on_it = [links[k] for k in hanging]
+            parts = [links[k].joint.at_interface(joints[k]) for k in hanging]
             parts += [one.rotor.load for one in on_it if one.rotor is not None]
             if s in link.carried:
                 parts.append(link.carried[s].load)
@@ -236,7 +245,8 @@ def inverse_dynamics(
     for i in tree.movable:
         forces[:, tree.joints[i].coordinate] = links[i].joint.drive(loads.joints[i])
     for i, k in tree.rotors.items():
-        forces[:, k] += links[i].rotor.force
+        if (rotor := links[i].rotor) is not None:
+            forces[:, k] += rotor.force
     if tree.cart is not None:
         forces[:, 0] = tree.cart * motion.qdd[:, 0]
         for i in tree.hanging[GROUND, 0]:
@@ -270,7 +280,7 @@ def body_loads(
         mechanism, motion, rates: as for `inverse_dynamics`.
         pull: see `inward_pass`.
     """
-    links = outward_pass(mechanism, motion, rates)
+    links = outward_pass(mechanism, motion, rates, pull)
     return _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
 
 

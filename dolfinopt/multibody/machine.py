@@ -466,7 +466,7 @@ def soft_joints(scene: Scene) -> dict[int, JointParts]:
 
 def rotors_of(scene: Scene) -> list[Rotor | None]:
     """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
-    motors = {k: place for place, k in enumerate(soft_joints(scene))}
+    motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
     return [
         Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
         for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)

@@ -141,8 +141,8 @@ class _Columns:
     """
 
     kept: list[np.ndarray]
-    rigid: dict[int, int]
-    drives: dict[int, int]
+    rigid: dict[int | None, int]
+    drives: dict[int | None, int]
     first: dict[int, int]
     modes: dict[int, slice]
     last: dict[int, int]
@@ -159,9 +159,12 @@ def _columns(tree: Mechanism, keep: np.ndarray | None, rigid: np.ndarray | None)
     keep = np.arange(tree.num_coordinates) if keep is None else keep
     ends = np.searchsorted(keep, [0, *(part.stop for part in tree.slices)])
     kept = [keep[a:b] - s.start for (a, b), s in zip(pairwise(ends), tree.slices, strict=True)]
-    drives = {k: row for row, k in enumerate(asked)}
+    drives: dict[int | None, int] = {k: row for row, k in enumerate(asked)}
     found = _Columns(kept, {}, drives, {}, {}, {}, np.empty(len(asked) + len(keep), dtype=int))
-    own = [[], *([] for _ in tree.joints)]  # rigid coordinates of the ground and of every joint
+    own: list[list[int]] = [
+        [],
+        *([] for _ in tree.joints),
+    ]  # rigid coordinates of the ground and of every joint
     if tree.cart_coordinate is not None:
         own[0].append(tree.cart_coordinate)
     for i, joint in enumerate(tree.joints):
@@ -221,11 +224,10 @@ def linearise(
     links = outward_pass(tree, motion, (q, qd, qdd))
     loads = inward_pass(tree, links, driven=len(columns.drives) > 0)
     walk = _Walk(tree, links, loads, columns)
-    if tree.friction is not None:
+    if tree.friction is not None and rigid is not None:
         slope = tree.friction.slope(motion.qd)
-        for k, row in columns.drives.items():
-            if k < tree.num_rigid:
-                walk.drives[:, row, 3 * columns.rigid[k] + 1] += slope[:, k]
+        for row, k in enumerate(map(int, rigid[rigid < tree.num_rigid])):
+            walk.drives[:, row, 3 * columns.rigid[k] + 1] += slope[:, k]
     first = len(columns.drives)
     blocks = [Block(slice(0, first), slice(None), None, walk.drives)] * (first > 0)
     kept = [part.start + own for part, own in zip(tree.slices, columns.kept, strict=True)]
@@ -272,9 +274,7 @@ class _Walk:
         drives: (n, R, 3 S) rows of the rigid coordinates asked for.
     """
 
-    def __init__(
-        self, tree: Mechanism, links: list[Link], loads: Loads, columns: _Columns
-    ) -> None:
+    def __init__(self, tree: Mechanism, links: list[Link], loads: Loads, columns: _Columns) -> None:
         """Walk out and back."""
         self.tree, self.links, self.loads, self.columns = tree, links, loads, columns
         self.dim, self.count = tree.dim, links[0].body.a.shape[1]
@@ -363,7 +363,8 @@ class _Walk:
             if felt:
                 self.on_frames[i] = self._on_frame(i, outboard)
                 self._add_drive(i)
-        if (row := self.columns.drives.get(tree.cart_coordinate)) is not None:
+        if tree.cart is not None and 0 in self.columns.drives:
+            row = self.columns.drives[0]
             on, behind = self._on_interface((GROUND, 0)), self.columns.behind(tree, (GROUND, 0))
             self.drives[:, row, :3] = (on.by_motion[:, :1] @ self.ends[GROUND, 0])[:, 0]
             self.drives[:, row, _three(behind)] = on.outboard[:, 0]

@@ -337,7 +337,9 @@ class CloudTree:
                 points, masses = _ring(joint.rotor.inertia)
                 size = np.sqrt(0.5 * joint.rotor.inertia / masses.sum())
                 along = size * np.outer([1.0, -1.0, 1.0, -1.0], joint.rotation @ joint.axis)
-                found.append(((joint.parent, joint.interface), _rigid(joint.origin + along, masses)))
+                found.append(
+                    ((joint.parent, joint.interface), _rigid(joint.origin + along, masses))
+                )
         return found
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from runs import ROOT
 from scipy.linalg import expm
 
 from dolfinopt.multibody.dimension import SpaceTurning
+from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.kinematics import (
     Posed,
@@ -50,7 +51,6 @@ from dolfinopt.multibody.mechanism import (
 )
 from dolfinopt.multibody.motion import RigidMotion, rigid_motion
 from dolfinopt.multibody.shape_integrals import rigid_bar, shape_integrals
-from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
