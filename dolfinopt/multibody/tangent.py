@@ -161,19 +161,13 @@ def _columns(tree: Mechanism, keep: np.ndarray | None, rigid: np.ndarray | None)
     kept = [keep[a:b] - s.start for (a, b), s in zip(pairwise(ends), tree.slices, strict=True)]
     drives: dict[int | None, int] = {k: row for row, k in enumerate(asked)}
     found = _Columns(kept, {}, drives, {}, {}, {}, np.empty(len(asked) + len(keep), dtype=int))
-    own: list[list[int]] = [
-        [],
-        *([] for _ in tree.joints),
-    ]  # rigid coordinates of the ground and of every joint
-    if tree.cart_coordinate is not None:
-        own[0].append(tree.cart_coordinate)
+    own = {GROUND: dict.fromkeys([tree.cart_coordinate])}
     for i, joint in enumerate(tree.joints):
-        every = (joint.coordinate, tree.rotors.get(i))
-        own[1 + i] += [k for k in dict.fromkeys(every) if k is not None]
+        own[i] = dict.fromkeys((joint.coordinate, tree.rotors.get(i)))
     place = 0
     for i in (GROUND, *tree.order):
         found.first[i] = place
-        for k in own[1 + i]:
+        for k in own[i]:
             if k in drives:
                 found.rigid[k] = found.order[drives[k]] = place
                 place += 1
@@ -335,7 +329,7 @@ class _Walk:
         return out
 
     def _of_motion(self, x: np.ndarray) -> np.ndarray:
-        """Return derivatives (n, m, 3 k) of a motion from those of (a, w, wd) (d + 2 r, 3, k, n)."""
+        """Return those (n, m, 3 k) of a motion from those of (a, w, wd) (d + 2 r, 3, k, n)."""
         if self.tree.forces:
             spin = x[self.dim.d : self.dim.d + self.dim.r]
             turned = np.zeros_like(spin)

@@ -334,7 +334,7 @@ class CloudTree:
         found = []
         for joint in self.joints:
             if joint.rotor is not None and joint.parent != GROUND:
-                points, masses = _ring(joint.rotor.inertia)
+                masses = _ring(joint.rotor.inertia)[1]
                 size = np.sqrt(0.5 * joint.rotor.inertia / masses.sum())
                 along = size * np.outer([1.0, -1.0, 1.0, -1.0], joint.rotation @ joint.axis)
                 found.append(
