@@ -336,7 +336,7 @@ class MachineSystem:
         ahead = np.zeros((len(t), self.ends[0]))
         winding = None
         if self.drives.rigid_feed_forward:
-            forces, motors = self.feed_forward(desired)
+            forces, motors = feed_forward(self.rigid, desired, self.drives, self.rigid_loops)
             ahead += forces
             springs = self.drives.springs
             if self.drives.winding:
@@ -350,9 +350,9 @@ class MachineSystem:
             ahead += self.drives.table(t)
         return MachineInstants(self, desired, ahead, winding)
 
-    def feed_forward(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray]:
-        """Return what moves the machine with rigid arms, see the function."""
-        return feed_forward(self.rigid, desired, self.drives, self.rigid_loops)
+    def feed_forward(self, desired: RigidMotion) -> np.ndarray:
+        """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
+        return feed_forward(self.rigid, desired, self.drives, self.rigid_loops)[0]
 
     @cached_property
     def rigid(self) -> Mechanism:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.multibody.body_motion import BodyMotion, Load, Motion, Weights
+from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.inverse_dynamics import Link, carried_load, inward_pass, outward_pass
-from dolfinopt.multibody.kinematics import Interface
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals

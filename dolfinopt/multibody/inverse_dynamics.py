@@ -14,7 +14,7 @@ import numpy as np
 from dolfinopt.multibody.body_motion import BodyMotion, Load
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.dimension import compose, product
-from dolfinopt.multibody.kinematics import Interface, MovingJoint, MovingRotor
+from dolfinopt.multibody.frames import Interface, MovingJoint, MovingRotor
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals

@@ -21,6 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Load
+from dolfinopt.multibody.frames import Passage
 from dolfinopt.multibody.inverse_dynamics import (
     Link,
     Loads,
@@ -29,7 +30,6 @@ from dolfinopt.multibody.inverse_dynamics import (
     inward_pass,
     outward_pass,
 )
-from dolfinopt.multibody.kinematics import Passage
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates

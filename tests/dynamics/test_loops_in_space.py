@@ -169,7 +169,7 @@ def test_forces_of_a_cylinder(tmp_path) -> None:
     body = system.mechanism.bodies[1]
     centre = body.w[:2, 0] @ [1.0, 1j] / body.mass
     moment = body.mass * (centre * np.exp(1j * luff)).real + 100.0 * 2.0 * np.cos(luff)
-    ahead = system.feed_forward(desired)[0][0]
+    ahead = system.feed_forward(desired)[0]
     cylinder = list(scene.rigid_units).index("cylinder")
     assert ahead[list(system.drives.free).index(cylinder)] == pytest.approx(
         GRAVITY * moment / lever, rel=1e-10

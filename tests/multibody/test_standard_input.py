@@ -20,8 +20,8 @@ from dolfinopt.exchange.sid import (
 )
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body_motion import BodyMotion, Constants
+from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.kinematics import Interface
 from dolfinopt.multibody.motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     TABLE,
