@@ -49,16 +49,6 @@ STALLED_GAIN = 1e-9  # part by which the distance falls in one of them, below wh
 START_GUESSES = 10  # the first as stated, the others around it at random
 KEPT_INSTANT_SETS = 16  # whose joints are kept: the integrator asks for the same ones again
 
-# -- standard_input --------------------------------------------------------------------------
-
-# How far matrices that must be symmetric, or zero, may be from it, relative to their largest
-# entry, and places to a length: finite elements leave 1e-12, files with six digits 1e-6.
-FILE_ROUNDING_SHARE = 1e-6
-# How far the centrifugal matrix may be from that of the mass, relative to Me: lumped masses reach
-# 5 %, geometric stiffening by rotation changes the sign of its diagonal for slender bodies.
-CENTRIFUGAL_EXCESS_SHARE = 0.1
-SAME_NODE_SHARE = 1e-9  # of an arm's extent: nodes of two ranks that are no farther apart are one
-
 # -- closures --------------------------------------------------------------------------------
 
 # Singular values of the closures' Jacobian, columns of like size, over the largest: below it
