@@ -6,6 +6,7 @@ function inwards by its transpose.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -22,47 +23,59 @@ from dolfinopt.multibody.dimension import (
 from dolfinopt.multibody.mechanism import Joint
 
 
-class Passage:
+@dataclass(frozen=True, eq=False)
+class MotionTransform:
     """Derivative of one frame's motion by that of the one that carries it, at n instants.
 
+    Its blocks are (., ., n), or some of them (., .) alike at all instants; None: zero.
+
     Attributes:
-        matrix: (n, d + 2 r, d + 2 r), or one.
-        of_loads: (n, d + r, d + r), or one: what carries a load on the one frame, in its
-            components, to the origin of the other.
+        dim: plane or space.
+        turn: the rotation into the components of the one carried.
+        by_w, by_wd: of its acceleration (d, r, n).
+        turned: of its angular acceleration by w (r, r, n).
     """
 
-    def __init__(
-        self,
-        dim: Dimension,
-        turn: np.ndarray,
-        by_w: np.ndarray | None,
-        by_wd: np.ndarray | None,
-        turned: np.ndarray | None = None,
-    ) -> None:
-        """Take the blocks (., ., n), or some of them alike at all instants; None: zero.
+    dim: Dimension
+    turn: np.ndarray
+    by_w: np.ndarray | None
+    by_wd: np.ndarray | None
+    turned: np.ndarray | None = None
 
-        Args:
-            dim: plane or space.
-            turn: the rotation (d, d, n) or (d, d) into the components of the one carried.
-            by_w, by_wd: of its acceleration (d, r, n).
-            turned: of its angular acceleration by w (r, r, n).
-        """
-        d, r = dim.d, dim.r
-        counts = {x.shape[2] for x in (turn, by_w, by_wd, turned) if x is not None and x.ndim == 3}
+    @cached_property
+    def matrix(self) -> np.ndarray:
+        """It as matrices (n, d + 2 r, d + 2 r), or one."""
+        d, r = self.dim.d, self.dim.r
+        some = self.turn, self.by_w, self.by_wd, self.turned
+        counts = {x.shape[2] for x in some if x is not None and x.ndim == 3}
         out = np.zeros((max(counts, default=1), d + 2 * r, d + 2 * r))
         a, w, wd = slice(0, d), slice(d, d + r), slice(d + r, d + 2 * r)
-        rotated = turn if r == d else np.ones((1, 1))
-        blocks = (a, a, turn), (w, w, rotated), (wd, wd, rotated), (wd, w, turned)
-        for rows, columns, block in (*blocks, (a, w, by_w), (a, wd, by_wd)):
+        rotated = self.turn if r == d else np.ones((1, 1))
+        blocks = (a, a, self.turn), (w, w, rotated), (wd, wd, rotated), (wd, w, self.turned)
+        for rows, columns, block in (*blocks, (a, w, self.by_w), (a, wd, self.by_wd)):
             if block is not None:
                 out[:, rows, columns] = block if block.ndim == 2 else block.transpose(2, 0, 1)
-        self.matrix = out
+        return out
+
+    @cached_property
+    def of_loads(self) -> np.ndarray:
+        """What carries a load on the one frame to the origin of the other (n, d + r, d + r)."""
         # Forces and moments work on displacements and rotations as a and wd go.
-        loads = np.empty((len(out), d + r, d + r))
-        loads[:, :d, :d], loads[:, :d, d:] = out[:, a, a].swapaxes(1, 2), 0.0
-        loads[:, d:, :d] = out[:, a, wd].swapaxes(1, 2)
-        loads[:, d:, d:] = out[:, wd, wd].swapaxes(1, 2)
-        self.of_loads = loads
+        d, r = self.dim.d, self.dim.r
+        kept = np.r_[0:d, d + r : d + 2 * r]
+        return self.matrix[:, kept[:, None], kept].swapaxes(1, 2)
+
+    def transposed(self, by: Motion) -> Motion:
+        """Return derivatives by the carrying frame's motion from those by the carried one's."""
+        a, w, wd = by
+        back = self.turn.swapaxes(0, 1)
+        to = product(back, a), self.dim.rotated(back, w), self.dim.rotated(back, wd)
+        extra = (1, self.by_w, a), (2, self.by_wd, a), (1, self.turned, wd)
+        found = list(to)
+        for place, block, x in extra:
+            if block is not None:
+                found[place] = found[place] + transposed_product(block, x)
+        return found[0], found[1], found[2]
 
 
 class Interface:
@@ -160,15 +173,15 @@ class Interface:
         return out + 2.0 * dim.by_spin(self.u[:, 1]) if body.is_flexible else out
 
     @cached_property
-    def passage(self) -> Passage:
+    def passage(self) -> MotionTransform:
         """From the body's motion to its own, in its own components."""
         dim, by_w, by_wd = self.dim, self._by_spin, self.dim.by_spin(self.place)
         if not self.body.is_flexible:
-            return Passage(dim, np.eye(dim.d), by_w, by_wd)
+            return MotionTransform(dim, np.eye(dim.d), by_w, by_wd)
         back, turned = self.turning.R.swapaxes(0, 1), None
         if dim.r > 1:
             turned = -product(back, dim.skew(self.turning.velocity))
-        return Passage(dim, back, product(back, by_w), product(back, by_wd), turned)
+        return MotionTransform(dim, back, product(back, by_w), product(back, by_wd), turned)
 
     @cached_property
     def _by_theta(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -214,33 +227,25 @@ class Interface:
         parts = out[:d], out[d : d + r], out[d + r :]
         return np.concatenate([product(back, parts[0]), *(dim.rotated(back, x) for x in parts[1:])])
 
-    def pulled_back(self, by: Motion) -> tuple[Motion, Motion]:
-        """Return derivatives by the body's motion from those by the interface's (n).
+    def by_displacement(self, by: Motion) -> Motion:
+        """Return derivatives by (u, theta), their rates and second ones, each (b, n).
 
-        And those by (u, theta), their rates and second ones, each (b, n); nothing of a rigid body.
+        Those by its motion, in its components, are given; of a flexible body.
         """
-        body, dim = self.body, self.dim
-        a, w, wd = by
-        place = self.place
-        if not body.is_flexible:
-            by_w = w + transposed_product(self._by_spin, a)
-            return (a, by_w, wd + dim.moment(place, a)), (a[:0], a[:0], a[:0])
-        turning, R = self.turning, self.turning.R
-        a, w, wd = product(R, a), dim.rotated(R, w), dim.rotated(R, wd)
+        body, dim, turning = self.body, self.dim, self.turning
+        a, w, wd = product(turning.R, by[0]), *(dim.rotated(turning.R, x) for x in by[1:])
         own_a, own_w, own_wd = self._unturned
-        by_w = w + transposed_product(self._by_spin, a) + dim.commutator(turning.velocity, wd)
         turn = dim.commutator(w, own_w) + dim.commutator(wd, own_wd) - dim.moment(own_a, a)
         value, rate, second = turning.pulled(turn), turning.pulled(w), turning.pulled(wd)
         if (by_theta := self._by_theta) is not None:
             of_w, of_wd, of_rate = by_theta
             value = value + transposed_product(of_w, w) + transposed_product(of_wd, wd)
             rate = rate + transposed_product(of_rate, wd)
-        moved = (
+        return (
             np.concatenate([dim.applied_transposed(body.alpha, a), value]),
             np.concatenate([dim.applied_transposed(body.beta, a), rate]),
             np.concatenate([a, second]),
         )
-        return (a, by_w, wd + dim.moment(place, a)), moved
 
     def load_by_rates(self, load: Load, kept: np.ndarray) -> np.ndarray:
         """Return the derivative of `in_body` by those e kept (d + r, k, n); `load` its result."""
@@ -358,7 +363,7 @@ class MovingJoint:
     # -- derivatives -------------------------------------------------------------------------
 
     @cached_property
-    def passage(self) -> Passage:
+    def passage(self) -> MotionTransform:
         """From the interface's motion to that of the body's frame."""
         dim, back = self.dim, self.R.swapaxes(0, 1)
         by_w = by_wd = turned = None
@@ -372,20 +377,7 @@ class MovingJoint:
             by_w = spun if by_w is None else by_w + spun
         elif self.rates is not None and dim.r > 1:
             turned = -product(dim.skew(self._rate), back)
-        return Passage(dim, back, by_w, by_wd, turned)
-
-    def pulled_back(self, by: Motion) -> Motion:
-        """Return derivatives by the interface's motion from those by the body's."""
-        (a, w, wd), dim, R = by, self.dim, self.R
-        if self.rates is not None and self.slides:
-            w = w + 2.0 * dim.moment(self._rate, a)
-        elif self.rates is not None:
-            w = w + dim.commutator(self._rate, wd)
-        a, w, wd = product(R, a), dim.rotated(R, w), dim.rotated(R, wd)
-        if self.is_offset:
-            w = w + transposed_product(dim.centripetal_by_spin(self.inner[1], self.r), a)
-            wd = wd + dim.moment(self.r, a)
-        return a, w, wd
+        return MotionTransform(dim, back, by_w, by_wd, turned)
 
     @cached_property
     def moved_by_joint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -56,7 +56,7 @@ def body_gradient(
             of_rows = np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
             by.append(_split(link.body, of_rows))
         for s, interface in link.interfaces.items():
-            parts = [links[k].joint.pulled_back(by_motion[k]) for k in tree.hanging[i, s]]
+            parts = [links[k].joint.passage.transposed(by_motion[k]) for k in tree.hanging[i, s]]
             parts += [
                 _rotor_gradient(links[k], ends[i, s], drives[:, tree.rotors[k]])
                 for k in tree.hanging[i, s]
@@ -64,11 +64,12 @@ def body_gradient(
             ]
             if s in link.carried:
                 parts.append(_motion_gradient(link.carried[s], ends[i, s]))
+            displaced = (np.zeros((link.body.dim.b, zeta.shape[1])),) * 3
             if parts:
-                inner, displaced = interface.pulled_back(_sum_motions(parts))
-                by.append(inner)
-            else:
-                displaced = (np.zeros((link.body.dim.b, zeta.shape[1])),) * 3
+                on_interface = _sum_motions(parts)
+                by.append(interface.passage.transposed(on_interface))
+                if link.body.is_flexible:
+                    displaced = interface.by_displacement(on_interface)
             if link.body.is_flexible:
                 both = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
                 outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)

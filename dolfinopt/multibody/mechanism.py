@@ -4,10 +4,7 @@ Every body hangs on its parent's outboard interface, or on the ground, by one jo
 placed as in URDF; the body's own frame is the joint's. What a body carries at an outboard interface
 without a joint (payload, motor) is a rigid body in the interface's frame. Source: Featherstone,
 Rigid Body Dynamics Algorithms (2008); Schwertassek & Wallrapp (1999).
-
-Plane vectors are complex numbers: v = v_x + i v_y, so S v = i v, a rotation by phi multiplies by
-exp(i phi), u . v = Re(conj(u) v) and the moment of a force F about the origin of its lever u is
-Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
+Every body works in its own tangent frame at its inboard joint.
 """
 
 from __future__ import annotations
@@ -301,17 +298,6 @@ class AppliedForce:
     known: bool = True
 
 
-def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
-    """Return the diagonal of a matrix that has nothing else, or the matrix."""
-    diagonal = np.diagonal(A)
-    return diagonal if np.count_nonzero(A) == np.count_nonzero(diagonal) else A
-
-
-def product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """Return x A (n, q) of a matrix, or of its diagonal."""
-    return x * A if A.ndim == 1 else x @ A
-
-
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """Bodies, the joints that hold them, what they carry, and gravity; in the plane or in space.
@@ -534,18 +520,16 @@ class Mechanism:
         return np.where(slides + [True] * self.rods, 1.0, reach)
 
     @cached_property
-    def stiffnesses(self) -> tuple[np.ndarray, ...]:
-        """Every body's stiffness (q, q), or its diagonal (q,) where there is nothing else."""
-        return tuple(_diagonal_or_matrix(body.K) for body in self.bodies)
+    def _unit(self) -> tuple[bool, ...]:
+        """Whether bodies' coordinates are normalised: their stiffness is the identity."""
+        return tuple(np.array_equal(body.K, np.eye(len(body.K))) for body in self.bodies)
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
         norms = []
-        for part, K in zip(self.slices, self.stiffnesses, strict=True):
+        for part, body, unit in zip(self.slices, self.bodies, self._unit, strict=True):
             e = q[..., part]
-            unit = K.ndim == 1 and (K == 1.0).all()
-            loads = e if unit else product(e, K)
-            squares = np.einsum("...nk,...nk->...n", loads, e)
+            squares = np.einsum("...nk,...nk->...n", e if unit else e @ body.K, e)
             norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
         return np.stack(norms, axis=-1)
 

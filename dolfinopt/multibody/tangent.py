@@ -21,7 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from dolfinopt.multibody.body_motion import Load
-from dolfinopt.multibody.frames import Passage
+from dolfinopt.multibody.frames import MotionTransform
 from dolfinopt.multibody.inverse_dynamics import (
     Link,
     Loads,
@@ -312,13 +312,13 @@ class _Walk:
                     end[:, :, _three(columns.modes[i])] = by_modes
                     self.ends[i, s] = end
 
-    def _passed_on(self, passage: Passage, inner: np.ndarray, width: int) -> np.ndarray:
+    def _passed_on(self, passage: MotionTransform, inner: np.ndarray, width: int) -> np.ndarray:
         """Return the derivatives of a motion by that of the one that carries it."""
         out = np.zeros((self.count, self.motion_size, 3 * width))
         np.matmul(self._carrier(passage), inner, out=out[:, :, : inner.shape[2]])
         return out
 
-    def _carrier(self, passage: Passage) -> np.ndarray:
+    def _carrier(self, passage: MotionTransform) -> np.ndarray:
         """Return the matrix (n, m, m), or one, that carries a motion on."""
         dim, inner = self.dim, passage.matrix
         if not self.tree.forces:
