@@ -84,13 +84,18 @@ class Tangent:
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
         size = len(self.own)
-        found = np.zeros((len(self.blocks[0].right), size, 3 * size))
+        found = np.zeros((len(self.blocks[0].right), size, 3, size))
+        coordinates = np.arange(size)
+        coordinates[self.order] = np.arange(size)  # of every column
         for one in self.blocks:
             ends = np.searchsorted(self.own, [one.rows.start, one.rows.stop])
-            rows = self.own[slice(*ends)] - one.rows.start
-            found[:, slice(*ends), one.columns] = one.part(rows)
-        every = found.reshape(len(found), size, size, 3)[:, :, self.order]
-        return every.swapaxes(2, 3).reshape(found.shape)
+            part = one.part(self.own[slice(*ends)] - one.rows.start)
+            part = part.reshape(*part.shape[:2], part.shape[2] // 3, 3).swapaxes(2, 3)
+            places = coordinates[one.columns.start // 3 : one.columns.stop // 3]
+            if len(places) and (np.diff(places) == 1).all():
+                places = slice(places[0], places[-1] + 1)
+            found[:, slice(*ends), :, places] = part
+        return found.reshape(len(found), size, 3 * size)
 
     def times(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
@@ -223,7 +228,9 @@ def linearise(
         for row, k in enumerate(map(int, rigid[rigid < tree.num_rigid])):
             walk.drives[:, row, 3 * columns.rigid[k] + 1] += slope[:, k]
     first = len(columns.drives)
-    blocks = [Block(slice(0, first), slice(None), None, walk.drives)] * (first > 0)
+    blocks = [Block(slice(0, first), slice(0, walk.drives.shape[2]), None, walk.drives)] * (
+        first > 0
+    )
     kept = [part.start + own for part, own in zip(tree.slices, columns.kept, strict=True)]
     own = np.concatenate([np.arange(first), *(first + rows for rows in kept)]).astype(int)
     order = columns.order
@@ -273,11 +280,12 @@ class _Walk:
         self.tree, self.links, self.loads, self.columns = tree, links, loads, columns
         self.dim, self.count = tree.dim, links[0].body.a.shape[1]
         self.motion_size = self.dim.d + (3 if tree.forces else 2) * self.dim.r
-        # Of frames by what is inboard and their joint; of interfaces by their body's modes as well.
+        # Of frames by what is inboard and their joint; of interfaces by their body's modes; of motors'
+        # forces by what carries them.
         self.frames: dict[int, np.ndarray] = {}
-        self.ends: dict[Site, np.ndarray] = {}
         self.by_modes: dict[Site, np.ndarray] = {}
         self.by_joints: dict[int, np.ndarray] = {}
+        self.by_carriers: dict[int, np.ndarray] = {}
         self._outwards()
         self.blocks: list[Block] = []
         size = 3 * len(columns.order)
@@ -292,10 +300,13 @@ class _Walk:
         tree, columns = self.tree, self.columns
         ground = np.zeros((self.count, self.motion_size, 3 * columns.modes[GROUND].start))
         ground[:, 0, 2::3] = 1.0  # the cart's acceleration
-        self.ends[GROUND, 0] = ground
+        ends = {(GROUND, 0): ground}
         for i in tree.order:
             link, joint = self.links[i], tree.joints[i]
-            inner = self.ends[joint.parent, joint.interface]
+            inner = ends[joint.parent, joint.interface]
+            if link.rotor is not None and tree.rotors[i] in columns.drives:
+                by_motion = link.rotor.force_by_motion
+                self.by_carriers[i] = by_motion @ inner[:, : len(by_motion)]
             frame = self._passed_on(link.joint.passage, inner, columns.modes[i].start)
             if (k := columns.rigid.get(joint.coordinate)) is not None:
                 moved = np.stack(link.joint.moved_by_joint, axis=1)[:, :, None]
@@ -310,12 +321,13 @@ class _Walk:
                 if tree.hanging[i, s]:
                     end = self._passed_on(interface.passage, frame, columns.modes[i].stop)
                     end[:, :, _three(columns.modes[i])] = by_modes
-                    self.ends[i, s] = end
+                    ends[i, s] = end
 
     def _passed_on(self, passage: MotionTransform, inner: np.ndarray, width: int) -> np.ndarray:
         """Return the derivatives of a motion by that of the one that carries it."""
-        out = np.zeros((self.count, self.motion_size, 3 * width))
+        out = np.empty((self.count, self.motion_size, 3 * width))
         np.matmul(self._carrier(passage), inner, out=out[:, :, : inner.shape[2]])
+        out[:, :, inner.shape[2] :] = 0.0
         return out
 
     def _carrier(self, passage: MotionTransform) -> np.ndarray:
@@ -360,9 +372,8 @@ class _Walk:
         if tree.cart is not None and 0 in self.columns.drives:
             row = self.columns.drives[0]
             on, behind = self._on_interface((GROUND, 0)), self.columns.behind(tree, (GROUND, 0))
-            self.drives[:, row, :3] = (on.by_motion[:, :1] @ self.ends[GROUND, 0])[:, 0]
+            self.drives[:, row, 2] = on.by_motion[:, 0, 0] + tree.cart
             self.drives[:, row, _three(behind)] = on.outboard[:, 0]
-            self.drives[:, row, 2] += tree.cart
 
     def _outboard(self, i: int, s: int) -> _OutboardLoad:
         """Return the derivatives of the load on a body's interface by all that is not inboard."""
@@ -372,53 +383,44 @@ class _Walk:
 
     def _on_interface(self, site: Site) -> _LoadDerivative:
         """Return the derivative of what hangs on an interface, by its own motion."""
-        (i, s), tree, columns = site, self.tree, self.columns
-        behind = columns.behind(tree, site)
-        rows = self.dim.d + self.dim.r
-        by_motion = np.zeros((self.count, rows, self.motion_size))
-        outboard = np.zeros((self.count, rows, 3 * (behind.stop - behind.start)))
+        (i, s), tree, columns, rows = site, self.tree, self.columns, self.dim.d + self.dim.r
+        by_motion, parts = np.zeros((self.count, rows, self.motion_size)), []
         for k in tree.hanging[site]:
-            joint, on_frame = self.links[k].joint, self.on_frames[k]
+            joint, on_frame, first = self.links[k].joint, self.on_frames[k], columns.first[k]
             of_loads = joint.passage.of_loads
             by_motion += of_loads @ (on_frame.by_motion @ self._carrier(joint.passage))
-            own = slice(columns.modes[k].start, columns.last[k])
-            outboard[:, :, _three(own, behind.start)] = of_loads @ on_frame.outboard
+            by_rigid = np.zeros((self.count, rows, 3 * (columns.modes[k].start - first)))
             if (by_joint := self.by_joints.get(k)) is not None:
-                place = 3 * (columns.rigid[tree.joints[k].coordinate] - behind.start)
-                by_joint = of_loads @ (on_frame.by_motion @ by_joint)
-                by_joint[:, :, 0] += joint.load_by_joint(self.loads.joints[k]).T
-                outboard[:, :, place : place + 3] = by_joint
+                by_rigid[:, :, :3] = of_loads @ (on_frame.by_motion @ by_joint)
+                by_rigid[:, :, 0] += joint.load_by_joint(self.loads.joints[k]).T
             if (rotor := self.links[k].rotor) is not None:
                 by_motion += self._widened(rotor.load_by_motion)
                 if (place := columns.rigid.get(tree.rotors[k])) is not None:
-                    place = 3 * (place - behind.start)
-                    outboard[:, :, place : place + 3] += rotor.load_by_motor.transpose(2, 0, 1)
+                    own = _three(slice(place, place + 1), first)
+                    by_rigid[:, :, own] += rotor.load_by_motor.transpose(2, 0, 1)
+            parts += [by_rigid, of_loads @ on_frame.outboard]
         if i != GROUND and s in self.links[i].carried:
             by_motion += self._widened(self.links[i].carried[s].load_by_motion)
-        return _LoadDerivative(by_motion, outboard)
+        return _LoadDerivative(by_motion, _side_by_side([by_motion[:, :, :0], *parts]))
 
     def _on_frame(self, i: int, outboard: dict[int, _OutboardLoad]) -> _LoadDerivative:
         """Return the derivative of what a joint feels of the body and all behind it."""
-        link, columns, dim = self.links[i], self.columns, self.dim
+        link, kept, dim = self.links[i], self.columns.kept[i], self.dim
         by_motion = self._widened(link.body.load_by_motion)
-        first, modes = columns.modes[i].start, _three(columns.modes[i], columns.modes[i].start)
-        behind = np.zeros((self.count, dim.d + dim.r, 3 * (columns.last[i] - first)))
+        own, parts = by_motion[:, :, :0], []
         if link.body.is_flexible:
-            by_own = _load_by_rates(link, self.loads.outboard[i], columns.kept[i])
-            behind[:, :, modes] = _by_coordinate(by_own)
+            own = _by_coordinate(_load_by_rates(link, self.loads.outboard[i], kept))
         for s, interface in link.interfaces.items():
             of_loads, on = interface.passage.of_loads, outboard[s]
             by_motion += of_loads @ on.by_frame
-            behind[:, :, modes] += of_loads @ on.by_modes
-            place = _three(columns.behind(self.tree, (i, s)), first)
-            if on.outboard.shape[2]:
-                behind[:, :, place] = of_loads @ on.outboard
+            own = own + of_loads @ on.by_modes
+            parts.append(of_loads @ on.outboard)
             if s in link.applied:
                 given = _given(link, s)
                 lever = _by_instant(dim.by_spin(interface.place)).swapaxes(1, 2)
                 by_motion[:, :, -dim.r :] += given
                 by_motion[:, dim.d :, -dim.r :] += lever @ given[:, : dim.d]
-        return _LoadDerivative(by_motion, behind)
+        return _LoadDerivative(by_motion, _side_by_side([own, *parts]))
 
     def _add_drive(self, i: int) -> None:
         """Add the rows of a joint's force, and of its motor's."""
@@ -433,8 +435,8 @@ class _Walk:
             self.drives[:, row, _three(own)] = axis @ on_frame.outboard
         if link.rotor is None or (row := columns.drives.get(tree.rotors[i])) is None:
             return
-        inner, by_motion = self.ends[joint.parent, joint.interface], link.rotor.force_by_motion
-        self.drives[:, row, : inner.shape[2]] += by_motion @ inner[:, : len(by_motion)]
+        by_carrier = self.by_carriers[i]
+        self.drives[:, row, : by_carrier.shape[1]] += by_carrier
         self.drives[:, row, 3 * columns.rigid[tree.rotors[i]] + 2] += link.rotor.force_by_motor
 
     def _add_rows(self, i: int, outboard: dict[int, _OutboardLoad]) -> None:
@@ -477,7 +479,13 @@ class _Walk:
         whole[:, :, _three(modes)] = own
         for place, left, right in parts:
             np.matmul(left, right, out=whole[:, :, _three(place)])
-        self.blocks.append(Block(rows, slice(None), None, whole))
+        self.blocks.append(Block(rows, slice(0, whole.shape[2]), None, whole))
+
+
+def _side_by_side(parts: list[np.ndarray]) -> np.ndarray:
+    """Return derivatives by the columns of all parts (n, ., 3 c)."""
+    some = [one for one in parts if one.shape[2]] or parts[:1]
+    return some[0] if len(some) == 1 else np.concatenate(some, axis=2)
 
 
 def _by_coordinate(x: np.ndarray) -> np.ndarray:
