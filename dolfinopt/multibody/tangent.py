@@ -280,8 +280,8 @@ class _Walk:
         self.tree, self.links, self.loads, self.columns = tree, links, loads, columns
         self.dim, self.count = tree.dim, links[0].body.a.shape[1]
         self.motion_size = self.dim.d + (3 if tree.forces else 2) * self.dim.r
-        # Of frames by what is inboard and their joint; of interfaces by their body's modes; of motors'
-        # forces by what carries them.
+        # Of frames by what is inboard and their joint, of interfaces by their body's modes, and of
+        # motors' forces by what carries their rotors.
         self.frames: dict[int, np.ndarray] = {}
         self.by_modes: dict[Site, np.ndarray] = {}
         self.by_joints: dict[int, np.ndarray] = {}
