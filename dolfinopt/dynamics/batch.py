@@ -46,7 +46,7 @@ from dolfinopt.dynamics.system import State
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_motion import Constants, Scale
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 

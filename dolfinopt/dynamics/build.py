@@ -18,21 +18,11 @@ from dolfinopt.dynamics.measured import (
     TABLE_BREAKPOINTS_LIMIT,
 )
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import largest_change
-from dolfinopt.multibody.machine import family_of, friction_of, loops_of
-from dolfinopt.multibody.mechanism import (
-    AppliedForce,
-    Closure,
-    Drives,
-    Mechanism,
-    Springs,
-)
-from dolfinopt.multibody.motion import (
-    RigidMotion,
-    breakpoints,
-    rests,
-)
+from dolfinopt.motion.build import breakpoints, check_path, passive_coordinates, rests, rigid_motion
+from dolfinopt.multibody.machine import build_mechanism, friction_of, loops_of
+from dolfinopt.multibody.mechanism import AppliedForce, Drives, Springs
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.paths import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
@@ -48,13 +38,6 @@ def soft_joints(scene: Scene) -> dict[int, JointParts]:
     return dict(sorted(found.items()))
 
 
-def dependent_coordinates(scene: Scene) -> list[int]:
-    """Return the rigid coordinates that follow from the others in closed loops."""
-    if scene.joints:
-        return [k for k, joint in enumerate(scene.movable) if joint.passive]
-    return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
-
-
 def is_machine(scene: Scene) -> bool:
     """Return whether rigid coordinates are unknown: by control, closed loops, soft joints."""
     closed = scene.closure is not None or bool(scene.closures)
@@ -63,13 +46,8 @@ def is_machine(scene: Scene) -> bool:
 
 def check_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed, or a stop is too short."""
-    family_of(scene).check(scene)
-    rests_of(scene)
-
-
-def rests_of(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """Return the intervals in which settling counts, see `motion.rests`, s."""
-    return rests(scene, family_of(scene).curve)
+    check_path(scene)
+    rests(scene)
 
 
 def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
@@ -83,13 +61,13 @@ def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
 
 def _motion_at(scene: Scene, stamp: int, t: np.ndarray) -> RigidMotion:
     if len(t) > KEPT_INSTANTS_LIMIT:
-        return family_of(scene).motion(t, scene)
+        return rigid_motion(t, scene)
     return _kept_motion(scene, stamp, np.asarray(t, dtype=float).tobytes())
 
 
 @lru_cache(maxsize=MOTIONS_KEPT)
 def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
-    return family_of(scene).motion(np.frombuffer(instants), scene)
+    return rigid_motion(np.frombuffer(instants), scene)
 
 
 def build_system(
@@ -102,12 +80,10 @@ def build_system(
         bodies: from the base outwards.
         motion: the desired rigid motion, shared with other scenes; None: the scene's.
     """
-    family = family_of(scene)
     if motion is None:
         motion = desired_motion(scene)
-    mechanism: Mechanism = family.build(scene, bodies)
-    instants = breakpoints(scene, family.curve)
-    if scene.forces:
+    mechanism, instants = build_mechanism(scene, bodies), breakpoints(scene)
+    if forces_of(scene):
         mechanism, motion = replace(mechanism, forces=forces_of(scene)), under_forces(motion, scene)
         instants = with_rows(instants, tables_of_forces(scene), scene.motion.horizon)
     if not is_machine(scene):
@@ -115,9 +91,7 @@ def build_system(
     if scene.control is not None and scene.control.forces is not None:
         times = _forces(scene.control.forces, scene.driven)[0]
         instants = with_rows(instants, [times], scene.motion.horizon)
-    drives = _drives(scene)
-    loops = _loops(scene, mechanism, motion, drives)
-    return MachineSystem(mechanism, motion, instants, drives, *loops)
+    return MachineSystem(mechanism, motion, instants, _drives(scene), loops_of(scene))
 
 
 def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
@@ -125,49 +99,12 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
 
     The loads p are those of the machine with rigid arms on the desired motion.
     """
-    family = family_of(scene)
-    mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
-    if scene.forces:
+    mechanism, motion = build_mechanism(scene, bodies), rigid_motion(t, scene)
+    if forces_of(scene):
         mechanism = replace(mechanism, forces=forces_of(scene))
         motion = under_forces(lambda _: motion, scene)(t)
-    if scene.closure is None:
-        return largest_change(mechanism, motion)
-    drives = _drives(scene)
-    loops = _loops(scene, mechanism, desired_motion(scene), drives)[1]
-    return largest_change(mechanism, motion, loops, drives.dependent)
-
-
-def closure_of(scene: Scene) -> Closure | None:
-    """Return what holds the last interface, or None."""
-    closure = scene.closure
-    if closure is None:
-        return None
-    point = complex(*closure.point)
-    if closure.kind == "pin":
-        return Closure.pin(point)
-    return Closure.slider(point, complex(*closure.direction), closure.force)
-
-
-def _loops(
-    scene: Scene,
-    mechanism: Mechanism,
-    motion: Callable[[np.ndarray], RigidMotion],
-    drives: Drives,
-) -> tuple[Loops | None, Loops | None]:
-    """Return the closures with those equations that are independent: of the arms, of rigid ones."""
-    if (closure := closure_of(scene)) is not None:
-        loops = Loops.of_plane(closure, mechanism.end)
-        return loops, loops
-    every = loops_of(scene)
-    if every is None:
-        return None, None
-    q_r, rigid = motion(np.zeros(1)).q, mechanism.num_rigid
-    rows = every.at(mechanism, q_r, np.zeros((1, mechanism.num_coordinates))).every_row[0]
-    by_rigid, by_elastic = rows[:, :rigid], rows[:, rigid:]
-    # Of like size: modes are normalised by their energy.
-    by_elastic = by_elastic / (np.abs(by_elastic).max(initial=0.0) or 1.0)
-    free = by_rigid[:, drives.free] / np.abs(by_rigid).max()
-    return every.independent(np.hstack([free, by_elastic])), every.independent(by_rigid)
+    passive = np.array(passive_coordinates(scene), dtype=int)
+    return largest_change(mechanism, motion, loops_of(scene), passive)
 
 
 def _drives(scene: Scene) -> Drives:
@@ -178,7 +115,7 @@ def _drives(scene: Scene) -> Drives:
     stiffness, damping = np.zeros((2, count))
     limits = np.full(count, np.inf)
     free, dependent = np.zeros((2, count), dtype=bool)
-    dependent[dependent_coordinates(scene)] = free[dependent_coordinates(scene)] = True
+    dependent[passive_coordinates(scene)] = free[passive_coordinates(scene)] = True
     rotors, soft = np.zeros(count), soft_joints(scene)
     for k, one in soft.items():
         rotors[k] = one.rotor
@@ -259,6 +196,17 @@ def with_rows(
 # -- forces on interfaces, [[forces]] ------------------------------------------------------------
 
 
+def forces_on(scene: Scene) -> tuple[Force, ...]:
+    """Return the scene's forces on interfaces, that of [closure] on the slider among them."""
+    closure = scene.closure
+    if closure is None or closure.force == 0.0:
+        return scene.forces
+    x, y = closure.direction
+    size = closure.force / np.hypot(x, y)
+    own = Force(arm=scene.arms[-1].name, force=(size * x, size * y))
+    return (*scene.forces, own)
+
+
 def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
     """Return where the scene's forces act; their values stand in the motion of `under_forces`."""
     names = [arm.name for arm in scene.arms]
@@ -269,7 +217,7 @@ def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
             in_world=force.frame == "world",
             known=force.feed_forward,
         )
-        for column, force in enumerate(scene.forces)
+        for column, force in enumerate(forces_on(scene))
         for k in [names.index(force.arm)]
     )
 
@@ -280,7 +228,7 @@ def under_forces(
     """Return the motion with the values of the scene's forces at the same instants."""
 
     def with_forces(t: np.ndarray) -> RigidMotion:
-        values = [_force_values(force, scene.dimension, t) for force in scene.forces]
+        values = [_force_values(force, scene.dimension, t) for force in forces_on(scene)]
         return replace(motion(t), applied=np.stack(values, axis=1))
 
     return with_forces

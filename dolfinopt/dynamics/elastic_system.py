@@ -22,7 +22,7 @@ from dolfinopt.dynamics.measured import (
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_errors
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 

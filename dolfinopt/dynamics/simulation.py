@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.dynamics import batch, generalized_alpha, radau
 from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.build import build_system, closure_of, desired_motion, rests_of
+from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
@@ -26,7 +26,8 @@ from dolfinopt.dynamics.newton import ONE_RUN
 from dolfinopt.dynamics.radau import BEYOND, REMEDY
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.closures import Loops
+from dolfinopt.motion.build import rests
+from dolfinopt.multibody.closures import Loops, Tie
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
 from dolfinopt.multibody.kinematics import (
@@ -36,8 +37,9 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.mechanism import Closure, Mechanism
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
     Rates,
@@ -218,9 +220,9 @@ class Trajectory:
         return self.problem.loops if isinstance(self.problem, MachineSystem) else None
 
     @property
-    def closure(self) -> Closure | None:
+    def closure(self) -> Tie | None:
         """What holds the last interface of a closed loop in the plane, or None."""
-        return closure_of(self.scene)
+        return self.loops.ties[0] if self.scene.closure and self.loops else None
 
     @cached_property
     def closure_force(self) -> np.ndarray | None:
@@ -233,7 +235,7 @@ class Trajectory:
         if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
         multipliers = self.unknowns[2][:, slice(*self.problem.ends[1:])]
-        return multipliers if self.closure else self.loops.reactions(multipliers)
+        return self.loops.reactions(multipliers)
 
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
@@ -260,11 +262,11 @@ class Trajectory:
     @cached_property
     def slider_position(self) -> np.ndarray | None:
         """Place of a slider on its line, from the closure's point along its direction (n,), m."""
-        if self.closure is None or self.closure.count != 1:
+        closure = self.scene.closure
+        if closure is None or closure.kind != "slider":
             return None
-        x, y = self.end.T
-        along = self.closure.normals[0] / 1j
-        return (np.conj(along) * (x + 1j * y - self.closure.point)).real
+        along = np.array(closure.direction) / np.linalg.norm(closure.direction)
+        return (self.end - np.array(closure.point)) @ along
 
     @property
     def motor_columns(self) -> tuple[int, ...]:
@@ -325,8 +327,8 @@ class Trajectory:
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
 
-        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' g_d'^-1 by_d; of
-        flexible arms that closures hold by more equations than that, the further forces are held.
+        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' x, g_d' x = by_d;
+        of arms that closures hold by more equations than that, x is of least norm.
 
         Args:
             indices: (n,) of the instants.
@@ -334,14 +336,14 @@ class Trajectory:
         """
         problem = self.problem
         by_q = by[:, problem.elastic_columns]
-        if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
+        if not isinstance(problem, MachineSystem) or problem.loops is None:
             return by_q
         q_r, q = self.motion.q[indices], self.q_e[indices]
-        here = problem.rigid_loops.at(self.mechanism, q_r, q)
+        here = problem.loops.at(self.mechanism, q_r, q)
         J = here.jacobian[:, :, problem.columns]
         dependent = np.flatnonzero(~problem.drives.driven)
-        by_g = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), by[:, dependent, None])
-        return by_q - np.einsum("nm,nmk->nk", by_g[..., 0], J[:, :, problem.elastic_columns])
+        by_g = least_norm(J[:, :, dependent].swapaxes(1, 2), by[:, dependent])
+        return by_q - np.einsum("nm,nmk->nk", by_g, J[:, :, problem.elastic_columns])
 
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
@@ -387,7 +389,7 @@ class Trajectory:
         """Which instants are in a rest (n,); the last one is in any case."""
         rounding = 1e-9 * self.scene.motion.horizon
         found = np.zeros(len(self.t), dtype=bool)
-        for begin, end in rests_of(self.scene):
+        for begin, end in rests(self.scene):
             found |= (self.t >= begin - rounding) & (self.t <= end + rounding)
         found[-1] = True
         return found

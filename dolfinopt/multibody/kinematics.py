@@ -22,7 +22,7 @@ from dolfinopt.multibody.dimension import (
     transposed_product,
 )
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 
 if TYPE_CHECKING:
     from dolfinopt.multibody.mechanism import Joint

@@ -28,7 +28,7 @@ from dolfinopt.multibody.inverse_dynamics import (
 from dolfinopt.multibody.kinematics import Interface, Passage
 from dolfinopt.multibody.measured import DERIVATIVES_BYTES, LEAST_INSTANTS
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
 

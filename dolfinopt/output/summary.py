@@ -390,15 +390,21 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
 
 
 def _redundant(trajectory: Trajectory | None) -> list[str]:
-    """Return a sentence that tells how many equations of closures follow from others."""
-    if trajectory is None or trajectory.loops is None or not trajectory.loops.redundant:
+    """Return sentences on closures that hold rigid arms more often than needed."""
+    if trajectory is None or trajectory.loops is None:
         return []
-    loops = trajectory.loops
-    return [
-        f"closures: of {loops.count + loops.redundant} equations {loops.redundant} follow from the "
-        "others and are left out; how forces share between them is not determined, the smallest "
-        "ones are told"
-    ]
+    problem, told = trajectory.problem, []
+    if problem.num_redundant:
+        told.append(
+            f"closures: of {trajectory.loops.count} equations {problem.num_redundant} follow from "
+            "the others for rigid arms; where no arm resists, the smallest forces are told"
+        )
+    if (left := problem.left_stress()) > 0.0:
+        told.append(
+            f"closures: closing what the arms leave open would add forces of {left:.3g} N, which "
+            "are left out"
+        )
+    return told
 
 
 def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | None:

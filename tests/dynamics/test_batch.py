@@ -16,7 +16,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.body_motion import Constants, Scale
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, rigid_bar
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.paths import quintic

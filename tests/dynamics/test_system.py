@@ -22,7 +22,7 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import DenseLinearisation, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.multibody.mechanism import Drives, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.paths import quintic
 from dolfinopt.profiling import Profile
 

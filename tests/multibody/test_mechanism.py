@@ -37,7 +37,8 @@ from dolfinopt.multibody.kinematics import (
 )
 from dolfinopt.multibody.machine import roll_pitch_yaw, skew
 from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
-from dolfinopt.multibody.motion import RigidMotion, rigid_motion
+from dolfinopt.motion.build import rigid_motion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise
 from dolfinopt.reduction import Options, craig_bampton, modal

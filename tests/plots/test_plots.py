@@ -15,7 +15,7 @@ from runs import ROOT
 import dolfinopt as do
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.mechanism import Closure, Mechanism, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView

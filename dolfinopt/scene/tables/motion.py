@@ -114,6 +114,11 @@ class Motion(Table):
         description="simulated time, at least the duration, after which the machine stays at "
         "rest or keeps its speed; the default is the duration if that is longer [s]",
     )
+    table_ends: Literal["rest", "moving"] = Field(
+        default="rest",
+        description="whether a table with times rests at its first and last instant, or moves "
+        "there at the rates of its own rows, as one cut out of a motion does [-]",
+    )
     dwells: bool | tuple[tuple[Instant, Instant], ...] = Field(
         default=True,
         description="rests in which settling counts besides that after the motion: true, every "
@@ -158,6 +163,7 @@ class Motion(Table):
         self.refuse_unused(self.path in ("points", "line", "joints"), "path", "initial_joints")
         self.refuse_unused(tabulated, "path", "file")
         self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
+        self.refuse_unused(tabulated, "path", "table_ends")
         joints = self.path in ("joints", "rotation")
         self.refuse_unused(not joints, "path", "cart_follow", "elbow")
         if self.path == "rotation" and self.base != "fixed":
@@ -182,6 +188,13 @@ class Motion(Table):
                 "how long the law accelerates",
                 ("acceleration_share",),
                 (last,),
+            )
+        if self.table_ends == "moving" and self.horizon > self.duration:
+            raise Refusal(
+                f"expected motion.duration = {self.duration:g} [s], the end of the table, with "
+                'motion.table_ends = "moving": nothing says how the machine moves on',
+                ("horizon",),
+                ("table_ends",),
             )
         if self.horizon < self.duration:
             raise Refusal(
