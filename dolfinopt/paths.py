@@ -353,7 +353,7 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
         pieces.append((table.t[i], table.t[j], _spline(table, slice(i, j + 1), free)))
     if len(pieces) == 1 and pieces[0][:2] == (table.t[0], table.t[-1]):
         return Curve(float(table.t[-1]), pieces[0][2], rests=not moving)
-    functions = piecewise(table, pieces)
+    functions = piecewise(table, pieces, ends_move=moving)
     end = float(table.t[-1])
     return Curve(end, functions, move_ends(table), rests=not moving, stops=stops_of(table))
 
@@ -379,21 +379,25 @@ def _spline(
 
 
 def piecewise(
-    table: Table, pieces: Sequence[Piece]
+    table: Table, pieces: Sequence[Piece], ends_move: bool
 ) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
     """Return a table's curve and two derivatives of moves between instants, at rest between.
 
-    The end of a move belongs to it: there an acceleration may jump.
+    Args:
+        table: its rows.
+        pieces: first and last instant of every move, and its functions.
+        ends_move: whether the last instant belongs to a move: there an acceleration may jump.
     """
     assert table.t is not None
     t, rows = table.t, table.rows
+    beyond = SAME * t[-1] if ends_move else 0.0
 
     def derivative(order: int) -> Callable[[np.ndarray], np.ndarray]:
         def value(u: np.ndarray) -> np.ndarray:
             here = rows[np.clip(np.searchsorted(t, u, side="right") - 1, 0, len(t) - 1)]
             found = here if order == 0 else np.zeros_like(here)
             for first, last, functions in pieces:
-                inside = (first < u) & (u <= last + SAME * t[-1])
+                inside = (first < u) & (u < last + beyond)
                 found[inside] = functions[order](np.minimum(u[inside], last))
             return found
 

@@ -526,9 +526,7 @@ class MachineSystem:
             weights = weights.copy()
             weights[:, springs.joints] *= 1.0 + turned
         desired = instants.desired
-        of_forces = feed_forward_weights(
-            self.rigid, desired, self.drives, self.loops, weights
-        )
+        of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.loops, weights)
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
         return [a + b.padded(a) for a, b in zip(total, rigid, strict=True)]

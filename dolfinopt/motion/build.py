@@ -10,10 +10,12 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion import plane
-from dolfinopt.motion.constraints import Constraints, Derivatives, Target
+from dolfinopt.motion.constraints import Constraints, Derivatives, Target, part_of
 from dolfinopt.motion.curves import along, curve_by_chord, curve_by_laws, inverse
 from dolfinopt.motion.measured import (
     DENSE_INSTANTS,
+    LEAST_ROWS,
+    REACHED_SHARE,
     REST_ACCELERATION_RATIO,
     TABLE_CORNERS_LIMIT,
 )
@@ -22,7 +24,16 @@ from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.machine import loops_of, roll_pitch_yaw, skeleton
 from dolfinopt.multibody.mechanism import repeated
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.paths import TIME, Curve, Limits, Table, column_names, curve_in_time, moves, read_table
+from dolfinopt.paths import (
+    TIME,
+    Curve,
+    Limits,
+    Table,
+    column_names,
+    curve_in_time,
+    moves,
+    read_table,
+)
 from dolfinopt.scene.duration import (
     POINT,
     SAME_TIME,
@@ -68,9 +79,12 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 
 def follows(scene: Scene) -> bool:
     """Return whether joints follow from equations: closed loops, or a path in space."""
-    if scene.closure is not None or scene.closures:
-        return True
-    return scene.is_spatial and scene.motion.path != "joints"
+    return has_loops(scene) or (scene.is_spatial and scene.motion.path != "joints")
+
+
+def has_loops(scene: Scene) -> bool:
+    """Return whether closures close loops."""
+    return scene.closure is not None or bool(scene.closures)
 
 
 def check_path(scene: Scene) -> None:
@@ -299,10 +313,10 @@ def target_of(t: np.ndarray, scene: Scene) -> Target:
     if scene.motion.path in ("joints", "rotation"):
         return Target(_with_springs(_prescribed(t, scene), scene), free)
     values, start = _along_table(t, scene), rows_of(scene).start
-    place, first = tuple(x[:, :3] for x in values), 3 if start is None else 6
-    turned = None if start is None else turning(start, tuple(x[:, 3:6] for x in values))
-    joints = tuple(x[:, first:] for x in values)
-    return Target(_with_springs(joints, scene), place, turned)
+    first = 3 if start is None else 6
+    turned = None if start is None else turning(start, part_of(values, slice(3, 6)))
+    joints = _with_springs(part_of(values, slice(first, None)), scene)
+    return Target(joints, part_of(values, slice(3)), turned)
 
 
 def _along_table(t: np.ndarray, scene: Scene) -> Derivatives:
@@ -324,11 +338,12 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Derivatives:
         turned = plane.rotation(
             t, time_law(motion), motion.speed, motion.start_angle, motion.duration
         )
-        joints = tuple(x[:, None] for x in turned)
+        joints = part_of(turned, None)
     if scene.is_spatial or motion.base == "cart":
         return joints
     places = (motion.base_position, 0.0, 0.0)
-    return tuple(np.insert(x, 0, place, axis=1) for x, place in zip(joints, places, strict=True))
+    q, qd, qdd = (np.insert(x, 0, at, axis=1) for x, at in zip(joints, places, strict=True))
+    return q, qd, qdd
 
 
 def _with_springs(joints: Derivatives, scene: Scene) -> Derivatives:
@@ -414,11 +429,6 @@ def _follower(scene: Scene, stamp: int) -> Follower:
     slides = np.array([unit == "m" for unit in scene.rigid_units.values()])
     has_path = motion.path not in ("joints", "rotation")
     constraints = Constraints(skeleton(scene), loops_of(scene) or Loops(), slides, has_path)
-    if scene.closures and not unknown:
-        raise InputError(
-            f"{scene.source}: closures: expected joints with passive = true, which follow from "
-            "the others; there are none"
-        )
     if not constraints.loops.ties:
         _check_joints(scene, constraints, unknown)
     guess, width = _guess(scene)
@@ -505,42 +515,38 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
 # -- what is told ----------------------------------------------------------------------------
 
 
-def notes(scene: Scene) -> list[str]:
-    """Return sentences on how loops start, what links leave open, and ends of a moving table."""
-    return [*_loop_notes(scene), *_table_notes(scene)]
+def loop_start(scene: Scene) -> dict[str, float]:
+    """Return the joints that follow in closed loops at t = 0, rad, m: the branch; none of a tree."""
+    if not has_loops(scene):
+        return {}
+    task, q = follower(scene).task, follower(scene).start.q
+    return {task.names[k]: float(q[k]) for k in task.unknown}
 
 
-def _loop_notes(scene: Scene) -> list[str]:
-    if scene.closure is None and not scene.closures:
-        return []
-    task, start = follower(scene).task, follower(scene).start
-    units = list(scene.rigid_units.values())
-    joints = ", ".join(f"{task.names[k]} = {start.q[k]:.4g} {units[k]}" for k in task.unknown)
-    chosen = "motion.initial_joints"
-    told = [f"closures: the loops start with {joints}; {chosen} near others chooses another branch"]
-    if start.misfit > 1e-9 * task.constraints.reach:
-        told.append(
-            f"closures: the links leave {start.misfit:.3g} m open; they are joined without the "
-            "stress of closing it"
-        )
-    return told
+def misfit(scene: Scene) -> float:
+    """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
+    if not has_loops(scene):
+        return 0.0
+    one = follower(scene)
+    left, reach = one.start.misfit, one.task.constraints.reach
+    return left if left > REACHED_SHARE * reach else 0.0
 
 
-def _table_notes(scene: Scene) -> list[str]:
+def forced_rest(scene: Scene) -> str | None:
     """Return that a table which moves at its ends is forced to rest, where that dominates."""
     motion = scene.motion
     if motion.path not in ("points", "joints") or motion.table_ends == "moving":
-        return []
+        return None
     table = rows_of(scene).table
-    if table.t is None or not _is_free(motion):
-        return []
+    if table.t is None or not _is_free(motion) or len(table.t) < LEAST_ROWS:
+        return None
     t = np.linspace(0.0, table.t[-1], max(DENSE_INSTANTS, 4 * len(table.t)))
     forced, own = (np.abs(curve_in_time(table, k)(t)[2]).max(axis=0) for k in (False, True))
     worst = int(np.argmax(forced / np.maximum(own, 1e-12)))
-    if not forced[worst] > REST_ACCELERATION_RATIO * own[worst] or len(table.t) < 6:
-        return []
-    return [
+    if forced[worst] <= REST_ACCELERATION_RATIO * own[worst]:
+        return None
+    return (
         f"motion: {motion.file} moves in its first or last row; the rest that is put there needs "
         f"an acceleration of {forced[worst]:.3g} where its rows have {own[worst]:.3g}: let it rest "
         'there, or take its own rates, motion.table_ends = "moving"'
-    ]
+    )

@@ -23,6 +23,12 @@ from dolfinopt.multibody.mechanism import Mechanism
 Derivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives
 
 
+def part_of(values: Derivatives, columns: slice | None) -> Derivatives:
+    """Return some columns of all three; None: of values (n,) the one column (n, 1)."""
+    q, qd, qdd = (x[:, columns] for x in values)
+    return q, qd, qdd
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """What is prescribed at n instants.
@@ -111,7 +117,11 @@ class Pose:
             [
                 np.zeros_like(self.closed.gap),
                 target.place[order],
-                *([] if target.turning is None else [self.constraints.reach * target.turning[order]]),
+                *(
+                    []
+                    if target.turning is None
+                    else [self.constraints.reach * target.turning[order]]
+                ),
             ]
         )
 

@@ -7,7 +7,6 @@ many; k - rank G equations follow from the others. Null vectors name the coordin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +32,7 @@ class Counts:
     missing: int
 
 
-def counts_of(G: np.ndarray, passive: Sequence[int], driven: Sequence[int], share: float) -> Counts:
+def counts_of(G: np.ndarray, passive: np.ndarray, driven: np.ndarray, share: float) -> Counts:
     """Return the counts by a scaled Jacobian (k, R) of a usual pose.
 
     Args:
@@ -41,17 +40,17 @@ def counts_of(G: np.ndarray, passive: Sequence[int], driven: Sequence[int], shar
         passive, driven: columns.
         share: see `ranks.rank`.
     """
-    own = G[:, list(passive)]
+    own = G[:, passive]
     followed, every = rank(own, share), rank(G[:, [*passive, *driven]], share)
     left, _, right = np.linalg.svd(own)
     undetermined = np.abs(right[followed:]).max(axis=0, initial=0.0) > NAMED_SHARE
     held: tuple[int, ...] = ()
     if followed < every:
         moved = left[:, followed:].T @ G
-        held = tuple(k for k in driven if np.abs(moved[:, k]).max() > NAMED_SHARE)
+        held = tuple(int(k) for k in driven if np.abs(moved[:, k]).max() > NAMED_SHARE)
     return Counts(
         redundant=len(G) - every,
-        undetermined=tuple(np.array(passive, dtype=int)[undetermined].tolist()),
+        undetermined=tuple(passive[undetermined].tolist()),
         loose=len(passive) - followed,
         held=held,
         missing=every - followed,

@@ -28,6 +28,7 @@ def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
             (t[i], t[j], tuple(partial(value, i, j, law, order) for order in range(3)))
             for i, j, law in laws
         ],
+        ends_move=True,
     )
     knots = [t[i] + law.knots * (t[j] - t[i]) for i, j, law in laws]
     kinks = np.unique(np.concatenate([move_ends(table), *knots]))

@@ -73,7 +73,7 @@ class Follower:
         off = np.linalg.norm(task.constraints.error(q, target), axis=1)
         wrong = np.flatnonzero(~(off <= self.start.tolerance(task.constraints.reach)))
         if wrong.size:
-            raise self._lost(q[wrong[0]], float(t[wrong[0]]), q[wrong[0]])
+            raise self._lost(q[wrong[0]], float(t[wrong[0]]))
         return q, *task.rates(q, target)
 
     # -- samples -----------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class Follower:
             if other is None:
                 step = 0.25 * h
                 if step < LEAST_STEP * end:
-                    lost.append(self._lost(guess[0], ahead, q))
+                    lost.append(self._lost(q, ahead))
                     return
                 continue
             rate = task.velocity(other[None], target)[0]
@@ -163,15 +163,13 @@ class Follower:
         reach = self.task.constraints.reach
         return 1e-8 * reach + self.start.tolerance(reach)
 
-    def _lost(self, guess: np.ndarray, t: float, before: np.ndarray) -> InputError:
-        """Return why there is no pose near a guess (R,): out of reach, or a singular position."""
+    def _lost(self, before: np.ndarray, t: float) -> InputError:
+        """Return why there is no pose at t near one (R,): out of reach, or a singular position."""
         task = self.task
-        target = task.target(np.array([t]))
-        later = min(t + task.end / SAMPLES / REFINED, task.end)
-        for instant in dict.fromkeys((t, later)):
+        for instant in (min(t + task.end / SAMPLES / REFINED, task.end), t):
             target = task.target(np.array([instant]))
             q = task.with_given(before[None], target)[0]
             q, off = nearest(task, q, target, task.unknown)
-            if off > self._rough and self._regularity.sizes(before[None]).min() > 0.01:
+            if off > self._rough:
                 return unreached(task, instant, q, target)
         return self._regularity.refusal(before, t)

@@ -15,6 +15,7 @@ DENSE_INSTANTS = 2001
 TABLE_CORNERS_LIMIT = 20
 # Times the acceleration within a table that its rest at the ends may need before it is told.
 REST_ACCELERATION_RATIO = 10.0
+LEAST_ROWS = 6  # of a table whose own acceleration a spline of degree 5 tells
 
 # -- constraints, counts, start --------------------------------------------------------------
 

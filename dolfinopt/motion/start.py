@@ -70,6 +70,9 @@ def nearest(
     def jacobian(x: np.ndarray) -> np.ndarray:
         return constraints.at(pose(x)).rows(turned)[0, rows][:, free]
 
+    if len(free) == 0:
+        off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
+        return q, float(off)
     accuracy = np.finfo(float).eps
     found = least_squares(
         error, np.zeros(len(free)), jacobian, xtol=accuracy, ftol=accuracy, gtol=accuracy

@@ -397,7 +397,9 @@ class Tie:
             point: a pin, or a point of a line.
             normals: (m, 2) directions of its forces: across a line, or two of a pin.
         """
-        return cls(name, site, None, np.asarray(point, float), np.eye(2), tuple(map(Along, normals)))
+        return cls(
+            name, site, None, np.asarray(point, float), np.eye(2), tuple(map(Along, normals))
+        )
 
     @property
     def is_rod(self) -> bool:

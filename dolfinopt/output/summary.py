@@ -18,6 +18,8 @@ from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.multibody.inverse_dynamics import Stiffening
@@ -50,6 +52,7 @@ SUMMARY_UNITS = {
     "max_deviation_time": "s",
     "max_rotation": "rad",
     "settling": "m",
+    "loop_start": "rad, m",
     "deflection_budget": "m, shares -",
     "stress": "Pa",
     "mass": "kg",
@@ -127,6 +130,7 @@ def summarise(
             **_figures(run.evaluation),
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            "loop_start": loop_start(scene),
             "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),
@@ -309,7 +313,8 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
         *_limits_exceeded(run.trajectory),
-        *_redundant(run.trajectory),
+        *_on_closures(run.scene, run.trajectory),
+        *([] if (rest := forced_rest(run.scene)) is None else [rest]),
         *_contact_warnings(run, traits),
         *(one.sentence for one in _too_narrow(run, traits)),
     ]
@@ -389,20 +394,21 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
     return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []
 
 
-def _redundant(trajectory: Trajectory | None) -> list[str]:
+def _on_closures(scene: Scene, trajectory: Trajectory | None) -> list[str]:
     """Return sentences on closures that hold rigid arms more often than needed."""
-    if trajectory is None or trajectory.loops is None:
+    if trajectory is None or not isinstance(trajectory.problem, MachineSystem):
         return []
     problem, told = trajectory.problem, []
     if problem.num_redundant:
+        _, first, last = problem.ends
         told.append(
-            f"closures: of {trajectory.loops.count} equations {problem.num_redundant} follow from "
-            "the others for rigid arms; where no arm resists, the smallest forces are told"
+            f"closures: of {last - first} equations {problem.num_redundant} follow from the others "
+            "for rigid arms; where no arm resists, the smallest forces are told"
         )
-    if (left := problem.left_stress()) > 0.0:
+    if (left := misfit(scene)) > 0.0:
         told.append(
-            f"closures: closing what the arms leave open would add forces of {left:.3g} N, which "
-            "are left out"
+            f"closures: rigid arms leave {left:.3g} m open; closing it would add forces of "
+            f"{problem.left_stress():.3g} N, which are left out"
         )
     return told
 

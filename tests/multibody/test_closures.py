@@ -41,7 +41,8 @@ from scipy.spatial.transform import Rotation
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.multibody import motion as motions
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
-from dolfinopt.multibody.machine import joint_motion, loops_of, skeleton
+from dolfinopt.motion.build import rigid_motion
+from dolfinopt.multibody.machine import loops_of, skeleton
 from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.motion import Loop, assembled, rotation
 from dolfinopt.paths import Limits, law_for
@@ -191,18 +192,18 @@ def of_crossed_crank(q: np.ndarray) -> np.ndarray:
 )
 def test_closed_forms(tmp_path, tree: dict, table: str, law: Law) -> None:
     scene = closed(tmp_path, table, tree)
-    motion = joint_motion(T, scene)
+    motion = rigid_motion(T, scene)
     assert np.abs(law(motion.q)).max() < EXACT
     inner, h = T[2:-2], 1e-3  # of the table's law, which is smooth there
     for key in ("q", "qd"):
-        a, b, c, d = (getattr(joint_motion(inner + k * h, scene), key) for k in (-2, -1, 1, 2))
+        a, b, c, d = (getattr(rigid_motion(inner + k * h, scene), key) for k in (-2, -1, 1, 2))
         by = (a - 8.0 * b + 8.0 * c - d) / (12.0 * h)
         expected = getattr(motion[2:-2], key + "d")
         assert np.abs(by - expected).max() < 1e-8 * (1.0 + np.abs(expected).max())
 
 
 def at_start(scene: Scene) -> np.ndarray:
-    q: np.ndarray = joint_motion(np.zeros(1), scene).q[0]
+    q: np.ndarray = rigid_motion(np.zeros(1), scene).q[0]
     return q
 
 
@@ -223,7 +224,7 @@ def test_a_path_of_the_plate_moves_the_drives(tmp_path) -> None:
     file = tmp_path / "points.csv"
     file.write_text("t,x,y,z\n0,0,0,-0.4\n0.5,0.05,0.02,-0.42\n1,-0.03,0.04,-0.38\n")
     scene = closed(tmp_path, "", delta(), motion={"path": "points", "file": str(file)})
-    q = joint_motion(np.array([0.0, 0.5, 1.0]), scene).q
+    q = rigid_motion(np.array([0.0, 0.5, 1.0]), scene).q
     assert np.abs(of_delta(q)).max() < EXACT
     points = np.array([[0, 0, -0.4], [0.05, 0.02, -0.42], [-0.03, 0.04, -0.38]])
     assert np.abs(q[:, 3:6] - points).max() < EXACT
@@ -283,7 +284,7 @@ def test_refused(tmp_path, tree: dict, table: str, words: tuple[str, ...]) -> No
     scene = closed(tmp_path, table, tree)
     with refused(*words):
         check_motion(scene)
-        joint_motion(T, scene)
+        rigid_motion(T, scene)
 
 
 # -- joints of closed loops of rigid arms: closure, rates, both ways to assemble, dead centres
