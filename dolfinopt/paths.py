@@ -361,7 +361,7 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
 def _spline(
     table: Table, part: slice, free: tuple[bool, bool]
 ) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
-    """Return the spline through some rows and two derivatives, at rest at ends that are not free."""
+    """Return the spline through some rows and its derivatives, at rest at ends not free."""
     from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
 
     assert table.t is not None

@@ -18,8 +18,8 @@ from dolfinopt.dynamics.measured import (
     TABLE_BREAKPOINTS_LIMIT,
 )
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.motion.build import breakpoints, check_path, passive_coordinates, rests, rigid_motion
+from dolfinopt.multibody.inverse_dynamics import largest_change
 from dolfinopt.multibody.machine import build_mechanism, friction_of, loops_of
 from dolfinopt.multibody.mechanism import AppliedForce, Drives, Springs
 from dolfinopt.multibody.rigid_motion import RigidMotion

@@ -15,7 +15,6 @@ from dolfinopt.motion.curves import along, curve_by_chord, curve_by_laws, invers
 from dolfinopt.motion.measured import (
     DENSE_INSTANTS,
     LEAST_ROWS,
-    REACHED_SHARE,
     REST_ACCELERATION_RATIO,
     TABLE_CORNERS_LIMIT,
 )
@@ -516,7 +515,7 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
 
 
 def loop_start(scene: Scene) -> dict[str, float]:
-    """Return the joints that follow in closed loops at t = 0, rad, m: the branch; none of a tree."""
+    """Return the joints that follow in closed loops at t = 0, rad, m: the branch."""
     if not has_loops(scene):
         return {}
     task, q = follower(scene).task, follower(scene).start.q
@@ -525,11 +524,7 @@ def loop_start(scene: Scene) -> dict[str, float]:
 
 def misfit(scene: Scene) -> float:
     """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
-    if not has_loops(scene):
-        return 0.0
-    one = follower(scene)
-    left, reach = one.start.misfit, one.task.constraints.reach
-    return left if left > REACHED_SHARE * reach else 0.0
+    return follower(scene).start.misfit if has_loops(scene) else 0.0
 
 
 def forced_rest(scene: Scene) -> str | None:

@@ -31,7 +31,7 @@ class Start:
         q: (R,) closed pose at t = 0.
         usual: (R,) a closed pose nearby that is not singular, unless all are.
         counts: of the closures there.
-        misfit: by which links leave the closures open at best, m.
+        misfit: by which links leave the closures open at best, m; 0 by rounding.
     """
 
     q: np.ndarray
@@ -155,7 +155,8 @@ def _usual(task: Task, q: np.ndarray, target: Target) -> tuple[np.ndarray, Count
         if off < 2.0 * misfit + REACHED_SHARE * constraints.reach and least > largest:
             usual, largest = other, least
     counts = counts_of(rows(usual)[closing], task.passive, task.driven, share)
-    return usual, counts, misfit if counts.redundant else 0.0
+    fits = not counts.redundant or misfit <= REACHED_SHARE * constraints.reach
+    return usual, counts, 0.0 if fits else misfit
 
 
 def _least(G: np.ndarray) -> float:

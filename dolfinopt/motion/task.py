@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.motion.constraints import Constraints, Derivatives, Target
+from dolfinopt.motion.constraints import Constraints, Target
 from dolfinopt.multibody.ranks import least_norm
 
 NEWTON_STEPS = 5  # from samples that are right to 1e-5, three leave rounding

@@ -19,9 +19,9 @@ from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
+from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.trajectory import (

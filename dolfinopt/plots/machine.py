@@ -239,7 +239,7 @@ def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
 
 
 def block_corners(place: complex, size: float, normal: complex) -> np.ndarray:
-    """Return the corners (4, 2), m, of a slider's block at a place, its line's normal; `size` as above."""
+    """Return the corners (4, 2), m, of a slider's block; `normal` of its line, `size` as above."""
     box = BLOCK * size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     return plane(place + box @ [1.0, 1j] * normal / 1j)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.motion.build import rests
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.motion.build import rests
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.response import constraints_of, find_limited, objective_of

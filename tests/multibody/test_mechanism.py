@@ -24,6 +24,7 @@ from remainders import substructure
 from runs import ROOT
 from scipy.linalg import expm
 
+from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody import measured
 from dolfinopt.multibody import tangent as tangents
 from dolfinopt.multibody.dimension import SpaceTurning
@@ -37,7 +38,6 @@ from dolfinopt.multibody.kinematics import (
 )
 from dolfinopt.multibody.machine import roll_pitch_yaw, skew
 from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
-from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.multibody.tangent import body_gradient, linearise

@@ -64,8 +64,8 @@ class Motion(Table):
     initial_joints: tuple[JointValue, ...] | None = Field(
         default=None,
         description="joint coordinates near those at the start of an end-effector's path in "
-        "space, for [[joints]] that move: which solution of inverse kinematics is meant; default: "
-        "0 [rad, m]",
+        "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
+        "solution is meant; default: 0, in the plane by closure.side [rad, m]",
     )
     file: FileName | None = Field(
         default=None,
@@ -160,7 +160,7 @@ class Motion(Table):
             raise Refusal("expected another point than motion.start", ("end",), ("start",))
         self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
         self.refuse_unused(self.path == "line", "path", "start", "end", "rpy")
-        self.refuse_unused(self.path in ("points", "line", "joints"), "path", "initial_joints")
+        self.refuse_unused(self.path != "arc", "path", "initial_joints")
         self.refuse_unused(tabulated, "path", "file")
         self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
         self.refuse_unused(tabulated, "path", "table_ends")
@@ -239,12 +239,17 @@ class Motion(Table):
                     "the plane",
                     ("motion", key),
                 )
-        for key in ("rpy", "initial_joints"):
+        for key in ("rpy", *(["initial_joints"] if scene.closure is None else [])):
             if getattr(self, key) is not None:
                 raise Refusal(
                     "expected none without [[joints]]: the machine moves in the plane",
                     ("motion", key),
                 )
+        if self.initial_joints is not None and len(self.initial_joints) != len(scene.arms):
+            raise Refusal(
+                f"expected {len(scene.arms)} numbers, the angles of all arms' joints",
+                ("motion", "initial_joints"),
+            )
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(
