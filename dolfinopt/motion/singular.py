@@ -140,7 +140,8 @@ class Regularity:
         joints = task.called(columns[null > 0.1 * null.max()])
         loops = task.constraints.loops
         acting = np.array(loops.by_tie(np.abs(G[0, : loops.count] * null).max(axis=1, initial=0.0)))
-        if not (acting > SINGULAR_SHARE).any():
+        by_path = task.constraints.has_path and not (acting > SINGULAR_SHARE).any()
+        if by_path or not loops.ties:
             return InputError(
                 f"{words.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
                 f"where rates of joints ({joints}) have no bounds; change {words.motion}, or "
@@ -149,7 +150,7 @@ class Regularity:
         ties = ", ".join(
             tie.name
             for tie, size in zip(loops.ties, acting, strict=True)
-            if size > SINGULAR_SHARE * acting.max()
+            if size >= SINGULAR_SHARE * acting.max()
         )
         return InputError(
             f"{words.source}: closures: at t = {t:.4g} s the loop of {ties} is at a dead centre, a "

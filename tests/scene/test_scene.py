@@ -327,6 +327,7 @@ BAD_VALUES = [
     ("motion.file", ["absent.csv"], "found neither /"),
     ("motion.law", ["cubic"], '"quintic" | "septic" | "trapezoidal" | "s-curve"'),
     ("motion.duration motion.horizon", [0, 0.0], "a number >= 0.0001 and <= 100000"),
+    ("motion.table_ends", ["still", True], '"rest" | "moving"'),
     ("motion.dwells", [0.5, [0.5, 0.7]], "true or false | an array of arrays of two numbers"),
     ("motion.dwells", [[[0.5, 0.4]], [[0.5, 0.7], [0.6, 0.8]]], "start before end, one after"),
     ("motion.dwells", [[[2.5, 3.5]]], "dwells that end by motion.horizon = 3 [s]"),
