@@ -268,14 +268,6 @@ class Along:
         moment = dim.moment(turned, apart) + dim.moment(e, by_a - by_b)
         return (turned, np.zeros_like(spin)), (-turned, moment)
 
-    def acceleration(self, a: SiteMotion, b: SiteMotion, rate: Moved, bias: Moved) -> np.ndarray:
-        """Return its second derivative (n,) in time by both frames' rates and accelerations."""
-        (v_a, _, v_b, w), (a_a, _, a_b, wd) = rate, bias
-        e, ed, edd = _turning(a.dim, b.turned(self.e), w, wd)
-        apart = a.place - b.place
-        found = edd * apart + 2.0 * ed * (v_a - v_b) + e * (a_a - a_b)
-        return found.sum(axis=0)
-
 
 @dataclass(frozen=True, eq=False)
 class Facing:
@@ -302,12 +294,6 @@ class Facing:
         moment = dim.moment(dim.velocity(spin_a, u), v) + dim.moment(u, dim.velocity(spin_b, v))
         none = np.zeros_like(by_a)
         return (none, self.length * moment), (none, -self.length * moment)
-
-    def acceleration(self, a: SiteMotion, b: SiteMotion, rate: Moved, bias: Moved) -> np.ndarray:
-        """Return its second derivative (n,) in time by both frames' rates and accelerations."""
-        u, ud, udd = _turning(a.dim, a.turned(self.u), rate[1], bias[1])
-        v, vd, vdd = _turning(a.dim, b.turned(self.v), rate[3], bias[3])
-        return self.length * (udd * v + 2.0 * ud * vd + u * vdd).sum(axis=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,14 +325,6 @@ class Distance:
         none = np.zeros_like(spin)
         return (turned, none), (-turned, none)
 
-    def acceleration(self, a: SiteMotion, b: SiteMotion, rate: Moved, bias: Moved) -> np.ndarray:
-        """Return its second derivative (n,) in time by both frames' rates and accelerations."""
-        apart, v = a.place - b.place, rate[0] - rate[2]
-        size = np.linalg.norm(apart, axis=0)
-        n = apart / size
-        across = (v * v).sum(axis=0) - np.square((n * v).sum(axis=0))
-        return across / size + (n * (bias[0] - bias[2])).sum(axis=0)
-
 
 Equation = Along | Facing | Distance
 
@@ -354,14 +332,6 @@ Equation = Along | Facing | Distance
 def _before(x: np.ndarray, like: np.ndarray) -> np.ndarray:
     """Return x (d, n) with axes for the directions of (d, ..., n)."""
     return x.reshape(len(x), *(1,) * (like.ndim - 2), x.shape[-1])
-
-
-def _turning(
-    dim: Dimension, e: np.ndarray, w: np.ndarray, wd: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a vector (d, n) of a frame with w and wd (r, n), and its two time derivatives."""
-    ed = dim.velocity(w, e)
-    return e, ed, dim.velocity(wd, e) + dim.velocity(w, ed)
 
 
 # -- closures ------------------------------------------------------------------------------------
@@ -565,15 +535,17 @@ class ClosedLoops:
         return found
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
-        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, k), m/s2."""
-        out, k = np.empty((len(rates), self.loops.count)), 0
-        for tie, (a, b) in zip(self.loops.ties, self._sites, strict=True):
-            rate = (*a.along(rates), *b.along(rates))
-            bias = (*a.acceleration(rates), *b.acceleration(rates))
+        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, k), m/s2.
+
+        The power g' of unit loads on moving frames, differentiated.
+        """
+        found = []
+        moved = [(*a.along(rates), *b.along(rates)) for a, b in self._sites]
+        bias = [(*a.acceleration(rates), *b.acceleration(rates)) for a, b in self._sites]
+        for tie, sites, v, a in zip(self.loops.ties, self._sites, moved, bias, strict=True):
             for one in tie.equations:
-                out[:, k] = one.acceleration(a, b, rate, bias)
-                k += 1
-        return out
+                found.append(_power(one.changes(*sites, v), v) + _power(one.loads(*sites), a))
+        return np.stack(found, axis=1) if found else np.zeros((len(rates), 0))
 
     def gradient(
         self, weights: np.ndarray, multipliers: np.ndarray, virtual: np.ndarray
@@ -623,6 +595,12 @@ class ClosedLoops:
             if "K0_outboard" in found[i]:
                 bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T
                 found[i]["K0_outboard"][own] -= bent @ e
+
+
+def _power(loads: Loads, rate: Moved) -> np.ndarray:
+    """Return that (n,) of loads on frames with these velocities."""
+    parts = zip((*loads[0], *loads[1]), rate, strict=True)
+    return np.sum([(f * v).sum(axis=0) for f, v in parts], axis=0)
 
 
 def _scaled(loads: Loads, factor: np.ndarray) -> Loads:
