@@ -75,6 +75,14 @@ class Constraints:
         """Return them at poses q (n, R)."""
         return Pose(self, q)
 
+    def right(self, target: Target, order: int) -> np.ndarray:
+        """Return c' or c'' (n, k), of order 1 or 2; m/s, m/s2."""
+        place = target.place[order]
+        parts = [np.zeros((len(place), self.loops.count)), place]
+        if target.turning is not None:
+            parts.append(self.reach * target.turning[order])
+        return np.hstack(parts)
+
     def error(self, q: np.ndarray, target: Target) -> np.ndarray:
         """Return how far poses are off (n, k), m."""
         return self.at(q).error(target)
@@ -110,20 +118,6 @@ class Pose:
         if self.end is not None and turned:
             parts.append(reach * self.end.by_spin.transpose(2, 0, 1))
         return np.concatenate(parts, axis=1) * (self.constraints.units / reach)
-
-    def right(self, target: Target, order: int) -> np.ndarray:
-        """Return c' or c'' (n, k), of order 1 or 2; m/s, m/s2."""
-        return np.hstack(
-            [
-                np.zeros_like(self.closed.gap),
-                target.place[order],
-                *(
-                    []
-                    if target.turning is None
-                    else [self.constraints.reach * target.turning[order]]
-                ),
-            ]
-        )
 
     def acceleration(self, qd: np.ndarray, turned: bool) -> np.ndarray:
         """Return G' qd (n, k), m/s2, at rates qd (n, R)."""

@@ -86,8 +86,8 @@ class Follower:
             fine = np.interp(np.arange(REFINED * (len(t) - 1) + 1) / REFINED, np.arange(len(t)), t)
             target = self.task.target(fine)
             q = self.task.with_given(CubicHermiteSpline(t, q, qd)(fine), target)
-            q = self.task.newton(q, target)[0]
-            t, qd = fine, self.task.velocity(q, target)
+            q, _, G = self.task.newton(q, target)
+            t, qd = fine, self.task.velocity(G, target)
         self._regularity.check((t, q, qd))
         if lost:
             raise lost[0]
@@ -109,16 +109,16 @@ class Follower:
             ahead = min(t + step, end, max(farthest, t + LEAST_STEP * end))
             target, h = task.target(np.array([ahead])), ahead - t
             guess = task.with_given((q + h * qd + 0.5 * h * h * bent)[None], target)
-            other = self._reached(guess, target, q, turn)
-            if other is None:
+            found = self._reached(guess, target, q, turn)
+            if found is None:
                 step = 0.25 * h
                 if step < LEAST_STEP * end:
                     lost.append(self._lost(q, ahead))
                     return
                 continue
-            rate = task.velocity(other[None], target)[0]
+            rate = task.velocity(found[1], target)[0]
             bent = (rate - qd) / h
-            t, q, qd = ahead, other, rate
+            t, q, qd = ahead, found[0], rate
             yield t, q, qd
             fastest = float(np.abs(qd[task.unknown] / units).max(initial=1e-9))
             step = min(2.0 * h, end / SAMPLES, 0.8 * turn / fastest)
@@ -128,7 +128,8 @@ class Follower:
         """The start as a sample."""
         q, zero = self.start.q[None], np.zeros(1)
         self._regularity.check((zero, q, np.zeros_like(q)))
-        return zero, q, self.task.velocity(q, self.task.target(zero))
+        target = self.task.target(zero)
+        return zero, q, self.task.velocity(self.task.newton(q, target)[2], target)
 
     @cached_property
     def _way(self) -> tuple[np.ndarray, np.ndarray]:
@@ -143,19 +144,18 @@ class Follower:
 
     def _reached(
         self, guess: np.ndarray, target: Target, before: np.ndarray, turn: float
-    ) -> np.ndarray | None:
-        """Return the pose (R,) of a step, or None where Newton's method went astray."""
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the pose (R,) of a step and G there, or None where Newton's method went astray."""
         task = self.task
         try:
-            q, last, _ = task.newton(guess, target, 1e-5)
+            q, last, G = task.newton(guess, target, 1e-5)
         except np.linalg.LinAlgError:
             return None
         units = task.constraints.units[task.unknown]
         moved, off = (np.abs((q[0] - x)[task.unknown] / units).max() for x in (before, guess[0]))
         # Not a number is not good.
         good = np.abs(last).max() < 1e-5 and moved <= turn and off <= 0.5 * turn
-        error = np.linalg.norm(task.constraints.error(q, target))
-        return q[0] if good and error <= self._rough else None
+        return (q[0], G) if good else None
 
     @property
     def _rough(self) -> float:

@@ -64,18 +64,27 @@ def nearest(
         out[0, free] += x * units
         return out
 
+    def padded(x: np.ndarray) -> np.ndarray:  # as many equations as unknowns, for MINPACK
+        return np.pad(x, [(0, max(len(free) - len(x), 0)), *[(0, 0)] * (x.ndim - 1)])
+
     def error(x: np.ndarray) -> np.ndarray:
-        return -constraints.error(pose(x), target)[0, rows] / constraints.reach
+        return padded(-constraints.error(pose(x), target)[0, rows] / constraints.reach)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        return constraints.at(pose(x)).rows(turned)[0, rows][:, free]
+        return padded(constraints.at(pose(x)).rows(turned)[0, rows][:, free])
 
     if len(free) == 0:
         off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
         return q, float(off)
     accuracy = np.finfo(float).eps
     found = least_squares(
-        error, np.zeros(len(free)), jacobian, xtol=accuracy, ftol=accuracy, gtol=accuracy
+        error,
+        np.zeros(len(free)),
+        jacobian,
+        method="lm",
+        xtol=accuracy,
+        ftol=accuracy,
+        gtol=accuracy,
     )
     return pose(found.x)[0], float(np.linalg.norm(found.fun)) * constraints.reach
 

@@ -96,15 +96,13 @@ class Task:
         """Return rates and accelerations (n, R) of poses on the path, exact to rounding."""
         here, turned = self.constraints.at(q), target.turning is not None
         G = here.rows(turned)
-        qd = self._solved(G, target.joints[1], here.right(target, 1))
-        right = here.right(target, 2) - here.acceleration(qd, turned)
+        qd = self.velocity(G, target)
+        right = self.constraints.right(target, 2) - here.acceleration(qd, turned)
         return qd, self._solved(G, target.joints[2], right)
 
-    def velocity(self, q: np.ndarray, target: Target) -> np.ndarray:
-        """Return the rates (n, R) alone."""
-        here = self.constraints.at(q)
-        G = here.rows(target.turning is not None)
-        return self._solved(G, target.joints[1], here.right(target, 1))
+    def velocity(self, G: np.ndarray, target: Target) -> np.ndarray:
+        """Return the rates (n, R) by G (n, k, R)."""
+        return self._solved(G, target.joints[1], self.constraints.right(target, 1))
 
     def _solved(self, G: np.ndarray, known: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return x (n, R) with G x = right (n, k), in m, and its given entries (n, g)."""
