@@ -537,9 +537,10 @@ def forced_rest(scene: Scene) -> str | None:
         return None
     t = np.linspace(0.0, table.t[-1], max(DENSE_INSTANTS, 4 * len(table.t)))
     forced, own = (np.abs(curve_in_time(table, k)(t)[2]).max(axis=0) for k in (False, True))
-    worst = int(np.argmax(forced / np.maximum(own, 1e-12)))
-    if forced[worst] <= REST_ACCELERATION_RATIO * own[worst]:
+    beyond = forced > REST_ACCELERATION_RATIO * own
+    if not beyond.any():
         return None
+    worst = int(np.argmax(forced * beyond))
     return (
         f"motion: {motion.file} moves in its first or last row; the rest that is put there needs "
         f"an acceleration of {forced[worst]:.3g} where its rows have {own[worst]:.3g}: let it rest "

@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
+from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid_motion
 from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.motion.plane import Bend
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -374,3 +374,42 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
     arms = (of.arms[0].model_copy(update={"name": name}), of.arms[1])
     with refused(f"'{name}'", "another name"):
         check_motion(of.model_copy(update={"arms": arms}))
+
+
+def sampled(folder: Path, count: int = 200, **keys: Any) -> Scene:
+    """Return joints that swing as 0.6 sin(2 t), a recording from the midst of the motion."""
+    t = np.linspace(0.0, 0.5, count)
+    rows = np.column_stack([t, 0.3 * t, 0.6 * np.sin(2.0 * t), 0.5 * np.cos(2.0 * t)])
+    file = folder / "cut.csv"
+    text = ["t,cart,arm0,arm1", *(",".join(map(repr, row)) for row in rows.tolist())]
+    file.write_text("\n".join(text))
+    tables = {"motion": {"path": "joints", "file": str(file), **keys}}
+    return scene_from_dict(scene(tables=tables).to_tree() | tables, "test.toml")
+
+
+@pytest.mark.parametrize("count", [4, 6, 200])
+def test_a_table_may_move_at_its_ends(tmp_path: Path, count: int) -> None:
+    """At its own rates there, and no rest is forced upon it; its horizon is its own."""
+    of = sampled(tmp_path, count, table_ends="moving")
+    assert of.motion.horizon == of.motion.duration == 0.5
+    t = np.linspace(0.0, 0.5, 41)
+    motion = rigid_motion(t, of)
+    close = 1e-7 if count == 200 else 0.2 / count
+    assert_close(motion.qd[:, 1], 1.2 * np.cos(2.0 * t), close)
+    assert_close(motion.q[:, 1], 0.6 * np.sin(2.0 * t), close)
+    assert forced_rest(of) is None
+
+
+def test_a_forced_rest_is_told(tmp_path: Path) -> None:
+    """With the acceleration that it needs, that of the rows, and the key that takes their rates."""
+    of = sampled(tmp_path)
+    motion = rigid_motion(np.linspace(0.0, 0.5, 4001), of)
+    told = forced_rest(of)
+    assert told is not None and 'motion.table_ends = "moving"' in told
+    largest = float(re.search(r"acceleration of (\S+)", told)[1])
+    assert largest == pytest.approx(np.abs(motion.qdd).max(), rel=0.02) and largest > 100.0
+    assert float(re.search(r"rows have (\S+):", told)[1]) == pytest.approx(2.0, rel=0.1)
+    calm = of_kind(tmp_path, 2, "joints in time", "quintic", "cart")
+    assert forced_rest(calm) is None
+    with refused("motion.horizon = 1", "motion.duration = 0.5", "table_ends"):
+        sampled(tmp_path, table_ends="moving", horizon=1.0)

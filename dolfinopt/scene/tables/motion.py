@@ -189,13 +189,6 @@ class Motion(Table):
                 ("acceleration_share",),
                 (last,),
             )
-        if self.table_ends == "moving" and self.horizon > self.duration:
-            raise Refusal(
-                f"expected motion.duration = {self.duration:g} [s], the end of the table, with "
-                'motion.table_ends = "moving": nothing says how the machine moves on',
-                ("horizon",),
-                ("table_ends",),
-            )
         if self.horizon < self.duration:
             raise Refusal(
                 f"expected at least motion.duration = {self.duration:g} [s], the end of the path",
@@ -230,6 +223,13 @@ class Motion(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
+        if self.table_ends == "moving" and self.horizon > self.duration:
+            raise Refusal(
+                f"expected motion.duration = {self.duration:g} [s], the end of the table, with "
+                'motion.table_ends = "moving": nothing says how the machine moves on',
+                ("motion", "horizon"),
+                ("motion", "table_ends"),
+            )
         if scene.is_spatial:
             return  # `tables.joints` knows
         for key in ("gravity", "start", "end"):
