@@ -288,10 +288,14 @@ def in_plane(kind: str, **keys: Any) -> dict:
 
 
 def test_the_plane_has_closures_that_are_its_closure():
-    found = scene_from_dict(in_plane("slider", axis=[2.0, 0.0, 0.0]))
-    assert found == loop("slider", closure={"direction": [2.0, 0.0]}) and not found.closures
-    found = scene_from_dict(in_plane("pin", point=[0.25, 0.0, 0.0], side=-1))
-    assert found == loop("pin")
+    named = {"name": "end"}
+    for key, value in (("axis", [2.0, 0.0, 0.0]), ("axis", [2.0, 0.0]), ("direction", [2.0, 0.0])):
+        found = scene_from_dict(in_plane("slider", **{key: value}))
+        assert found == loop("slider", closure=named | {"direction": [2.0, 0.0]})
+        assert not found.closures
+    for point in ([0.25, 0.0, 0.0], [0.25, 0.0]):
+        found = scene_from_dict(in_plane("pin", point=point, side=-1))
+        assert found == loop("pin", closure=named)
     up = {"axis": [0, 0, 1]}
     for keys in ({"point": [0.2, 0.0, 0.1]}, {"axis": [1, 0, 0]}, {"between": ["crank", "ground"]}):
         with refused("closures.0.kind", "the last arm and the ground", "[[joints]]"):

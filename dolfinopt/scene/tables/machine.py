@@ -325,6 +325,9 @@ DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the l
 class Closure(Table):
     """What holds the outboard interface of the last arm, whose rotation stays free."""
 
+    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
+        default="closure", description="name in the columns of trajectory.csv [-]"
+    )
     kind: ClosureKind = Field(
         description="the interface slides on a line, or turns about a fixed point [-]"
     )
