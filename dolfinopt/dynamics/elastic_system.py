@@ -111,6 +111,8 @@ class ElasticSystem:
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration of the undeformed mechanism at t = 0, rad/s."""
         size = self.num_coordinates
+        if size == 0:
+            return 0.0
         rest = np.zeros((1, size))
         blocks = self.at(np.zeros(1)).linearise(rest, rest, rest).dense()[0]
         stiffness, mass = self.mechanism.stiffness(), blocks[:, 2 * size :]
