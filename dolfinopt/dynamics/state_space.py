@@ -378,11 +378,11 @@ class Poles:
         change = np.concatenate(moved, axis=2).transpose(0, 2, 1)  # (3, n, S)
         rates = [x + dx for x, dx in zip(self.one.rates, change, strict=True)]
         every = np.concatenate(rows, axis=1).T.copy()
-        t = np.repeat(self.one.t, len(every))
-        tangent = system.at(t).linearise(*rates)
+        instants = system.at(np.repeat(self.one.t, len(every)))
+        tangent = instants.linearise(*rates)
         by_rates = np.stack([x.sum(axis=0) for x in tangent.transposed(every)])
         return by_rates.reshape(3, 1, S), system.body_gradient(
-            t, rates[0], rates[1], rates[2], every
+            instants, rates[0], rates[1], rates[2], every
         )
 
     def _size(self, displaced: np.ndarray) -> np.ndarray:
