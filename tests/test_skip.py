@@ -234,7 +234,7 @@ def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
 def test_model_imports_nothing_of_studies_pictures_and_space() -> None:
     """And the package nothing at all."""
     assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
-    others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.multibody.inverse_kinematics"}
+    others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.motion.follower"}
     assert loaded(others | {"dolfinx"}, "from dolfinopt import Model") == {"dolfinx"}
 
 

@@ -32,7 +32,7 @@ from dolfinopt.multibody.machine import (
     skew,
 )
 from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.reduction.basis import FreeArm, FreeOperators
 from dolfinopt.reduction.eigenproblem import largest_eigenpairs, lowest_eigenpairs

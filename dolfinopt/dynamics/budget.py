@@ -10,10 +10,11 @@ import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.multibody.kinematics import end_effector_gradient
+from dolfinopt.multibody.ranks import least_norm
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.multibody.motion import RigidMotion
+    from dolfinopt.multibody.rigid_motion import RigidMotion
 
 # Kinds of parts, and the words for all of a kind.
 KINDS = {
@@ -80,8 +81,8 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     """
     worst = int(np.argmax(trajectory.distance))
     size = float(trajectory.distance[worst])
-    closure = trajectory.closure
-    if size == 0.0 or (closure is not None and closure.count > 1):  # a pin holds the end
+    closure = trajectory.scene.closure
+    if size == 0.0 or (closure is not None and closure.kind == "pin"):  # it holds the end
         return None
     at = slice(worst, worst + 1)
     desired = trajectory.desired[at]
@@ -103,12 +104,13 @@ def _derivatives(
     mechanism, none = trajectory.mechanism, np.zeros((1, trajectory.mechanism.num_coordinates))
     by_q, by_rigid, _ = end_effector_gradient(mechanism, desired, none, direction)
     problem = trajectory.problem
-    if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
+    if not isinstance(problem, MachineSystem) or problem.loops is None:
         return by_q[0], by_rigid[0]
-    G = problem.rigid_loops.at(mechanism, desired.q, none).jacobian[0]
-    dependent = problem.drives.free[~problem.drives.driven]
+    G = problem.loops.at(mechanism, desired.q, none).jacobian
+    dependent = problem.drives.dependent
     every = np.concatenate([by_rigid[0], by_q[0]])
-    every -= np.linalg.solve(G[:, dependent].T, every[dependent]) @ G
+    weights = least_norm(G[:, :, dependent].swapaxes(1, 2), every[None, dependent])
+    every -= (weights @ G[0])[0]
     return every[by_rigid.shape[1] :], every[: by_rigid.shape[1]]
 
 

@@ -4,7 +4,15 @@ Unknowns are y = (e, q, mu, s): the deviation e of the free rigid coordinates fr
 motion, the elastic coordinates q, for every constraint a coordinate whose second derivative is its
 multiplier, and the deviation s of motors that drive their arms through springs. Equations are those
 of the free rigid coordinates, forces of inverse dynamics less drives less what the closure does; of
-the elastic coordinates; the constraints themselves at every stage; and of the motors. With
+the elastic coordinates; the constraints themselves at every stage; and of the motors.
+
+Closures may hold rigid arms by more equations than joints that follow. P projects on combinations
+of equations that none of these joints moves, at the desired pose of every instant; constraints are
+
+    scale (g - g_0) + rho P mu'' = 0
+
+with the gap g_0 that rigid arms leave. What no arm resists then carries no force, as joints that
+give way by rho of the softest arm would have it; what arms resist is determined by them. With
 constraints this is Radau IIA of index 3, of which positions have order 2 s - 1, velocities s and
 multipliers s - 1. Source: Hairer, Lubich & Roche (1989), doi:10.1007/BFb0093947.
 """
@@ -19,14 +27,20 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
-from dolfinopt.dynamics.measured import EQUILIBRIUM_ITERATIONS, MACHINE_EQUILIBRIUM_ROUNDING_ERROR
+from dolfinopt.dynamics.measured import (
+    CLOSURE_COMPLIANCE_SHARE,
+    EQUILIBRIUM_ITERATIONS,
+    MACHINE_EQUILIBRIUM_ROUNDING_ERROR,
+)
 from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.mechanism import Drives, Mechanism
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.ranks import complement, least_norm
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import linearise
 
@@ -81,12 +95,15 @@ class MachineInstants:
         desired: motion (n) of the rigid coordinates.
         ahead: (n, R) feed-forward forces.
         winding: (n, R) how far drives are asked to be ahead of their joints, rad; or None.
+        redundant: P (n, k, k) and g_0 (n, k), m, of closures that hold rigid arms more often than
+            needed; or None.
     """
 
     machine: MachineSystem
     desired: RigidMotion
     ahead: np.ndarray
     winding: np.ndarray | None = None
+    redundant: tuple[np.ndarray, np.ndarray] | None = None
 
     def __len__(self) -> int:
         """Return n."""
@@ -95,7 +112,11 @@ class MachineInstants:
     def __getitem__(self, part: slice | np.ndarray) -> MachineInstants:
         """Return it at some of the instants."""
         winding = None if self.winding is None else self.winding[part]
-        return MachineInstants(self.machine, self.desired[part], self.ahead[part], winding)
+        redundant = self.redundant
+        if redundant is not None:
+            redundant = redundant[0][part], redundant[1][part]
+        desired, ahead = self.desired[part], self.ahead[part]
+        return MachineInstants(self.machine, desired, ahead, winding, redundant)
 
     def split(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (n, R), (n, N), (n, m) of coordinates or their derivatives (n, S)."""
@@ -198,8 +219,16 @@ class MachineInstants:
             return out
         here = machine.loops.at(machine.mechanism, motion.q, q)
         out[:, : machine.ends[1]] -= here.work(multipliers)[:, machine.columns]
-        out[:, slice(*machine.ends[1:])] = machine.gap_scale * here.gap
+        out[:, slice(*machine.ends[1:])] = self._constraints(here.gap, multipliers)
         return out
+
+    def _constraints(self, gap: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Return the constraints' rows (n, k), N."""
+        if self.redundant is None:
+            return self.machine.gap_scale * gap
+        P, left = self.redundant
+        given = CLOSURE_COMPLIANCE_SHARE * np.einsum("nij,nj->ni", P, multipliers)
+        return self.machine.gap_scale * (gap - left) + given
 
     def linearise(
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
@@ -233,6 +262,9 @@ class MachineInstants:
             matrix[:, :moving, 0, :moving] -= H
             matrix[:, :moving, 2, moving:last] -= J.swapaxes(1, 2)
             matrix[:, moving:last, 0, :moving] += machine.gap_scale * J
+            if self.redundant is not None:
+                given = CLOSURE_COMPLIANCE_SHARE * self.redundant[0]
+                matrix[:, moving:last, 2, moving:last] += given
         return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
 
 
@@ -245,8 +277,7 @@ class MachineSystem:
         motion: desired rigid coordinates at given instants (n,) s.
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
-        loops: closures, of whose equations m are independent for flexible arms; or None.
-        rigid_loops: the same with those that are for rigid arms: as many as joints that follow.
+        loops: closures, m equations; or None.
     """
 
     mechanism: Any
@@ -254,7 +285,6 @@ class MachineSystem:
     breakpoints: tuple[float, ...]
     drives: Drives
     loops: Loops | None = None
-    rigid_loops: Loops | None = None
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
@@ -290,11 +320,6 @@ class MachineSystem:
     def elastic_columns(self) -> slice:
         """Where the elastic coordinates stand among the unknowns."""
         return slice(*self.ends[:2])
-
-    @property
-    def runs(self) -> int:
-        """One."""
-        return 1
 
     @cached_property
     def elastic(self) -> ElasticSystem:
@@ -332,11 +357,21 @@ class MachineSystem:
 
     def at(self, t: np.ndarray) -> MachineInstants:
         """Return the machine at instants t (n,), s."""
-        desired = self.motion(t)
-        ahead = np.zeros((len(t), self.ends[0]))
+        table = self.drives.table
+        return self._along(self.motion(t), None if table is None else table(t))
+
+    def at_stages(self, time_grid: np.ndarray, nodes: np.ndarray) -> MachineInstants:
+        """Return it at the stages of the steps of a grid, see `System.at_stages`."""
+        table = self.drives.table
+        pushes = None if table is None else table.at_stages(time_grid, nodes)
+        return self._along(motion_at_stages(self.motion, time_grid, nodes), pushes)
+
+    def _along(self, desired: RigidMotion, pushes: np.ndarray | None) -> MachineInstants:
+        """Return the machine on a desired motion, with a table's forces (n, R) of its drives."""
+        ahead = np.zeros((len(desired.q), self.ends[0]))
         winding = None
         if self.drives.rigid_feed_forward:
-            forces, motors = feed_forward(self.rigid, desired, self.drives, self.rigid_loops)
+            forces, motors = feed_forward(self.rigid, desired, self.drives, self.loops)
             ahead += forces
             springs = self.drives.springs
             if self.drives.winding:
@@ -346,13 +381,43 @@ class MachineSystem:
             if springs.friction.acts:
                 speeds = desired.qd[:, self.drives.free[springs.joints]]
                 ahead[:, springs.joints] += springs.friction.force(speeds)
-        if self.drives.table is not None:
-            ahead += self.drives.table(t)
-        return MachineInstants(self, desired, ahead, winding)
+        if pushes is not None:
+            ahead += pushes
+        return MachineInstants(self, desired, ahead, winding, self._redundant(desired))
+
+    @property
+    def num_redundant(self) -> int:
+        """Number of equations that follow from the others for rigid arms."""
+        _, moving, last = self.ends
+        return last - moving - len(self.drives.dependent)
+
+    def _redundant(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return P (n, k, k) and g_0 = P g (n, k), m, of rigid arms on a desired motion."""
+        if self.loops is None or self.num_redundant == 0:
+            return None
+        dependent, none = self.drives.dependent, np.zeros((len(desired.q), 0))
+        here = self.loops.at(self.rigid, desired.q, none)
+        P = complement(here.jacobian[:, :, dependent] / self.mechanism.levers[dependent])
+        return P, np.einsum("nij,nj->ni", P, here.gap)
+
+    def left_stress(self) -> float:
+        """Return the largest force that closing what rigid arms leave open would add at t = 0, N.
+
+        (N' G_e K^-1 G_e' N)^-1 N' g_0, N spanning P: it is told, not summed in.
+        """
+        found = self._redundant(self.motion(np.zeros(1)))
+        if self.loops is None or found is None:
+            return 0.0
+        P, left = (x[0] for x in found)
+        q_r, q = self.motion(np.zeros(1)).q, np.zeros((1, self.mechanism.num_coordinates))
+        elastic = self.loops.at(self.mechanism, q_r, q).jacobian[0][:, self.mechanism.num_rigid :]
+        softness = P @ elastic @ np.linalg.solve(self.mechanism.stiffness(), elastic.T @ P)
+        forces = np.linalg.pinv(softness, rcond=1e-9, hermitian=True) @ left
+        return float(np.abs(forces).max(initial=0.0))
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.rigid, desired, self.drives, self.rigid_loops)[0]
+        return feed_forward(self.rigid, desired, self.drives, self.loops)[0]
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -384,21 +449,34 @@ class MachineSystem:
     def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
         instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
-        rest, ydd, step = (np.zeros_like(y) for _ in range(3))
-        step, some = step[0], self._at_start
+        rest, ydd, some = np.zeros_like(y), np.zeros_like(y), self._at_start
+        load = None
         for _ in range(EQUILIBRIUM_ITERATIONS):
             residual = instants.residual(y, rest, ydd)[0, some]
             if not residual.any():
                 return y, ydd[0, ground]
-            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])
+            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])[np.ix_(some, some)]
+            size, x = np.abs(matrix).max(axis=1), np.abs(y + ydd)[0, some]
+            if not size.all():
+                break
+            # Rows of like size; the backward error judges what rounding leaves of each.
+            matrix, residual = matrix / size[:, None], residual / size
+            load = np.abs(residual) if load is None else load
+            rounding = (np.abs(matrix) @ x + load).max()
             try:
-                step[some] = np.linalg.solve(matrix[np.ix_(some, some)], -residual)
+                step = np.linalg.solve(matrix, -residual)
             except np.linalg.LinAlgError:
                 break
-            ydd[0, ground] += step[ground]
-            step[ground] = 0.0
-            y = y + step
-            if np.abs(step).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(1.0, np.abs(y).max()):
+            if np.abs(residual).max() <= 10.0 * MACHINE_EQUILIBRIUM_ROUNDING_ERROR * rounding:
+                return y, ydd[0, ground]
+            change = np.zeros(y.shape[1])
+            change[some] = step
+            ydd[0, ground] += change[ground]
+            change[ground] = 0.0
+            y = y + change
+            if np.abs(change).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(
+                1.0, np.abs(y).max()
+            ):
                 return y, ydd[0, ground]
         limited = bool(self.drives.limited.any())
         raise ConvergenceError(
@@ -414,7 +492,7 @@ class MachineSystem:
 
     def body_gradient(
         self,
-        t: np.ndarray,
+        instants: MachineInstants,
         y: np.ndarray,
         yd: np.ndarray,
         ydd: np.ndarray,
@@ -423,14 +501,14 @@ class MachineSystem:
         """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals.
 
         Args:
-            t: (n,) instants, s.
+            instants: n of them.
             y, yd, ydd, multipliers: (n, S).
         """
-        instants, moving = self.at(t), self.ends[1]
+        moving = self.ends[1]
         motion = instants.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
-        of_forces = np.zeros((len(t), motion.q.shape[1] + len(self.mechanism.motor_joints)))
+        of_forces = np.zeros((len(y), motion.q.shape[1] + len(self.mechanism.motor_joints)))
         of_forces[:, self.drives.free] = of_rigid
         of_forces[:, self.motor_coordinates] = instants.motors(multipliers)
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
@@ -439,7 +517,7 @@ class MachineSystem:
         if self.loops is None:
             return total
         # -J' f . multipliers, by which the frames move in their direction, and the gaps' part.
-        moved = np.zeros((len(t), motion.q.shape[1] + q.shape[1]))
+        moved = np.zeros((len(y), motion.q.shape[1] + q.shape[1]))
         moved[:, self.columns] = multipliers[:, :moving]
         here = self.loops.at(self.mechanism, motion.q, q)
         parts = here.gradient(self.gap_scale * of_gap, ground, -moved)
@@ -464,9 +542,7 @@ class MachineSystem:
             weights = weights.copy()
             weights[:, springs.joints] *= 1.0 + turned
         desired = instants.desired
-        of_forces = feed_forward_weights(
-            self.rigid, desired, self.drives, self.rigid_loops, weights
-        )
+        of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.loops, weights)
         of_forces = np.hstack([of_forces, motors])
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
@@ -483,7 +559,7 @@ class MachineSystem:
         multipliers, some = np.zeros_like(right), self._at_start
         matrix = self._at_rest(tangent)[np.ix_(some, some)]
         multipliers[some] = np.linalg.solve(matrix.T, -right[some])
-        return self.body_gradient(np.zeros(1), y[None], rest, ydd, multipliers[None])
+        return self.body_gradient(self.at(np.zeros(1)), y[None], rest, ydd, multipliers[None])
 
     def _at_rest(self, tangent: np.ndarray) -> np.ndarray:
         """Return the derivative (S, S) by coordinates and multipliers of a tangent (S, 3 S)."""
@@ -508,17 +584,9 @@ class MachineSystem:
         rigid = np.sqrt(squares).max(axis=-1)
         return np.concatenate([rigid[..., None], arms], axis=-1)
 
-    def prescribed(self, t: np.ndarray) -> None:
-        """Return nothing: drives give way, and joints that follow have vibrations of their own."""
-
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration with rigid coordinates held, rad/s."""
         return self.elastic.slowest_frequency()
-
-    def describe(self, y: np.ndarray) -> str:
-        """Say how far the arms' ends turn in a motion y (n, S)."""
-        R, moving, _ = self.ends
-        return self.elastic.describe(y[:, R:moving])
 
     def deflection(self, y: np.ndarray) -> float:
         """Return the largest deflection of an arm in a motion y (n, S), over its length."""
@@ -535,11 +603,11 @@ class MachineSystem:
         arms = self.elastic.preconditioner()
         changed = replace(self, mechanism=arms.system.mechanism)
         (R, moving, _), size = self.ends, self.num_coordinates
-        frequencies = np.zeros((1, size))
-        frequencies[:, R:moving] = arms.frequencies
-        k, d, m = np.ones((1, size)), np.zeros((1, size)), np.ones((1, size))
+        frequencies = np.zeros(size)
+        frequencies[R:moving] = arms.frequencies
+        k, d, m = np.ones(size), np.zeros(size), np.ones(size)
         for each, value in zip((k, d, m), arms.uncoupled, strict=True):
-            each[:, R:moving] = value
+            each[R:moving] = value
         return MachineModes(changed, arms, slice(R, moving), frequencies, (k, d, m))
 
 
@@ -556,7 +624,6 @@ class MachineModes:
     columns: slice
     frequencies: np.ndarray
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
-    definite = False
     guided = True
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
@@ -575,10 +642,6 @@ class MachineModes:
         """Return dJ/dq (..., S)."""
         return self._with(by_z, self.arms.gradient_from_modes)
 
-    def chosen(self, runs: np.ndarray) -> MachineModes:
-        """Return itself: there is one run."""
-        return self
-
     def _with(self, x: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         out = x.copy()
         out[..., self.columns] = change(x[..., self.columns])
@@ -596,7 +659,7 @@ def feed_forward(
     And those of motors behind springs (n, M) that move their rotors.
 
     In a closed loop the joints that follow from others have no drive: what they would need, the
-    closures give.
+    closures give, by multipliers of least norm.
     """
     none = np.zeros((len(desired.q), 0))
     every = inverse_dynamics(rigid, desired, none, none, none)[1]
@@ -622,7 +685,6 @@ def feed_forward_weights(
     out[:, drives.free] = weights * drives.driven
     if loops is not None:
         J = loops.at(rigid, desired.q, np.zeros((len(desired.q), 0))).jacobian
-        dependent = drives.dependent
-        pulled = np.linalg.solve(J[:, :, dependent], (J @ out[:, :, None]))[:, :, 0]
-        out[:, dependent] -= pulled
+        dependent, moved = drives.dependent, np.einsum("nkr,nr->nk", J, out)
+        out[:, dependent] -= least_norm(J[:, :, dependent], moved)
     return out

@@ -9,24 +9,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.dynamics import batch, generalized_alpha, radau
+from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.build import build_system, closure_of, desired_motion, rests_of
-from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
+from dolfinopt.dynamics.build import build_system, desired_motion
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
+from dolfinopt.dynamics.march import BEYOND, REMEDY
 from dolfinopt.dynamics.measured import (
-    BATCH_NEWTON_SHARE,
     DEFLECTION_LIMIT,
     DRIVES_CHUNK,
     JOINT_LIMIT_ROUNDING,
     KEPT_MATRICES_BYTES,
 )
-from dolfinopt.dynamics.newton import ONE_RUN
-from dolfinopt.dynamics.radau import BEYOND, REMEDY
+from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.dynamics.system import Linearisation
+from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.closures import Loops
+from dolfinopt.motion.build import rests
+from dolfinopt.multibody.closures import Loops, Tie
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
@@ -37,8 +38,9 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.mechanism import Closure, Mechanism
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     SPACE,
     Rates,
@@ -219,9 +221,9 @@ class Trajectory:
         return self.problem.loops if isinstance(self.problem, MachineSystem) else None
 
     @property
-    def closure(self) -> Closure | None:
+    def closure(self) -> Tie | None:
         """What holds the last interface of a closed loop in the plane, or None."""
-        return closure_of(self.scene)
+        return self.loops.ties[0] if self.scene.closure and self.loops else None
 
     @cached_property
     def closure_force(self) -> np.ndarray | None:
@@ -234,7 +236,7 @@ class Trajectory:
         if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
         multipliers = self.unknowns[2][:, slice(*self.problem.ends[1:])]
-        return multipliers if self.closure else self.loops.reactions(multipliers)
+        return self.loops.reactions(multipliers)
 
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
@@ -261,11 +263,11 @@ class Trajectory:
     @cached_property
     def slider_position(self) -> np.ndarray | None:
         """Place of a slider on its line, from the closure's point along its direction (n,), m."""
-        if self.closure is None or self.closure.count != 1:
+        closure = self.scene.closure
+        if closure is None or closure.kind != "slider":
             return None
-        x, y = self.end.T
-        along = self.closure.normals[0] / 1j
-        return (np.conj(along) * (x + 1j * y - self.closure.point)).real
+        along = np.array(closure.direction) / np.linalg.norm(closure.direction)
+        return (self.end - np.array(closure.point)) @ along
 
     @property
     def motor_columns(self) -> tuple[int, ...]:
@@ -326,8 +328,8 @@ class Trajectory:
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
 
-        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' g_d'^-1 by_d; of
-        flexible arms that closures hold by more equations than that, the further forces are held.
+        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' x, g_d' x = by_d;
+        of arms that closures hold by more equations than that, x is of least norm.
 
         Args:
             indices: (n,) of the instants.
@@ -335,14 +337,14 @@ class Trajectory:
         """
         problem = self.problem
         by_q = by[:, problem.elastic_columns]
-        if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
+        if not isinstance(problem, MachineSystem) or problem.loops is None:
             return by_q
         q_r, q = self.motion.q[indices], self.q_e[indices]
-        here = problem.rigid_loops.at(self.mechanism, q_r, q)
+        here = problem.loops.at(self.mechanism, q_r, q)
         J = here.jacobian[:, :, problem.columns]
         dependent = np.flatnonzero(~problem.drives.driven)
-        by_g = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), by[:, dependent, None])
-        return by_q - np.einsum("nm,nmk->nk", by_g[..., 0], J[:, :, problem.elastic_columns])
+        by_g = least_norm(J[:, :, dependent].swapaxes(1, 2), by[:, dependent])
+        return by_q - np.einsum("nm,nmk->nk", by_g, J[:, :, problem.elastic_columns])
 
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
@@ -388,7 +390,7 @@ class Trajectory:
         """Which instants are in a rest (n,); the last one is in any case."""
         rounding = 1e-9 * self.scene.motion.horizon
         found = np.zeros(len(self.t), dtype=bool)
-        for begin, end in rests_of(self.scene):
+        for begin, end in rests(self.scene):
             found |= (self.t >= begin - rounding) & (self.t <= end + rounding)
         found[-1] = True
         return found
@@ -429,85 +431,51 @@ def simulate(
     Raises:
         ConvergenceError: the integrator gave up; the message says what to try.
     """
-    (found,) = simulate_batch([scene], [bodies], profile, [start])
+    (found,) = simulate_all([scene], [bodies], profile, [start])
     if isinstance(found, ConvergenceError):
         raise found
     return found
 
 
-def simulate_batch(
+def simulate_all(
     scenes: Sequence[Scene],
     bodies: Sequence[list[ShapeIntegrals]],
     profile: Profile,
     starts: Sequence[Solution | None] = (),
-    *,
-    differentiated: bool = False,
 ) -> list[Trajectory | ConvergenceError]:
-    """Integrate the same design in many scenes at once, each to its `simulation.tolerance`.
-
-    Scenes may differ in payload, motion, gravity, damping and, by the factors of `body.scaled`, in
-    material; whatever else differs is simulated by itself. The common steps are those of the scene
-    that needs most, so that a trajectory depends on the other scenes within the tolerance, not on
-    their order.
+    """Integrate several scenes, each to its `simulation.tolerance`; those of one motion share it.
 
     Args:
         scenes: any number of them.
         bodies: of each, from the cart outwards.
         profile: counts the simulations.
         starts: solution of a nearby design for each, or None.
-        differentiated: whether gradients are asked of the trajectories: Newton's method then leaves
-            1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
         In the scenes' order; of one that fails, or bends by more than `DEFLECTION_LIMIT` of an
         arm's length, its error, see `simulate`.
     """
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
-    problems = _problems(scenes, bodies)
-    found: list[Trajectory | ConvergenceError | None] = [None] * len(scenes)
-    groups: dict[tuple[str, float, int, float], list[int]] = {}
-    for i, scene in enumerate(scenes):
-        options = scene.simulation
-        key = (options.integrator, options.tolerance, options.stages, options.rho_inf)
-        groups.setdefault(key, []).append(i)
-    for (integrator, tolerance, stages, rho_inf), group in groups.items():
-        own, begun = [problems[i] for i in group], [starts[i] for i in group]
-        with profile.phase("simulation"):
-            if integrator == "radau":
-                goal = ONE_RUN.goal if differentiated else BATCH_NEWTON_SHARE
-                solutions = _by_radau(own, tolerance, stages, profile, begun, goal)
-            else:
-                solve, rest = generalized_alpha.integrate, (tolerance, rho_inf, profile)
-                solutions = [batch.attempted(solve, one, *rest) for one in own]
-        for i, one in zip(group, solutions, strict=True):
-            if isinstance(one, ConvergenceError):
-                found[i] = one
-                continue
-            trajectory = _trajectory(problems[i], scenes[i], one)
-            found[i] = _refused(trajectory) or trajectory
-            profile.counts.simulations += 1
-    return [one for one in found if one is not None]
+    results: list[Trajectory | ConvergenceError] = []
+    for problem, scene, start in zip(_problems(scenes, bodies), scenes, starts, strict=True):
+        try:
+            results.append(_simulated(problem, scene, profile, start))
+        except ConvergenceError as error:
+            results.append(error)
+    return results
 
 
-def _by_radau(
-    problems: Sequence[Problem],
-    tolerance: float,
-    stages: int,
-    profile: Profile,
-    starts: Sequence[Solution | None],
-    goal: float,
-) -> list[Solution | ConvergenceError]:
-    """Return the solutions in their order: chains on prescribed motions together, others alone."""
-    alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if one.mechanism.dim.d == 2}
-    together, begun = list(own), [starts[i] for i in own]
-    solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
-    found = dict(zip(together, solved, strict=True))
-    for i, one in enumerate(problems):
-        if i not in found:
-            options = (tolerance, stages, profile, starts[i])
-            found[i] = batch.attempted(radau.integrate, one, *options)
-    return [found[i] for i in range(len(problems))]
+def _simulated(
+    problem: Problem, scene: Scene, profile: Profile, start: Solution | None
+) -> Trajectory:
+    """Return the motion of a problem, or raise why there is none."""
+    options = scene.simulation
+    with profile.phase("simulation"):
+        solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
+    profile.counts.simulations += 1
+    trajectory = _trajectory(problem, scene, solution)
+    _check_deflections(trajectory)
+    return trajectory
 
 
 def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -> list[Problem]:
@@ -529,16 +497,16 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
     return problems
 
 
-def _refused(trajectory: Trajectory) -> ConvergenceError | None:
-    """Return why a motion is none of flexible arms any more, or None."""
+def _check_deflections(trajectory: Trajectory) -> None:
+    """Raise `GivenUp` where a motion is none of flexible arms any more."""
     arms, deflections = trajectory.scene.arms, trajectory.deflections
     worst = int(np.argmax(deflections)) if len(deflections) else 0
     if not len(deflections) or deflections[worst] <= DEFLECTION_LIMIT:
-        return None
+        return
     name = f"arm {arms[worst].name!r}" if worst < len(arms) else "a link"
-    return GivenUp(
+    raise GivenUp(
         f"{name} deflects by {100.0 * deflections[worst]:.3g} % of its length: {BEYOND}; "
-        f"{REMEDY.replace('them', 'the arm', 1)}"
+        f"{REMEDY.replace('the arms', 'the arm', 1)}"
     )
 
 
@@ -784,10 +752,11 @@ def load_gradient(
     multipliers = np.zeros((len(t), probe.system.num_coordinates))
     for part, by in zip(probe.places, by_coefficients, strict=True):
         multipliers[:, part] = -by
-    tangent = probe.system.at(t).linearise(*at)
+    instants = probe.system.at(t)
+    tangent = instants.linearise(*at)
     by_rates = np.stack(tangent.transposed(multipliers))[:, :, probe.own]
     y, yd, ydd = at
-    wide = probe.system.body_gradient(t, y, yd, ydd, multipliers)
+    wide = probe.system.body_gradient(instants, y, yd, ydd, multipliers)
     parts = [
         by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)

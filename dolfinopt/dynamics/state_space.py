@@ -24,7 +24,8 @@ from dolfinopt.dynamics.measured import LOOP_STEP_SHARE, POLE_STENCIL, POLE_STEP
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import end_effector_gradient
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.ranks import rank
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.machine import Control
@@ -268,8 +269,9 @@ def null_space(one: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if system.loops is None:
         return np.eye(size), np.zeros((size, size)), np.zeros((size, size))
     every = np.concatenate([np.arange(moving), np.arange(last, size)])
-    G, Gd, Gdd = np.zeros((3, last - moving, size))
-    G[:, :moving], Gd[:, :moving], Gdd[:, :moving] = _constraint_rates(one)
+    rates = _independent(*_constraint_rates(one))
+    G, Gd, Gdd = np.zeros((3, len(rates[0]), size))
+    G[:, :moving], Gd[:, :moving], Gdd[:, :moving] = rates
     dependent = _dependent(system, G)
     independent = np.setdiff1d(every, dependent)
     own = G[:, dependent]
@@ -280,6 +282,13 @@ def null_space(one: Linearised) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     left = Gdd[:, independent] + 2.0 * Gd[:, dependent] @ Sd + Gdd[:, dependent] @ S
     N[dependent], Nd[dependent], Ndd[dependent] = S, Sd, -np.linalg.solve(own, left)
     return N, Nd, Ndd
+
+
+def _independent(G: np.ndarray, Gd: np.ndarray, Gdd: np.ndarray) -> list[np.ndarray]:
+    """Return as many combinations of the constraints as are independent, and their rates."""
+    scaled = G / np.abs(G).max(axis=0, initial=1e-300)
+    rows = np.linalg.svd(scaled)[0][:, : rank(scaled)].T
+    return [rows @ x for x in (G, Gd, Gdd)]
 
 
 def _dependent(system: MachineSystem, G: np.ndarray) -> np.ndarray:
@@ -369,11 +378,11 @@ class Poles:
         change = np.concatenate(moved, axis=2).transpose(0, 2, 1)  # (3, n, S)
         rates = [x + dx for x, dx in zip(self.one.rates, change, strict=True)]
         every = np.concatenate(rows, axis=1).T.copy()
-        t = np.repeat(self.one.t, len(every))
-        tangent = system.at(t).linearise(*rates)
+        instants = system.at(np.repeat(self.one.t, len(every)))
+        tangent = instants.linearise(*rates)
         by_rates = np.stack([x.sum(axis=0) for x in tangent.transposed(every)])
         return by_rates.reshape(3, 1, S), system.body_gradient(
-            t, rates[0], rates[1], rates[2], every
+            instants, rates[0], rates[1], rates[2], every
         )
 
     def _size(self, displaced: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ ch. 2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -33,8 +33,8 @@ import numpy as np
 from dolfinopt.multibody.body_motion import Load
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, product
 from dolfinopt.multibody.kinematics import Posed, SiteMotion
-from dolfinopt.multibody.measured import INDEPENDENT_SHARE
-from dolfinopt.multibody.mechanism import Closure, Mechanism, Site
+from dolfinopt.multibody.mechanism import Mechanism, Site
+from dolfinopt.multibody.ranks import least_norm
 
 # -- equations: value, force on both frames, and how the force changes as these move -------------
 #
@@ -158,6 +158,20 @@ class Tie:
     rotation: np.ndarray
     equations: tuple[Equation, ...]
 
+    @classmethod
+    def in_plane(cls, name: str, site: Site, point: np.ndarray, normals: np.ndarray) -> Tie:
+        """Return what holds an interface of a plane machine to the ground's point (2,), m.
+
+        Args:
+            name: of it.
+            site: the interface.
+            point: a pin, or a point of a line.
+            normals: (m, 2) directions of its forces: across a line, or two of a pin.
+        """
+        return cls(
+            name, site, None, np.asarray(point, float), np.eye(2), tuple(map(Along, normals))
+        )
+
     @property
     def is_rod(self) -> bool:
         """Whether its frames are apart."""
@@ -166,73 +180,42 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """All closures of a machine: m equations, combinations of their own k.
+    """All closures of a machine, k equations; every one has its multiplier.
 
     Attributes:
         ties: the closures.
-        weights: (m, k) of the combinations that are independent; the identity where all are.
-        given: (k,) multipliers that are known, of constant forces; N.
     """
 
-    ties: tuple[Tie, ...]
-    weights: np.ndarray
-    given: np.ndarray
-
-    @classmethod
-    def of(cls, ties: Sequence[Tie]) -> Loops:
-        """Return closures of which all equations count."""
-        count = sum(len(tie.equations) for tie in ties)
-        return cls(tuple(ties), np.eye(count), np.zeros(count))
+    ties: tuple[Tie, ...] = ()
 
     @property
     def count(self) -> int:
-        """Number m of equations that count."""
-        return len(self.weights)
+        """Number k of equations."""
+        return sum(len(tie.equations) for tie in self.ties)
 
-    @property
-    def redundant(self) -> int:
-        """Number of equations that follow from the others."""
-        return len(self.given) - int(np.count_nonzero(self.given)) - self.count
+    @cached_property
+    def equations(self) -> tuple[Equation, ...]:
+        """Those of all closures."""
+        return tuple(one for tie in self.ties for one in tie.equations)
 
     @cached_property
     def lengths(self) -> np.ndarray:
         """By what (k,) a multiplier is a moment, m; 1 of forces."""
-        every = [one for tie in self.ties for one in tie.equations]
-        return np.array([one.length if isinstance(one, Facing) else 1.0 for one in every])
+        return np.array([one.length if isinstance(one, Facing) else 1.0 for one in self.equations])
+
+    def by_tie(self, values: np.ndarray) -> list[float]:
+        """Return the norm of every closure's part of values (k,) of the equations."""
+        ends = np.cumsum([len(tie.equations) for tie in self.ties])[:-1]
+        return [float(np.linalg.norm(part)) for part in np.split(values, ends)]
 
     def reactions(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return forces and moments (n, k) on the first frames, N and N m, of (n, m)."""
-        out: np.ndarray = (multipliers @ self.weights) * self.lengths
+        """Return forces and moments on the first frames, N and N m, of multipliers (n, k)."""
+        out: np.ndarray = multipliers * self.lengths
         return out
-
-    @classmethod
-    def of_plane(cls, closure: Closure, site: Site) -> Loops:
-        """Return what holds an interface of a plane machine."""
-        normals = [np.array([n.real, n.imag]) for n in closure.normals]
-        equations, given = [Along(n) for n in normals], np.zeros(len(normals))
-        if closure.force:
-            size = abs(closure.force)
-            along = closure.force / size
-            equations.append(Along(np.array([along.real, along.imag])))
-            given = np.append(given, size)
-        point = np.array([closure.point.real, closure.point.imag])
-        tie = Tie("closure", site, None, point, np.eye(2), tuple(equations))
-        return cls((tie,), np.eye(len(normals), len(equations)), given)
 
     def at(self, mechanism: Mechanism, q_r: np.ndarray, q: np.ndarray) -> ClosedLoops:
         """Return them at n poses, q_r (n, R) and q (n, N)."""
         return ClosedLoops(self, Posed(mechanism, q_r, q))
-
-    def independent(self, jacobian: np.ndarray) -> Loops:
-        """Return those combinations that are independent, by the Jacobian (k, C) of a pose.
-
-        Its columns are of like size. What is left out follows from the others where the loops are
-        closed, as the equations out of a plane mechanism's plane do.
-        """
-        U, sizes, _ = np.linalg.svd(jacobian, full_matrices=False)
-        rank = int((sizes > INDEPENDENT_SHARE * sizes.max(initial=0.0)).sum())
-        weights = np.eye(len(jacobian)) if rank == len(jacobian) else U[:, :rank].T
-        return replace(self, weights=weights)
 
 
 class ClosedLoops:
@@ -263,52 +246,39 @@ class ClosedLoops:
         return [(one, a, b) for tie, (a, b) in pairs for one in tie.equations]
 
     @cached_property
-    def every_gap(self) -> np.ndarray:
-        """All k equations (n, k), m."""
-        return np.stack([one.value(a, b) for one, a, b in self._equations], axis=1)
-
-    @cached_property
-    def every_row(self) -> np.ndarray:
-        """Their derivatives by all coordinates (n, k, C)."""
-        rows = []
-        for one, a, b in self._equations:
-            on_a, on_b = one.loads(a, b)
-            row = a.work(on_a) + b.work(on_b)
-            if isinstance(one, Distance) and one.coordinate is not None:
-                row[:, one.coordinate] -= 1.0
-            rows.append(row)
-        return np.stack(rows, axis=1)
-
-    @property
     def gap(self) -> np.ndarray:
-        """Those m that count (n, m), m."""
-        return self.every_gap @ self.loops.weights.T
+        """The equations (n, k), m."""
+        out = np.empty((len(self.posed.q), self.loops.count))
+        for k, (one, a, b) in enumerate(self._equations):
+            out[:, k] = one.value(a, b)
+        return out
 
     @cached_property
     def jacobian(self) -> np.ndarray:
-        """Their derivatives by all coordinates (n, m, C)."""
-        return self.loops.weights @ self.every_row
-
-    def forces(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the multipliers (n, k) of all equations from those (n, m) that count."""
-        return multipliers @ self.loops.weights + self.loops.given
+        """Their derivatives by all coordinates (n, k, C)."""
+        size = self.posed.mechanism.num_rigid + self.posed.q.shape[1]
+        out = np.empty((len(self.posed.q), self.loops.count, size))
+        for k, (one, a, b) in enumerate(self._equations):
+            on_a, on_b = one.loads(a, b)
+            out[:, k] = a.work(on_a) + b.work(on_b)
+            if isinstance(one, Distance) and one.coordinate is not None:
+                out[:, k, one.coordinate] -= 1.0
+        return out
 
     def work(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return what the closures' forces of multipliers (n, m) do on every coordinate (n, C)."""
-        out: np.ndarray = np.einsum("nk,nkc->nc", self.forces(multipliers), self.every_row)
+        """Return what the closures' forces of multipliers (n, k) do on every coordinate (n, C)."""
+        out: np.ndarray = np.einsum("nk,nkc->nc", multipliers, self.jacobian)
         return out
 
     def closing(self, forces: np.ndarray, dependent: np.ndarray) -> np.ndarray:
-        """Return the multipliers (n, m) that give what joints that follow need.
+        """Return the multipliers (n, k) of least norm that give what joints that follow need.
 
         Args:
             forces: (n, R) of inverse dynamics without closures.
-            dependent: (m,) the joints that follow, rigid coordinates.
+            dependent: the joints that follow, rigid coordinates; at most k.
         """
         J = self.jacobian[:, :, dependent]
-        left = forces[:, dependent] - self.work(np.zeros(J.shape[:2]))[:, dependent]
-        out: np.ndarray = np.linalg.solve(J.swapaxes(1, 2), left[:, :, None])[:, :, 0]
-        return out
+        return least_norm(J.swapaxes(1, 2), forces[:, dependent])
 
     def pulls(self, multipliers: np.ndarray) -> dict[Site, Load]:
         """Return what interfaces give to the closures, force and moment in their components."""
@@ -328,7 +298,7 @@ class ClosedLoops:
 
     def _loads(self, multipliers: np.ndarray) -> list[Loads]:
         """Return the loads of every closure on its two frames."""
-        every, found, k = self.forces(multipliers).T, [], 0
+        every, found, k = multipliers.T, [], 0
         for tie, (a, b) in zip(self.loops.ties, self._sites, strict=True):
             parts = []
             for one in tie.equations:
@@ -339,7 +309,7 @@ class ClosedLoops:
 
     def _changes(self, multipliers: np.ndarray, moved: Sequence[Moved]) -> list[Loads]:
         """Return how they change by motions of the frames of every closure."""
-        every, found, k = self.forces(multipliers).T, [], 0
+        every, found, k = multipliers.T, [], 0
         for tie, (a, b), by in zip(self.loops.ties, self._sites, moved, strict=True):
             parts = []
             for one in tie.equations:
@@ -366,12 +336,17 @@ class ClosedLoops:
         return found
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
-        """Return what rates (n, C) add to the equations' second derivatives (n, m), m/s2."""
-        here, found = self._without_given(), []
-        for unit in np.eye(self.loops.count):
-            H = here.hessian(np.broadcast_to(unit, (len(rates), len(unit))))
-            found.append(np.einsum("ni,nij,nj->n", rates, H, rates, optimize=True))
-        return np.stack(found, axis=1)
+        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, k), m/s2.
+
+        The power g' of unit loads on moving frames, differentiated.
+        """
+        found = []
+        moved = [(*a.along(rates), *b.along(rates)) for a, b in self._sites]
+        bias = [(*a.acceleration(rates), *b.acceleration(rates)) for a, b in self._sites]
+        for tie, sites, v, a in zip(self.loops.ties, self._sites, moved, bias, strict=True):
+            for one in tie.equations:
+                found.append(_power(one.changes(*sites, v), v) + _power(one.loads(*sites), a))
+        return np.stack(found, axis=1) if found else np.zeros((len(rates), 0))
 
     def gradient(
         self, weights: np.ndarray, multipliers: np.ndarray, virtual: np.ndarray
@@ -379,8 +354,7 @@ class ClosedLoops:
         """Return the derivative of sum_n weights_n . gap_n + work_n(multipliers) . virtual_n.
 
         Args:
-            weights: (n, m).
-            multipliers: (n, m) of the forces; those given count as well.
+            weights, multipliers: (n, k).
             virtual: (n, C) displacements of all coordinates.
 
         Returns:
@@ -392,16 +366,12 @@ class ClosedLoops:
             if body.is_stiffened:
                 by["K0_outboard"] = np.zeros_like(body.K0_outboard)
         moved = [(*a.along(virtual), *b.along(virtual)) for a, b in self._sites]
-        values = self._without_given()._loads(weights)
+        values = self._loads(weights)
         forces, changes = self._loads(multipliers), self._changes(multipliers, moved)
         for sites, value, load, change in zip(self._sites, values, forces, changes, strict=True):
             for site, of_gap, of_force, by in zip(sites, value, load, change, strict=True):
                 self._add_gradient(found, site, of_gap, of_force, by, virtual)
         return found
-
-    def _without_given(self) -> ClosedLoops:
-        """Return them without constant forces."""
-        return ClosedLoops(replace(self.loops, given=0.0 * self.loops.given), self.posed)
 
     def _add_gradient(
         self,
@@ -426,6 +396,12 @@ class ClosedLoops:
             if "K0_outboard" in found[i]:
                 bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T
                 found[i]["K0_outboard"][own] -= bent @ e
+
+
+def _power(loads: Loads, rate: Moved) -> np.ndarray:
+    """Return that (n,) of loads on frames with these velocities."""
+    parts = zip((*loads[0], *loads[1]), rate, strict=True)
+    return np.sum([(f * v).sum(axis=0) for f, v in parts], axis=0)
 
 
 def _scaled(loads: Loads, factor: np.ndarray) -> Loads:

@@ -13,7 +13,7 @@ from dolfinopt.multibody.body_motion import BodyMotion, Load, Motion, Weights
 from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.inverse_dynamics import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 

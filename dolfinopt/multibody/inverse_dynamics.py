@@ -16,7 +16,7 @@ from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.dimension import compose, product
 from dolfinopt.multibody.frames import Interface, MovingJoint, MovingRotor
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 
 NOTHING: Mapping[Site, Load] = {}
@@ -348,7 +348,7 @@ def largest_change(
     Args:
         mechanism: bodies with geometric stiffness.
         motion: at n instants.
-        loops: closures, with those equations that count for rigid arms; or None.
+        loops: closures; or None.
         dependent: rigid coordinates that follow from them.
     """
     largest = 0.0

@@ -11,7 +11,7 @@ from dolfinopt.multibody.body_motion import Constants, Load
 from dolfinopt.multibody.dimension import Turning, compose, product
 from dolfinopt.multibody.frames import MovingJoint
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 
 
 class Section:
@@ -172,6 +172,22 @@ class SiteMotion:
         """Return displacement (d, n) and rotation (r, n) by virtual coordinates (n, C)."""
         place = np.einsum("dcn,nc->dn", self.by_place, virtual)
         return place, np.einsum("rcn,nc->rn", self.by_spin, virtual)
+
+    def acceleration(self, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return acceleration (d, n) and angular acceleration (r, n) at rates (n, R) alone.
+
+        Those of the coordinates are zero, the bodies rigid: going outwards with the angular
+        velocity w so far, sum (2 w + s) x dp and sum w x s.
+        """
+        dim, count = self.dim, len(rates)
+        a, (wd, w) = np.zeros((dim.d, count)), np.zeros((2, dim.r, count))
+        inboard_first = np.argsort(self.order, kind="stable")
+        for c in inboard_first[self.order[inboard_first] >= 0]:
+            shift, spin = self.by_place[:, c] * rates[:, c], self.by_spin[:, c] * rates[:, c]
+            a = a + dim.velocity(2.0 * w + spin, shift)
+            wd = wd + dim.commutator(w, spin)
+            w = w + spin
+        return a, wd
 
     def hessian(self, load: Load) -> np.ndarray:
         """Return the derivative (n, C, C) of `work` by the coordinates, the load held.

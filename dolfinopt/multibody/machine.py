@@ -1,9 +1,9 @@
-"""A scene as a machine: rigid bodies and rotations in space, joints, mechanism, motion."""
+"""A scene as a machine: rigid bodies and rotations in space, joints, closures, mechanism."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,16 +21,7 @@ from dolfinopt.multibody.mechanism import (
     plane_chain,
     with_bearings,
 )
-from dolfinopt.multibody.motion import (
-    RigidMotion,
-    along_table,
-    check_plane_motion,
-    columns_of,
-    curve_of_table,
-    rigid_motion,
-)
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
-from dolfinopt.paths import Curve
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.closures import Closures, closing_site
@@ -122,92 +113,6 @@ def roll_pitch_yaw(rpy: tuple[float, float, float]) -> np.ndarray:
     return R
 
 
-# -- the joints from the ground to the end-effector, links rigid: places, Jacobian,
-# accelerations
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """The end-effector at n instants, world's components; k joints that move.
-
-    Attributes:
-        place: (n, 3) m.
-        rotation: (n, 3, 3) from the end-effector's frame to the world's.
-        jacobian: (n, 6, k) velocity and angular velocity by the joints' rates.
-        bias: (n, 6) acceleration and angular acceleration at these rates, the joints' own zero.
-    """
-
-    place: np.ndarray
-    rotation: np.ndarray
-    jacobian: np.ndarray
-    bias: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class RigidChain:
-    """Rigid links from the ground to the end-effector.
-
-    Attributes:
-        joints: from the ground outwards, fixed ones included.
-        points: (3,) for every joint where on its parent the interface is that it sits on, m.
-        end: (3,) the end-effector in the last link's frame, m.
-    """
-
-    joints: tuple[Joint, ...]
-    points: tuple[np.ndarray, ...]
-    end: np.ndarray
-
-    @property
-    def coordinates(self) -> tuple[int, ...]:
-        """Which of the machine's rigid coordinates move the end-effector."""
-        return tuple(j.coordinate for j in self.joints if j.coordinate is not None)
-
-    @property
-    def reach(self) -> float:
-        """Length of the links together, m."""
-        offsets = [p + joint.origin for p, joint in zip(self.points, self.joints, strict=True)]
-        return float(sum(map(np.linalg.norm, [*offsets, self.end]))) or 1.0
-
-    def at(self, q: np.ndarray, qd: np.ndarray | None = None) -> Pose:
-        """Return the end-effector for the machine's joint coordinates.
-
-        Args:
-            q: (n, joints) rad, m.
-            qd: (n, joints) rates; zero by default.
-        """
-        count = len(q)
-        qd = np.zeros_like(q) if qd is None else qd
-        R, p = np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3))
-        w, wd, a = np.zeros((3, count, 3))
-        origins, axes, slides = [], [], []
-        for joint, point in zip(self.joints, self.points, strict=True):
-            away = times(R, np.broadcast_to(point + joint.origin, p.shape))
-            p = p + away
-            a = a + cross(wd, away) + cross(w, cross(w, away))
-            R = R @ joint.rotation
-            if (k := joint.coordinate) is None:
-                continue
-            axis = times(R, np.broadcast_to(joint.axis, p.shape))
-            turned = axis * qd[:, k, None]
-            if joint.kind == "prismatic":
-                slid = axis * q[:, k, None]
-                p = p + slid
-                a = a + cross(wd, slid) + cross(w, cross(w, slid)) + 2.0 * cross(w, turned)
-            else:
-                R = R @ about(joint.axis, q[:, k])
-                wd, w = wd + cross(w, turned), w + turned
-            origins.append(p)
-            axes.append(axis)
-            slides.append(joint.kind == "prismatic")
-        away = times(R, np.broadcast_to(self.end, p.shape))
-        p, a = p + away, a + cross(wd, away) + cross(w, cross(w, away))
-        J = np.zeros((count, 6, len(axes)))
-        for i, (origin, axis, slide) in enumerate(zip(origins, axes, slides, strict=True)):
-            J[:, :3, i] = axis if slide else cross(axis, p - origin)
-            J[:, 3:, i] = 0.0 if slide else axis
-        return Pose(p, R, J, np.hstack([a, wd]))
-
-
 # -- A scene's rigid arms, payload and joints -> bodies and joints of a machine in space ---------
 
 Inertia = tuple[float, ...]
@@ -259,7 +164,7 @@ def spatial_mechanism(
     return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
 
 
-def build_spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
+def _spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     """Put the bodies on the scene's joints, with what they carry.
 
     Args:
@@ -332,12 +237,16 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     return tuple(joints)
 
 
-# -- what closes loops in space ------------------------------------------------------------------
+# -- what closes loops -----------------------------------------------------------------------
 
 
 def skeleton(scene: Scene) -> Mechanism:
     """Return the scene's joints and interfaces without any mass: what moves rigid links."""
     none = np.zeros(3)
+    if not scene.is_spatial:
+        bars = [rigid_bar(arm.length, arm.height, 0.0, 0.0) for arm in scene.arms]
+        hardware = [JointHardware()] * len(bars)
+        return plane_chain(bars, 0.0, 0.0, (0.0, 0.0), scene.motion.joint_height, hardware=hardware)
     bodies = []
     for arm in scene.arms:
         first, *further = arm.interface_points
@@ -347,10 +256,12 @@ def skeleton(scene: Scene) -> Mechanism:
 
 
 def loops_of(scene: Scene) -> Loops | None:
-    """Return the scene's closures in space with all of their equations; None of a tree."""
+    """Return the scene's closures; None of a tree."""
+    if scene.closure is not None:
+        return Loops((_plane_tie(scene.closure, (len(scene.arms) - 1, 0)),))
     if not scene.closures:
         return None
-    reach, first = end_chain(scene).reach, len(scene.movable)
+    reach, first = reach_of(skeleton(scene)), len(scene.movable)
     places = {one.name: first + k for k, one in enumerate(scene.rods)}
     ties = []
     for one in scene.closures:
@@ -359,7 +270,23 @@ def loops_of(scene: Scene) -> Loops | None:
         equations = _equations(one, reach, places.get(one.name))
         point, rotation = np.array(one.point, dtype=float), roll_pitch_yaw(one.rpy)
         ties.append(Tie(one.name, a, b, point, rotation, equations))
-    return Loops.of(ties)
+    return Loops(tuple(ties))
+
+
+def _plane_tie(one: scenes.Closure, site: Site) -> Tie:
+    """Return what holds an interface in the plane: a slider across its line, a pin along x, y."""
+    x, y = _unit(one.direction)
+    normals = np.array([[-y, x]]) if one.kind == "slider" else np.eye(2)
+    return Tie.in_plane("closure", site, np.array(one.point), normals)
+
+
+def reach_of(mechanism: Mechanism) -> float:
+    """Return the length of the links from the ground to the end-effector together, m."""
+    total, point = 0.0, np.zeros(mechanism.dim.d)
+    for i, number in mechanism.way:
+        total += float(np.linalg.norm(point + mechanism.joints[i].origin))
+        point = mechanism.constants[i].points[number]
+    return total + float(np.linalg.norm(point)) or 1.0
 
 
 def _equations(one: Closures, reach: float, place: int | None) -> tuple[Equation, ...]:
@@ -385,18 +312,6 @@ def _unit(v: Sequence[float] | np.ndarray | None) -> np.ndarray:
     return np.asarray(v, dtype=float) / np.linalg.norm(v)
 
 
-def end_chain(scene: Scene) -> RigidChain:
-    """Return the rigid links from the ground to the end-effector."""
-    joints, (arm, interface) = joints_of(scene), scene.end_effector
-    points = [[np.array(point) for point in one.interface_points] for one in scene.arms]
-    end, chain = points[arm][interface], [joints[arm]]
-    while chain[0].parent != GROUND:
-        chain.insert(0, joints[chain[0].parent])
-    ground = np.zeros(3)
-    sits = [ground if j.parent == GROUND else points[j.parent][j.interface] for j in chain]
-    return RigidChain(tuple(chain), tuple(sits), end)
-
-
 def _payload(scene: Scene) -> ShapeIntegrals:
     """Return the payload, in the frame of the end-effector's interface."""
     payload = scene.payload
@@ -416,31 +331,13 @@ def _carried(scene: Scene, k: int) -> ShapeIntegrals | None:
     return parts[0] if len(parts) == 1 else parts[0] + parts[1]
 
 
-# -- motion of a spatial machine's joints at given instants --------------------------------------
-
-
-def joint_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
-    """Return the joints at instants t (n,), s: of the scene's table, or of the end-effector's path.
-
-    Raises:
-        InputError: the table cannot be used, or the path cannot be followed.
-    """
-    if scene.motion.path != "joints" or scene.closures:
-        from dolfinopt.multibody.inverse_kinematics import follower
-
-        return RigidMotion(*follower(scene).at(t))
-    return RigidMotion(*along_table(t, scene.motion, columns_of(scene)))
-
-
-def check_joint_motion(scene: Scene) -> None:
-    """Raise `InputError` when the scene's table or path cannot be followed."""
-    joint_motion(np.zeros(1), scene)
-
-
-# -- how scenes become machines, by their dimension ------------------------------------------------
-
-
 def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
+    """Return the scene's machine, of bodies in the order of its arms."""
+    build = _spatial_mechanism if scene.dimension == 3 else _plane_mechanism
+    return build(scene, bodies)
+
+
+def _plane_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
     """Put the bodies on the scene's base, with what sits at their joints and its payload."""
     mechanism = plane_chain(
         bodies,
@@ -471,32 +368,3 @@ def rotors_of(scene: Scene) -> list[Rotor | None]:
         Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
         for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
     ]
-
-
-@dataclass(frozen=True)
-class Family:
-    """How scenes in the plane, or in space, become machines.
-
-    Attributes:
-        build: (scene, bodies): the mechanism.
-        motion: (t, scene): the desired rigid motion at instants t (n,), s.
-        check: (scene): raises `InputError` where that motion is impossible.
-        curve: (scene): the curve through its table, and whether its parameter is time.
-    """
-
-    build: Callable[[Scene, list[ShapeIntegrals]], Mechanism]
-    motion: Callable[..., RigidMotion]
-    check: Callable[[Scene], None]
-    curve: Callable[[Scene], tuple[Curve, bool]]
-
-
-IN_PLANE = Family(build_mechanism, rigid_motion, check_plane_motion, curve_of_table)
-
-
-def family_of(scene: Scene) -> Family:
-    """Return how the scene becomes a machine."""
-    if scene.dimension == 2:
-        return IN_PLANE
-    from dolfinopt.multibody.inverse_kinematics import curve_in_space
-
-    return Family(build_spatial_mechanism, joint_motion, check_joint_motion, curve_in_space)

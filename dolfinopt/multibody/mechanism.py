@@ -9,11 +9,11 @@ Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
-    from dolfinopt.multibody.motion import RigidMotion
+    from dolfinopt.multibody.rigid_motion import RigidMotion
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
 # closures
@@ -122,7 +122,7 @@ class Drives:
         rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
         winding: whether motors behind springs are asked to turn ahead of their joints by what the
             springs give under u_ff.
-        table: of instants t (n,), s, forces (n, R) that are added; or None.
+        table: `dynamics.tables.Table` of forces (R) that are added; or None.
         springs: between drives and arms, where a drive is controlled.
         friction: (R,) of motors before springs that are on the desired motion; or None.
     """
@@ -133,7 +133,7 @@ class Drives:
     limits: np.ndarray
     driven: np.ndarray
     rigid_feed_forward: bool = False
-    table: Callable[[np.ndarray], np.ndarray] | None = None
+    table: Any = None
     springs: Springs = NO_SPRINGS
     friction: Friction | None = None
     winding: bool = False
@@ -165,55 +165,6 @@ class Drives:
     def limited(self) -> np.ndarray:
         """Where there is a limit (R,)."""
         return np.isfinite(self.limits)
-
-
-@dataclass(frozen=True, eq=False)
-class Closure:
-    """The last outboard interface slides on a line, or turns about a fixed point.
-
-    g_i = Re(conj(n_i) (p - point)) = 0 with m unit normals n_i; the force of the ground on the
-    interface is sum_i lambda_i n_i, N, beside a given constant one.
-
-    Attributes:
-        point: complex, m.
-        normals: (m,) complex: one across the line, or both axes.
-        force: given force on the interface, complex, N.
-    """
-
-    point: complex
-    normals: np.ndarray
-    force: complex = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number m of constraints."""
-        return len(self.normals)
-
-    def gap(self, place: np.ndarray) -> np.ndarray:
-        """Return g (n, m), m, of places (n,)."""
-        return (np.conj(self.normals) * (place[:, None] - self.point)).real
-
-    def project(self, derivative: np.ndarray) -> np.ndarray:
-        """Return the part along every normal (n, m, ...) of complex derivatives (n, ...)."""
-        shape = (1, -1) + (1,) * (derivative.ndim - 1)
-        return (np.conj(self.normals).reshape(shape) * derivative[:, None]).real
-
-    @classmethod
-    def slider(cls, point: complex, direction: complex, force: float = 0.0) -> Closure:
-        """Return the closure of a slider on the line through `point` along `direction`.
-
-        Args:
-            point: m.
-            direction: of any length.
-            force: on the slider along the direction, N.
-        """
-        unit = direction / abs(direction)
-        return cls(point, np.array([1j * unit]), force * unit)
-
-    @classmethod
-    def pin(cls, point: complex) -> Closure:
-        """Return the closure of a pin at `point`, m."""
-        return cls(point, np.array([1.0, 1j]))
 
 
 # -- few instants: the same bits wherever arrays lie in memory

@@ -31,7 +31,7 @@ from dolfinopt.multibody.inverse_dynamics import (
     outward_pass,
 )
 from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates
 
 # -- the derivative of a residual by some coordinates --------------------------------------------

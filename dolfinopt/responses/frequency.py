@@ -21,8 +21,8 @@ from dolfinopt.arms.modes import Chain, LoadedModes, RigidIntegrals, rigid_integ
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.state_space import Poles, damping_ratios, linearised, poles_of
-from dolfinopt.multibody.machine import family_of
-from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.motion.build import rigid_motion
+from dolfinopt.multibody.machine import build_mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
@@ -193,8 +193,8 @@ def _tree(analysis: Analysis) -> FrozenTree:
             fixed_body(scene, place) if owner is None else owned[owner]
             for place, owner in enumerate(scene.owners)
         ]
-        motion = family_of(scene).motion(np.array([0.5 * scene.motion.duration]), scene)
-        rigid = family_of(scene).build(scene, bodies).rigid  # its bearings, too
+        motion = rigid_motion(np.array([0.5 * scene.motion.duration]), scene)
+        rigid = build_mechanism(scene, bodies).rigid  # its bearings, too
         return FrozenTree(rigid, motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)

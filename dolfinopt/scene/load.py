@@ -585,7 +585,10 @@ def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> 
             )
     duration = motion.get("duration")
     default = Motion.model_fields["horizon"].default
-    if "horizon" not in motion and isinstance(duration, (int, float)) and duration > default:
+    moving = motion.get("table_ends") == "moving"
+    if "horizon" in motion or not isinstance(duration, (int, float)):
+        return tuple(derived)
+    if duration > default or moving:
         motion["horizon"] = duration
         derived.append(("motion", "horizon"))
     return tuple(derived)

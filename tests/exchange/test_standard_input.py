@@ -18,7 +18,7 @@ from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body_motion import BodyMotion, Constants
 from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     TABLE,
     ShapeIntegrals,

@@ -22,7 +22,7 @@ from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.machine import roll_pitch_yaw
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile

@@ -10,7 +10,7 @@ from runs import ROOT, run, tomllib
 from dolfinopt.multibody.machine import (
     GROUND,
     about,
-    build_spatial_mechanism,
+    build_mechanism,
     rigid_link,
     rigid_spatial_body,
 )
@@ -122,7 +122,7 @@ def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> Mechanism:
         else rigid_spatial_body(*solids[arm.name], (arm.length, 0.0, 0.0))
         for arm in scene.arms
     ]  # fmt: skip
-    return build_spatial_mechanism(scene, bodies)
+    return build_mechanism(scene, bodies)
 
 
 def frames_of(mechanism: Mechanism, q: np.ndarray) -> list[np.ndarray]:

@@ -24,6 +24,7 @@ from remainders import substructure
 from runs import ROOT
 from scipy.linalg import expm
 
+from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
@@ -49,7 +50,7 @@ from dolfinopt.multibody.mechanism import (
     Rotor,
     plane_chain,
 )
-from dolfinopt.multibody.motion import RigidMotion, rigid_motion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import rigid_bar, shape_integrals
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.reduction import Options, craig_bampton, modal

@@ -18,7 +18,7 @@ from dolfinopt.multibody.machine import (
     spatial_mechanism,
 )
 from dolfinopt.multibody.mechanism import bearing_body, with_bearings
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 
 pin = pytest.importorskip("pinocchio")
 pytestmark = pytest.mark.serial

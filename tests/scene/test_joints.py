@@ -9,7 +9,7 @@ from scenes import put_at
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.machine import build_spatial_mechanism, rigid_link
+from dolfinopt.multibody.machine import build_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -69,7 +69,7 @@ def with_fork():
 
 
 def machine_of(scene):
-    return build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
+    return build_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
 
 
 def test_machine_of_a_scene(source):

@@ -326,6 +326,9 @@ DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the l
 class Closure(Table):
     """What holds the outboard interface of the last arm, whose rotation stays free."""
 
+    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
+        default="closure", description="name in the columns of trajectory.csv [-]"
+    )
     kind: ClosureKind = Field(
         description="the interface slides on a line, or turns about a fixed point [-]"
     )
@@ -381,12 +384,6 @@ class Closure(Table):
                 'expected "rotation" or "joints" with [closure]: the motion prescribes the '
                 "joints that are independent",
                 ("motion", "path"),
-                (*at, "kind"),
-            )
-        if scene.simulation.integrator != "radau":
-            raise Refusal(
-                'expected "radau" with [closure]: its stages keep the loop closed',
-                ("simulation", "integrator"),
                 (*at, "kind"),
             )
         self._check_springs(scene, at)
