@@ -21,6 +21,7 @@ from dolfinopt.multibody.mechanism import (
     plane_chain,
     with_bearings,
 )
+from dolfinopt.multibody.rotations import ONE, roll_pitch_yaw
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
@@ -69,48 +70,6 @@ def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
     """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = inertia
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
-
-
-# -- rotations in space: axes and angles, URDF's frames; n instants first
-
-ONE: np.ndarray = np.eye(3)
-PERMUTATION = np.cross(ONE[:, None], ONE).transpose(2, 0, 1)  # e_cab
-_NEXT, _OTHER = np.array([1, 2, 0]), np.array([2, 0, 1])
-
-
-def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return u x v (..., 3)."""
-    return u[..., _NEXT] * v[..., _OTHER] - u[..., _OTHER] * v[..., _NEXT]
-
-
-def skew(v: np.ndarray) -> np.ndarray:
-    """Return v~ (..., 3, 3), v~ u = v x u."""
-    out = np.zeros((*v.shape, 3), dtype=v.dtype)
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
-
-
-def times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return A v (n, 3) of matrices (n, 3, 3), or one (3, 3), and vectors (n, 3)."""
-    return v @ A.T if A.ndim == 2 else np.einsum("nij,nj->ni", A, v)
-
-
-def about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return the rotations (n, 3, 3) about a unit axis (3,) by angles (n,)."""
-    A = skew(axis)
-    # Of a column NumPy takes other instructions, and another last bit, where the end of its stride
-    # touches the memory of the result.
-    angle = np.ascontiguousarray(angle)
-    s, c = np.sin(angle), np.cos(angle)
-    return ONE + s[:, None, None] * A + (1.0 - c)[:, None, None] * (A @ A)
-
-
-def roll_pitch_yaw(rpy: tuple[float, float, float]) -> np.ndarray:
-    """Return the rotation (3, 3) of URDF's fixed-axis roll, pitch, yaw: Rz(y) Ry(p) Rx(r)."""
-    x, y, z = (about(ONE[i], np.array([angle]))[0] for i, angle in enumerate(rpy))
-    R: np.ndarray = z @ y @ x
-    return R
 
 
 # -- A scene's rigid arms, payload and joints -> bodies and joints of a machine in space ---------
