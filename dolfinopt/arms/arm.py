@@ -31,8 +31,8 @@ from dolfinopt.fem.interior import Guesses
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.inverse_dynamics import Stiffening
-from dolfinopt.multibody.machine import RIGID_ARMS
+from dolfinopt.multibody.build import RIGID_ARMS
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile

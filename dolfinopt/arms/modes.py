@@ -25,15 +25,11 @@ from scipy.linalg import eigh
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.stress import Prestress
-from dolfinopt.multibody.inverse_dynamics import outward_pass
-from dolfinopt.multibody.machine import (
-    ONE,
-    rigid_spatial_body,
-    skew,
-)
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.newton_euler import outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.rotations import ONE, skew
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_spatial_body
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.reduction.basis import FreeArm, FreeOperators
 from dolfinopt.reduction.eigenproblem import largest_eigenpairs, lowest_eigenpairs
 

@@ -19,11 +19,11 @@ from dolfinopt.dynamics.measured import (
 from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, check_path, passive_coordinates, rests, rigid_motion
-from dolfinopt.multibody.inverse_dynamics import largest_change
-from dolfinopt.multibody.machine import build_mechanism, friction_of, loops_of, soft_joints
-from dolfinopt.multibody.mechanism import AppliedForce, Drives, Springs
+from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
+from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tree import AppliedForce, Drives, Springs
 from dolfinopt.paths import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene

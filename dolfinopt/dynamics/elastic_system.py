@@ -23,7 +23,8 @@ from dolfinopt.dynamics.system import Linearisation, State, System, relative_err
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.gradient import body_gradient
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
+from dolfinopt.multibody.loads import is_loaded_at_rest
+from dolfinopt.multibody.newton_euler import elastic_residual
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tangent import linearise

@@ -37,12 +37,12 @@ from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.gradient import body_gradient
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Drives, Mechanism
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import complement, least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import Drives, Mechanism
 
 
 @dataclass(frozen=True, eq=False)

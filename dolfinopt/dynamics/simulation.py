@@ -29,8 +29,6 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Loops, Tie
 from dolfinopt.multibody.gradient import body_gradient
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
 from dolfinopt.multibody.kinematics import (
     deviation,
     end_effector,
@@ -38,16 +36,13 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.loads import load_coefficients as coefficients_of
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import (
-    SPACE,
-    Rates,
-    ShapeIntegrals,
-    add_integrals,
-)
+from dolfinopt.multibody.shape_integrals import SPACE, Rates, ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.closures import PARTS

@@ -39,7 +39,7 @@ from dolfinopt.exchange.measured import (
     FILE_ROUNDING_SHARE,
     SAME_NODE_SHARE,
 )
-from dolfinopt.multibody.machine import ONE, PERMUTATION, skew
+from dolfinopt.multibody.rotations import ONE, PERMUTATION, skew
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
 from dolfinopt.scene import sid
 

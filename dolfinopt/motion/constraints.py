@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.machine import reach_of
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.tree import Mechanism
 
 Derivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives
 

@@ -30,11 +30,11 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Load
+from dolfinopt.multibody.body import Load
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, product
 from dolfinopt.multibody.kinematics import Posed, SiteMotion
-from dolfinopt.multibody.mechanism import Mechanism, Site
 from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.multibody.tree import Mechanism, Site
 
 # -- equations: value, force on both frames, and how the force changes as these move -------------
 #

@@ -1,6 +1,6 @@
 """From a body to those that hang on it: interfaces, joints and the rotors that drive them.
 
-Motions and loads as in `body_motion`. What carries a motion outwards carries the derivatives of a
+Motions and loads as in `body`. What carries a motion outwards carries the derivatives of a
 function inwards by its transpose.
 """
 
@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import BodyMotion, Load, Motion
+from dolfinopt.multibody.body import BodyMotion, Load, Motion
 from dolfinopt.multibody.dimension import (
     DIMENSIONS,
     Dimension,
@@ -20,7 +20,7 @@ from dolfinopt.multibody.dimension import (
     product,
     transposed_product,
 )
-from dolfinopt.multibody.mechanism import Joint
+from dolfinopt.multibody.tree import Joint
 
 
 @dataclass(frozen=True, eq=False)

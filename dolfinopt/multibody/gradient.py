@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import BodyMotion, Load, Motion, Weights
+from dolfinopt.multibody.body import BodyMotion, Load, Motion, Weights
 from dolfinopt.multibody.frames import Interface
-from dolfinopt.multibody.inverse_dynamics import Link, carried_load, inward_pass, outward_pass
-from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
+from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tree import GROUND, Mechanism, Site
 
 
 def body_gradient(

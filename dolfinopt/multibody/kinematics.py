@@ -1,17 +1,17 @@
 """Poses: where bodies and interfaces are, how coordinates move them, and the end-effector.
 
-Rotations are to the ground's frame, vectors as in `body_motion`.
+Rotations are to the ground's frame, vectors as in `body`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Constants, Load
+from dolfinopt.multibody.body import Constants, Load
 from dolfinopt.multibody.dimension import Turning, compose, product
 from dolfinopt.multibody.frames import MovingJoint
-from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.tree import GROUND, Mechanism, Site
 
 
 class Section:

@@ -90,7 +90,7 @@ class ShapeIntegrals:
             1 for modes in m; (0, q, q) likewise.
         further_points: (i, d) reference positions of the others, m; none in the plane.
         along_modes: (q, q, q) L of the displacement of second order along the modes, M^-1 times
-            the geometric stiffness by the modes' inertia, see `body_motion`; (0, q, q) where
+            the geometric stiffness by the modes' inertia, see `body`; (0, q, q) where
             it is not known, as of bodies from files.
     """
 
@@ -481,6 +481,47 @@ def rigid_body(
         mass, moment, inertia, modes, none, none, square, square, square, square, outboard,
         outboard_point,
     )  # fmt: skip
+
+
+def rigid_spatial_body(
+    mass: float,
+    centre: np.ndarray | tuple[float, ...],
+    inertia: np.ndarray | tuple[float, ...],
+    outboard_point: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
+    further_points: np.ndarray | tuple[tuple[float, ...], ...] = (),
+) -> ShapeIntegrals:
+    """Return a spatial body without elastic coordinates.
+
+    Args:
+        mass: kg.
+        centre: (3,) of mass, m.
+        inertia: (6,) xx, yy, zz, xy, xz, yz of the inertia tensor about the centre, as in URDF,
+            kg m2.
+        outboard_point: (3,) of its outboard interface, m.
+        further_points: (i, 3) of others, m.
+    """
+    r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
+    # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
+    second = 0.5 * np.trace(tensor) * np.eye(3) - tensor + mass * np.outer(r, r)
+    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
+    return ShapeIntegrals(
+        mass=float(mass),
+        w=(mass * r)[:, None],
+        W=second.reshape(9, 1, 1),
+        K=square,
+        D=square,
+        outboard=np.zeros((6 + 6 * len(further), 0)),
+        outboard_point=np.asarray(outboard_point, dtype=float),
+        K0=np.zeros((0, 0, 0)),
+        K0_outboard=np.zeros((0, 0, 0)),
+        further_points=further,
+    )
+
+
+def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
+    """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
 
 
 def rigid_bar(

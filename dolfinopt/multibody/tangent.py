@@ -20,9 +20,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Load
+from dolfinopt.multibody.body import Load
 from dolfinopt.multibody.frames import MotionTransform
-from dolfinopt.multibody.inverse_dynamics import (
+from dolfinopt.multibody.newton_euler import (
     Link,
     Loads,
     carried_load,
@@ -30,9 +30,9 @@ from dolfinopt.multibody.inverse_dynamics import (
     inward_pass,
     outward_pass,
 )
-from dolfinopt.multibody.mechanism import GROUND, Mechanism, Site
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates
+from dolfinopt.multibody.tree import GROUND, Mechanism, Site
 
 # -- the derivative of a residual by some coordinates --------------------------------------------
 

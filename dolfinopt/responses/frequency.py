@@ -22,7 +22,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.state_space import Poles, damping_ratios, linearised, poles_of
 from dolfinopt.motion.build import rigid_motion
-from dolfinopt.multibody.machine import build_mechanism
+from dolfinopt.multibody.build import build_mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE

@@ -22,7 +22,7 @@ from runs import TWO_ARM, overrides, run
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.measured import LINEAR_DRIVE_SHARE
-from dolfinopt.multibody.mechanism import saturated
+from dolfinopt.multibody.tree import saturated
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 

@@ -39,7 +39,7 @@ from dolfinopt.dynamics.build import desired_motion, largest_stiffness_change
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.exchange.in_space import in_space
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.machine import rigid_spatial_body
+from dolfinopt.multibody.shape_integrals import rigid_spatial_body
 from dolfinopt.parallel import on_root
 
 WORLD = MPI.COMM_WORLD

@@ -11,7 +11,7 @@ from loops import bennett, closed, cranks
 import dolfinopt as do
 from dolfinopt.dynamics.machine_system import MachineSystem, feed_forward
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 
 pytestmark = pytest.mark.serial
 

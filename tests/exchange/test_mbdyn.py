@@ -20,7 +20,7 @@ from dolfinopt.exchange.mbdyn import fem_text, write_fem
 from dolfinopt.exchange.standard_input import load_body, lumped_nodes, modal_element
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody.body_motion import BodyMotion, Constants
+from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.reduction import Options, craig_bampton
 from dolfinopt.scene.sid import read_sid, sid_text

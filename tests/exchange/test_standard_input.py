@@ -15,15 +15,11 @@ from runs import refused
 from dolfinopt.exchange.in_space import in_space, plate_moments
 from dolfinopt.exchange.standard_input import from_sid, load_body, to_sid
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody.body_motion import BodyMotion, Constants
+from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.frames import Interface
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import (
-    TABLE,
-    ShapeIntegrals,
-    shape_integrals,
-)
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, shape_integrals
 from dolfinopt.reduction import Options, craig_bampton
 from dolfinopt.scene.sid import (
     StandardInputData,

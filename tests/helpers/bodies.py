@@ -10,18 +10,16 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.multibody.machine import (
+from dolfinopt.multibody.rotations import skew
+from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
+from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
-    skew,
+    JointHardware,
+    Mechanism,
+    Rotor,
+    plane_chain,
     spatial_mechanism,
-)
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism, Rotor, plane_chain
-from dolfinopt.multibody.shape_integrals import (
-    STIFFENING,
-    TABLE,
-    ShapeIntegrals,
-    plane_body,
 )
 
 # By which integrals a function of a body is differentiated.

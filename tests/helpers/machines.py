@@ -16,8 +16,8 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.dimension import product
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import Posed
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.scene.load import Scene, scene_from_dict

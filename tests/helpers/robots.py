@@ -6,16 +6,11 @@ from typing import Any
 
 import numpy as np
 from runs import ROOT, run, tomllib
-
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.multibody.machine import (
-    GROUND,
-    build_mechanism,
-    rigid_link,
-    rigid_spatial_body,
-)
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.build import build_mechanism, rigid_link
+from dolfinopt.multibody.shape_integrals import rigid_spatial_body
+from dolfinopt.multibody.tree import GROUND, Mechanism
 from dolfinopt.scene.load import load_scene
 
 DEMO = ROOT / "demos" / "robot.urdf"

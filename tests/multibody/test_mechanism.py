@@ -27,7 +27,6 @@ from scipy.linalg import expm
 from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.gradient import body_gradient
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
 from dolfinopt.multibody.kinematics import (
     Posed,
     deviation,
@@ -35,13 +34,12 @@ from dolfinopt.multibody.kinematics import (
     end_effector_gradient,
     end_rotation,
 )
-from dolfinopt.multibody.machine import (
-    rigid_spatial_body,
-    roll_pitch_yaw,
-    skew,
-    spatial_mechanism,
-)
-from dolfinopt.multibody.mechanism import (
+from dolfinopt.multibody.newton_euler import elastic_residual, inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.rotations import roll_pitch_yaw, skew
+from dolfinopt.multibody.shape_integrals import rigid_bar, rigid_spatial_body, shape_integrals
+from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import (
     GROUND,
     AppliedForce,
     Joint,
@@ -49,10 +47,8 @@ from dolfinopt.multibody.mechanism import (
     Mechanism,
     Rotor,
     plane_chain,
+    spatial_mechanism,
 )
-from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import rigid_bar, shape_integrals
-from dolfinopt.multibody.tangent import linearise
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Constants, Load, Motion
+from dolfinopt.multibody.body import Constants, Load, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -581,6 +581,19 @@ def plane_chain(
         origin=np.array([0.0, joint_height]),
         cart=cart_mass,
     )
+
+
+def spatial_mechanism(
+    bodies: Sequence[ShapeIntegrals],
+    joints: Sequence[Joint],
+    carried: Mapping[Site, ShapeIntegrals],
+    gravity: Sequence[float] | np.ndarray,
+    end: Site,
+) -> Mechanism:
+    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
+    loads = {site: Constants(one) for site, one in carried.items()}
+    down = np.array(gravity, dtype=float)[:, None]
+    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
 
 
 # -- what is between a drive and its arm: bearings, friction ---------------------------------

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
-from dolfinopt.multibody.mechanism import (
+from dolfinopt.multibody.rotations import ONE, roll_pitch_yaw
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    rigid_bar,
+    rigid_spatial_body,
+)
+from dolfinopt.multibody.tree import (
     GROUND,
     Friction,
     Joint,
@@ -19,58 +24,13 @@ from dolfinopt.multibody.mechanism import (
     Site,
     bearing_body,
     plane_chain,
+    spatial_mechanism,
     with_bearings,
 )
-from dolfinopt.multibody.rotations import ONE, roll_pitch_yaw
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
-
-# -- rigid bodies ----------------------------------------------------------------------------
-
-
-def rigid_spatial_body(
-    mass: float,
-    centre: np.ndarray | tuple[float, ...],
-    inertia: np.ndarray | tuple[float, ...],
-    outboard_point: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
-    further_points: np.ndarray | tuple[tuple[float, ...], ...] = (),
-) -> ShapeIntegrals:
-    """Return a spatial body without elastic coordinates.
-
-    Args:
-        mass: kg.
-        centre: (3,) of mass, m.
-        inertia: (6,) xx, yy, zz, xy, xz, yz of the inertia tensor about the centre, as in URDF,
-            kg m2.
-        outboard_point: (3,) of its outboard interface, m.
-        further_points: (i, 3) of others, m.
-    """
-    r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
-    # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
-    second = 0.5 * np.trace(tensor) * ONE - tensor + mass * np.outer(r, r)
-    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
-    return ShapeIntegrals(
-        mass=float(mass),
-        w=(mass * r)[:, None],
-        W=second.reshape(9, 1, 1),
-        K=square,
-        D=square,
-        outboard=np.zeros((6 + 6 * len(further), 0)),
-        outboard_point=np.asarray(outboard_point, dtype=float),
-        K0=np.zeros((0, 0, 0)),
-        K0_outboard=np.zeros((0, 0, 0)),
-        further_points=further,
-    )
-
-
-def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
-    """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = inertia
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
-
 
 # -- A scene's rigid arms, payload and joints -> bodies and joints of a machine in space ---------
 
@@ -108,19 +68,6 @@ RIGID_ARMS = {2: flat_bar, 3: rigid_link}  # by the machine's dimension
 def _tensor(inertia: float | Inertia) -> Inertia:
     """Return xx, yy, zz, xy, xz, yz; a number is the moment about every axis."""
     return inertia if isinstance(inertia, tuple) else (*[inertia] * 3, 0.0, 0.0, 0.0)
-
-
-def spatial_mechanism(
-    bodies: Sequence[ShapeIntegrals],
-    joints: Sequence[Joint],
-    carried: Mapping[Site, ShapeIntegrals],
-    gravity: Sequence[float] | np.ndarray,
-    end: Site,
-) -> Mechanism:
-    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
-    loads = {site: Constants(one) for site, one in carried.items()}
-    down = np.array(gravity, dtype=float)[:, None]
-    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
 
 
 def _spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
