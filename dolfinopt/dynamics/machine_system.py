@@ -190,7 +190,7 @@ class MachineInstants:
         forces, motors = np.split(every, [machine.mechanism.num_rigid], axis=1)
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
-            forces -= here.work(multipliers)[:, : forces.shape[1]]
+            forces -= here.generalised_force(multipliers)[:, : forces.shape[1]]
         free = machine.drives.free
         forces[:, free] = self.drive_forces(y, yd)
         if not len(machine.drives.springs.joints):
@@ -218,7 +218,7 @@ class MachineInstants:
         if machine.loops is None:
             return out
         here = machine.loops.at(machine.mechanism, motion.q, q)
-        out[:, : machine.ends[1]] -= here.work(multipliers)[:, machine.columns]
+        out[:, : machine.ends[1]] -= here.generalised_force(multipliers)[:, machine.columns]
         out[:, slice(*machine.ends[1:])] = self._constraints(here.gap, multipliers)
         return out
 
@@ -371,7 +371,8 @@ class MachineSystem:
         ahead = np.zeros((len(desired.q), self.ends[0]))
         winding = None
         if self.drives.rigid_feed_forward:
-            forces, motors = feed_forward(self.rigid, desired, self.drives, self.loops)
+            every = feed_forward(self.rigid, desired, self.drives, self.loops)
+            forces, motors = np.split(every, [self.ends[0]], axis=1)
             ahead += forces
             springs = self.drives.springs
             if self.drives.winding:
@@ -417,7 +418,7 @@ class MachineSystem:
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.rigid, desired, self.drives, self.loops)[0]
+        return feed_forward(self.rigid, desired, self.drives, self.loops)[:, : self.ends[0]]
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -653,11 +654,10 @@ def feed_forward(
     desired: RigidMotion,
     drives: Drives,
     loops: Loops | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the forces (n, R) that move the machine with rigid arms on the desired motion.
+) -> np.ndarray:
+    """Return the forces (n, R + M) that move the machine with rigid arms on the desired motion.
 
-    And those of motors behind springs (n, M) that move their rotors.
-
+    Those of the free coordinates, and of motors behind springs, which move their rotors.
     In a closed loop the joints that follow from others have no drive: what they would need, the
     closures give, by multipliers of least norm.
     """
@@ -666,8 +666,9 @@ def feed_forward(
     forces, motors = np.split(every, [rigid.num_rigid], axis=1)
     if loops is not None:
         here = loops.at(rigid, desired.q, none)
-        forces = forces - here.work(here.closing(forces, drives.dependent))
-    return forces[:, drives.free] * drives.driven, motors[:, : len(drives.springs.joints)]
+        forces = forces - here.generalised_force(here.closing(forces, drives.dependent))
+    motors = motors[:, : len(drives.springs.joints)]
+    return np.hstack([forces[:, drives.free] * drives.driven, motors])
 
 
 def feed_forward_weights(

@@ -203,7 +203,7 @@ class BodyMotion:
             return None
         return -self._bent_rate, -self._bent_by(2)
 
-    def pulled(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x: forces by z as forces by e, (q, n) or (m, q, n)."""
         if self.constants.L is None:
             return x
@@ -222,12 +222,12 @@ class BodyMotion:
     def Y(self) -> np.ndarray:
         """Derivative of the rows by alpha_c (g, q, n); that of beta_c is `Yd`."""
         d, g = self.dim.d, self.dim.g
-        return self.V[d : d + g] + self.pulled(self._Wz[:, :, 0])
+        return self.V[d : d + g] + self.jacobian_transposed(self._Wz[:, :, 0])
 
     @cached_property
     def Yd(self) -> np.ndarray:
         """J' W_c z' (g, q, n)."""
-        return self.pulled(self._Wz[:, :, 1])
+        return self.jacobian_transposed(self._Wz[:, :, 1])
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -274,7 +274,7 @@ class BodyMotion:
         pushes[:, 0], pushes[:, 1], pushes[:, 2] = self.alpha, self.beta, self.dim.trace
         return np.asarray(np.einsum("crn,ckrn->kn", pushes, self._Wz))
 
-    def pushes(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
+    def load_coefficients(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return all P of them (P, n) from those of the interfaces, by number."""
         count = self.a.shape[1]
         pulls = [
@@ -285,8 +285,8 @@ class BodyMotion:
 
     def rows(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the elastic rows (q, n) under pushes of the interfaces, by number."""
-        constants, p = self.constants, self.pushes(outboard)
-        f = self.pulled(self.modal_inertia)
+        constants, p = self.constants, self.load_coefficients(outboard)
+        f = self.jacobian_transposed(self.modal_inertia)
         if constants.K0 is None:
             f = f + constants.T.T @ p
         else:
@@ -323,7 +323,7 @@ class BodyMotion:
         d, across = dim.d, slice(dim.d, dim.d + dim.g)
         C, Y, Yd = self.V[:d, kept], self.Y[:, kept], self.Yd[:, kept]
         turned = dim.transposed(Y)
-        first, second = Yd, self.pulled(self._Wz[:, :, 2])[:, kept]
+        first, second = Yd, self.jacobian_transposed(self._Wz[:, :, 2])[:, kept]
         by_e = dim.apply(self.alpha, C)
         by_ed = dim.apply(self.beta, C)
         moved = None
@@ -357,7 +357,7 @@ class BodyMotion:
         constants, q = self.constants, self.constants.num_modes
         if constants.L is None:
             by_e, by_ed, by_edd = *self._by_z(kept), constants.M[:, kept]
-            held = self.pushes(outboard)
+            held = self.load_coefficients(outboard)
         else:
             by_z, by_zd = self._by_z(np.arange(q))
             assert self.rates_by_e is not None
@@ -371,7 +371,7 @@ class BodyMotion:
             by_e = left @ (by_z @ own + by_zd @ Jd[:, :, kept] + M @ Jdd[:, :, kept])
             by_ed = left @ (by_zd @ own + 2.0 * (M @ Jd[:, :, kept]))
             by_edd = left @ (M @ own)
-            held = np.concatenate([self.pushes(outboard), self.modal_inertia])
+            held = np.concatenate([self.load_coefficients(outboard), self.modal_inertia])
         if constants.K0 is not None:
             bent = constants.bent.reshape(len(held), q, q)[:, :, kept]
             by_e -= (held.T @ bent.reshape(len(held), q * len(kept))).reshape(by_e.shape)

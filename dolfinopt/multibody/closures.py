@@ -260,12 +260,12 @@ class ClosedLoops:
         out = np.empty((len(self.posed.q), self.loops.count, size))
         for k, (one, a, b) in enumerate(self._equations):
             on_a, on_b = one.loads(a, b)
-            out[:, k] = a.work(on_a) + b.work(on_b)
+            out[:, k] = a.generalised_force(on_a) + b.generalised_force(on_b)
             if isinstance(one, Distance) and one.coordinate is not None:
                 out[:, k, one.coordinate] -= 1.0
         return out
 
-    def work(self, multipliers: np.ndarray) -> np.ndarray:
+    def generalised_force(self, multipliers: np.ndarray) -> np.ndarray:
         """Return what the closures' forces of multipliers (n, k) do on every coordinate (n, C)."""
         out: np.ndarray = np.einsum("nk,nkc->nc", multipliers, self.jacobian)
         return out
@@ -280,7 +280,7 @@ class ClosedLoops:
         J = self.jacobian[:, :, dependent]
         return least_norm(J.swapaxes(1, 2), forces[:, dependent])
 
-    def pulls(self, multipliers: np.ndarray) -> dict[Site, Load]:
+    def interface_loads(self, multipliers: np.ndarray) -> dict[Site, Load]:
         """Return what interfaces give to the closures, force and moment in their components."""
         found: dict[Site, Load] = {}
         for sites, loads in zip(self._sites, self._loads(multipliers), strict=True):
@@ -319,7 +319,7 @@ class ClosedLoops:
         return found
 
     def hessian(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative of `work` by all coordinates (n, C, C)."""
+        """Return the derivative of `generalised_force` by all coordinates (n, C, C)."""
         moved = [(a.by_place, a.by_spin, b.by_place, b.by_spin) for a, b in self._sites]
         changes = self._changes(multipliers, moved)
         size, count = self.posed.mechanism.num_rigid + self.posed.q.shape[1], len(self.posed.q)
@@ -388,9 +388,9 @@ class ClosedLoops:
             if self.posed.section(i, number).turning is None:
                 continue
             e, v = self.posed.q[:, self.posed.mechanism.slices[i]], virtual[:, site.columns(i)]
-            rate = site.pull(i, number, of_force)
-            value = site.pull(i, number, of_gap)
-            value = value + site.pull_along(i, number, of_force, change, virtual)
+            rate = site.interface_load(i, number, of_force)
+            value = site.interface_load(i, number, of_gap)
+            value = value + site.interface_load_along(i, number, of_force, change, virtual)
             own = slice(dim.b * number, dim.b * (number + 1))
             found[i]["outboard"][own] += value @ e + rate @ v
             if "K0_outboard" in found[i]:

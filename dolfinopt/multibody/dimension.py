@@ -329,11 +329,11 @@ class PlaneTurning:
         out[1, 1], out[0, 1] = out[0, 0], -out[1, 0]
         return out
 
-    def pushed(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_times(self, x: np.ndarray) -> np.ndarray:
         """Return J x (r, ..., n): the angular velocity of a rate."""
         return x
 
-    pulled = pushed  # J' x
+    jacobian_transposed = jacobian_times
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray | None:
         """Return the derivative of J v by theta; of J' v with `sign` = -1. None: zero."""
@@ -375,18 +375,18 @@ class SpaceTurning:
         """Angular velocity by the rate (3, 3, n)."""
         return rotation(self.theta, self._c, 2)
 
-    def pushed(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_times(self, x: np.ndarray) -> np.ndarray:
         """Return J x (3, ..., n): the angular velocity of a rate."""
         return product(self.J, x)
 
-    def pulled(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x (3, ..., n)."""
         return transposed_product(self.J, x)
 
     @cached_property
     def velocity(self) -> np.ndarray:
         """Angular velocity J theta' (3, n)."""
-        return self.pushed(self.rate)
+        return self.jacobian_times(self.rate)
 
     @cached_property
     def acceleration(self) -> np.ndarray:
@@ -396,7 +396,7 @@ class SpaceTurning:
         first, second = self._first
         turned = Space.velocity(theta, v)
         bent = (along * first) * turned + (along * second) * Space.velocity(theta, turned)
-        return self.pushed(self.second) + bent + self._c[3] * Space.velocity(v, turned)
+        return self.jacobian_times(self.second) + bent + self._c[3] * Space.velocity(v, turned)
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray:
         """Return the derivative of J v by theta (3, 3, n); of J' v with `sign` = -1."""

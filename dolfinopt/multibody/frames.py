@@ -138,9 +138,9 @@ class Interface:
         """Return a load on the interface, in the body's components, about the body's origin."""
         return load[0], load[1] + self.dim.moment(self.place, load[0])
 
-    def pushes(self, load: Load) -> np.ndarray:
+    def load_coefficients(self, load: Load) -> np.ndarray:
         """Return what works on (u, theta) (b, n): force and J' moment, of `in_body`."""
-        return np.concatenate([load[0], self.turning.pulled(load[1])])
+        return np.concatenate([load[0], self.turning.jacobian_transposed(load[1])])
 
     def virtual(self, body: Load, zeta: np.ndarray) -> Load:
         """Return its virtual displacement and rotation, the body's components.
@@ -154,7 +154,7 @@ class Interface:
         if not self.body.is_flexible:
             return p, phi
         moved = np.einsum("pkn,kn->pn", self.body.V[self.places], zeta)
-        return p + moved[: self.dim.d], phi + self.turning.pushed(moved[self.dim.d :])
+        return p + moved[: self.dim.d], phi + self.turning.jacobian_times(moved[self.dim.d :])
 
     def in_interface(self, load: Load) -> Load:
         """Return vectors of the body's components in those of the interface."""
@@ -203,7 +203,7 @@ class Interface:
         u, theta = B[:d], B[d:]
         out = np.zeros((d + 2 * r, 3, *u.shape[1:]))
         by_e, by_ed, by_edd = out.swapaxes(0, 1)
-        phi = self.turning.pushed(theta)
+        phi = self.turning.jacobian_times(theta)
         a, w, wd = self._unturned
         by_e[:d] = dim.apply(body.alpha, u) - dim.velocity(phi, a)
         by_ed[:d], by_edd[:d] = dim.apply(body.beta, u), u
@@ -215,7 +215,10 @@ class Interface:
             by_ed[d + r :] = product(of_rate, theta)
         if (rates := body.rates_by_e) is not None:
             Bd, Bdd = (x[self.places][:, kept] for x in rates)
-            turned, second = self.turning.pushed(Bd[d:]), self.turning.pushed(Bdd[d:])
+            turned, second = (
+                self.turning.jacobian_times(Bd[d:]),
+                self.turning.jacobian_times(Bdd[d:]),
+            )
             by_e[:d] += dim.apply(body.beta, Bd[:d]) + Bdd[:d]
             by_ed[:d] += 2.0 * Bd[:d]
             by_e[d : d + r] += turned
@@ -236,7 +239,11 @@ class Interface:
         a, w, wd = product(turning.R, by[0]), *(dim.rotated(turning.R, x) for x in by[1:])
         own_a, own_w, own_wd = self._unturned
         turn = dim.commutator(w, own_w) + dim.commutator(wd, own_wd) - dim.moment(own_a, a)
-        value, rate, second = turning.pulled(turn), turning.pulled(w), turning.pulled(wd)
+        value, rate, second = (
+            turning.jacobian_transposed(turn),
+            turning.jacobian_transposed(w),
+            turning.jacobian_transposed(wd),
+        )
         if (by_theta := self._by_theta) is not None:
             of_w, of_wd, of_rate = by_theta
             value = value + transposed_product(of_w, w) + transposed_product(of_wd, wd)
@@ -250,10 +257,10 @@ class Interface:
     def load_by_rates(self, load: Load, kept: np.ndarray) -> np.ndarray:
         """Return the derivative of `in_body` by those e kept (d + r, k, n); `load` its result."""
         dim = self.dim
-        phi = self.turning.pushed(self.body.V[self.places][self.dim.d :, kept])
+        phi = self.turning.jacobian_times(self.body.V[self.places][self.dim.d :, kept])
         return np.concatenate([dim.velocity(phi, load[0]), dim.commutator(phi, load[1])])
 
-    def pushes_by_e(self, load: Load, kept: np.ndarray) -> np.ndarray | None:
+    def coefficients_by_e(self, load: Load, kept: np.ndarray) -> np.ndarray | None:
         """Return the derivative of J' moment by those e kept (r, k, n); None: zero."""
         by_theta = self.turning.by_theta(load[1], -1.0)
         if by_theta is None:
@@ -264,7 +271,7 @@ class Interface:
     def rows_by_load(self) -> np.ndarray:
         """Derivative of the rows by a load of `in_body` (d + r, q, n)."""
         B, d = self.body.V[self.places], self.dim.d
-        return np.concatenate([B[:d], self.turning.pushed(B[d:])])
+        return np.concatenate([B[:d], self.turning.jacobian_times(B[d:])])
 
     @cached_property
     def rows_by_own_load(self) -> np.ndarray:

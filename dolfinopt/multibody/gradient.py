@@ -99,7 +99,7 @@ def _by_rotation(
             )
             if link.body.is_flexible:
                 turned = dim.rotated(interface.turning.R, turned)
-                found[i, s] = interface.turning.pulled(turned)
+                found[i, s] = interface.turning.jacobian_transposed(turned)
             total += turned
             if s in link.applied:
                 p, phi = interface.virtual(moves[i], own)
@@ -166,11 +166,11 @@ def _interface_weights(
     (force, moment), dim, turning = load, interface.dim, interface.turning
     p, phi = interface.virtual(virtual, zeta)
     # The load's lever, its components, and J' of the row.
-    turned = turning.pulled(dim.moment(own_force, p) + dim.commutator(own_moment, phi))
+    turned = turning.jacobian_transposed(dim.moment(own_force, p) + dim.commutator(own_moment, phi))
     by_theta = turning.by_theta(moment, -1.0)
     if by_theta is not None:
         theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][dim.d :], zeta)
         turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
     value, rate, second = displaced
     value = value + np.concatenate([-dim.velocity(virtual[1], force), turned])
-    return Weights(value, rate, second, interface.pushes(load))
+    return Weights(value, rate, second, interface.load_coefficients(load))

@@ -136,7 +136,7 @@ class SiteMotion:
         self.order[columns] = order
         R, V = self.posed.body(i)[2], self.modes(i, number)
         lever = self.place - self.posed.interface(i, number)[0]
-        spin = dim.rotated(R, section.turning.pushed(V[dim.d :]))
+        spin = dim.rotated(R, section.turning.jacobian_times(V[dim.d :]))
         self.by_spin[:, columns] = spin
         self.by_place[:, columns] = product(R, V[: dim.d]) + dim.velocity(spin, lever[:, None])
 
@@ -159,7 +159,7 @@ class SiteMotion:
         found = product(self.R, v[:, None])
         return np.broadcast_to(found, (self.dim.d, len(self.posed.q)))
 
-    def work(self, load: Load) -> np.ndarray:
+    def generalised_force(self, load: Load) -> np.ndarray:
         """Return what a force and a moment (., n), the ground's components, do on every coordinate.
 
         (n, C).
@@ -190,7 +190,7 @@ class SiteMotion:
         return a, wd
 
     def hessian(self, load: Load) -> np.ndarray:
-        """Return the derivative (n, C, C) of `work` by the coordinates, the load held.
+        """Return the derivative (n, C, C) of `generalised_force` by the coordinates, the load held.
 
         Rows are the coordinates on which it works.
         """
@@ -222,7 +222,7 @@ class SiteMotion:
         lever = self.place - self.posed.interface(i, number)[0]
         swung = dim.velocity(spin, lever[:, None])
         found = np.einsum("rkn,rln->nkl", spin, dim.moment(swung, force[:, None]))
-        pull = self.pull(i, number, load)
+        pull = self.interface_load(i, number, load)
         own = self._in_body(i, number, load)
         by_theta = section.turning.by_theta(own[1], -1.0)
         if by_theta is not None:
@@ -241,17 +241,17 @@ class SiteMotion:
         moment = moment + self.dim.moment(lever, force)
         return product(back, force), self.dim.rotated(back, moment)
 
-    def pull(self, i: int, number: int, load: Load) -> np.ndarray:
+    def interface_load(self, i: int, number: int, load: Load) -> np.ndarray:
         """Return what works on (u, theta) (b, n) of body i's interface on the way."""
         turning = self.posed.section(i, number).turning
         assert turning is not None
         force, moment = self._in_body(i, number, load)
-        return np.concatenate([force, turning.pulled(moment)])
+        return np.concatenate([force, turning.jacobian_transposed(moment)])
 
-    def pull_along(
+    def interface_load_along(
         self, i: int, number: int, load: Load, change: Load, virtual: np.ndarray
     ) -> np.ndarray:
-        """Return the derivative of `pull` (b, n) along virtual coordinates (n, C).
+        """Return the derivative of `interface_load` (b, n) along virtual coordinates (n, C).
 
         Args:
             i, number: as there.
@@ -273,7 +273,7 @@ class SiteMotion:
         back = self.posed.body(i)[2].swapaxes(0, 1)
         by_force = product(back, change[0] - dim.velocity(spin, force))
         by_moment = dim.rotated(back, changed - dim.commutator(spin, about))
-        by = section.turning.pulled(by_moment)
+        by = section.turning.jacobian_transposed(by_moment)
         by_theta = section.turning.by_theta(dim.rotated(back, about), -1.0)
         if by_theta is not None:
             theta = np.einsum("rkn,nk->rn", self.modes(i, number)[dim.d :], virtual[:, columns])
@@ -352,7 +352,7 @@ def end_effector_gradient(
     posed, dim = Posed(mechanism, motion.q, q), mechanism.dim
     site = SiteMotion(posed, mechanism.end, np.zeros(dim.d), np.eye(dim.d))
     load = weights.T, np.zeros((dim.r, len(q))) if moments is None else moments.T
-    by_all, by_bodies = site.work(load), []
+    by_all, by_bodies = site.generalised_force(load), []
     for body in mechanism.bodies:
         by_bodies.append({"outboard": np.zeros_like(body.outboard)})
         if body.is_stiffened:
@@ -360,7 +360,7 @@ def end_effector_gradient(
     for i, number in site.way:
         if posed.section(i, number).turning is None:
             continue
-        pull, e = site.pull(i, number, load), q[:, mechanism.slices[i]]
+        pull, e = site.interface_load(i, number, load), q[:, mechanism.slices[i]]
         own = slice(dim.b * number, dim.b * (number + 1))
         by_bodies[i]["outboard"][own] = pull @ e
         if mechanism.bodies[i].is_stiffened:

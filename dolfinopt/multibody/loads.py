@@ -12,7 +12,7 @@ from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.newton_euler import (
     NOTHING,
     Link,
-    interface_pushes,
+    interface_coefficients,
     inverse_dynamics,
     inward_pass,
     outward_pass,
@@ -46,8 +46,8 @@ def _body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.n
     for link, loads in zip(links, outboard, strict=True):
         pulls = {s: np.concatenate(load) for s, load in loads.items()}
         if link.body.is_flexible:
-            pulls = interface_pushes(link, loads)
-        p, order = link.body.pushes(pulls), link.body.dim.loads
+            pulls = interface_coefficients(link, loads)
+        p, order = link.body.load_coefficients(pulls), link.body.dim.loads
         found.append(np.concatenate([p[order], p[len(order) :]]).T)
     return found
 
@@ -134,5 +134,5 @@ def _loads(
     if loops is not None and dependent is not None:
         forces = inverse_dynamics(rigid, motion, none, none, none)[1]
         here = loops.at(rigid, motion.q, none)
-        pull = here.pulls(here.closing(forces, dependent))
+        pull = here.interface_loads(here.closing(forces, dependent))
     return body_loads(rigid, motion, (none, none, none), pull)

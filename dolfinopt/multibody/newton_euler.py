@@ -213,13 +213,13 @@ def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
     rows = [np.zeros((0, links[0].body.a.shape[1]))]
     for link, outboard in zip(links, loads.outboard, strict=True):
         if link.body.is_flexible:
-            rows.append(link.body.rows(interface_pushes(link, outboard)))
+            rows.append(link.body.rows(interface_coefficients(link, outboard)))
     return np.concatenate(rows).T
 
 
-def interface_pushes(link: Link, outboard: dict[int, Load]) -> dict[int, np.ndarray]:
+def interface_coefficients(link: Link, outboard: dict[int, Load]) -> dict[int, np.ndarray]:
     """Return what works on the displacements of a flexible body's interfaces, by number."""
-    return {s: link.interfaces[s].pushes(load) for s, load in outboard.items()}
+    return {s: link.interfaces[s].load_coefficients(load) for s, load in outboard.items()}
 
 
 def inverse_dynamics(
@@ -237,7 +237,7 @@ def inverse_dynamics(
         coordinates and the motors behind springs (n, R + M), N m of revolute and N of prismatic
         joints.
     """
-    tree: Mechanism = mechanism
+    tree = mechanism
     links = outward_pass(tree, motion, (q, qd, qdd))
     loads = inward_pass(tree, links)
     forces = np.zeros((len(q), tree.num_rigid + len(tree.motor_joints)))

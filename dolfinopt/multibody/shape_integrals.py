@@ -194,15 +194,6 @@ class ShapeIntegrals:
         zero: dict[str, Any] = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
         return replace(whole, **zero)
 
-    def scaled_by(self, scale: str | None) -> list[np.ndarray]:
-        """Return the integrals that `scale` multiplies, see `Integral`; None: the geometry."""
-        return [np.asarray(getattr(self, one.name)) for one in TABLE if one.scale == scale]
-
-    def is_shaped_like(self, other: ShapeIntegrals) -> bool:
-        """Return whether number of coordinates, outboard modes and point are equal."""
-        pairs = zip(self.scaled_by(None), other.scaled_by(None), strict=True)
-        return self.num_modes == other.num_modes and all(np.array_equal(a, b) for a, b in pairs)
-
     @property
     def first_frequency(self) -> float:
         """Lowest natural frequency of the reduced clamped-free body, Hz; inf if rigid."""

@@ -26,7 +26,7 @@ from dolfinopt.multibody.newton_euler import (
     Link,
     Loads,
     carried_load,
-    interface_pushes,
+    interface_coefficients,
     inward_pass,
     outward_pass,
 )
@@ -444,12 +444,12 @@ class _Walk:
         link, columns, loads = self.links[i], self.columns, self.loads.outboard[i]
         body, kept, dim = link.body, columns.kept[i], self.dim
         own = np.empty((self.count, body.constants.num_modes, len(kept), 3))
-        rates = body.rows_by_rates(kept, interface_pushes(link, loads))
+        rates = body.rows_by_rates(kept, interface_coefficients(link, loads))
         own[..., 0], own[..., 1], own[..., 2] = rates
         by_frame, parts = self._widened(body.rows_by_motion.swapaxes(0, 1)), []
         flat = own.reshape(self.count, body.constants.num_modes, -1)
         for s, interface in link.interfaces.items():
-            turning = interface.pushes_by_e(loads[s], kept)
+            turning = interface.coefficients_by_e(loads[s], kept)
             if turning is not None:
                 theta = body.V[interface.places][dim.d :]
                 own[..., 0] += _by_instant(theta.swapaxes(0, 1)) @ _by_instant(turning)

@@ -72,7 +72,7 @@ def test_forces_of_least_norm_are_smooth(tmp_path) -> None:
     here = system.loops.at(system.rigid, desired.q, none)
     dependent = system.drives.dependent
     found = here.closing(forces, dependent)
-    left = forces[:, dependent] - here.work(found)[:, dependent]
+    left = forces[:, dependent] - here.generalised_force(found)[:, dependent]
     assert np.abs(left).max() < 1e-10 * np.abs(forces).max()
     J = here.jacobian[:, :, dependent]
     range_of = np.einsum("nkd,ndj,nj->nk", J, np.linalg.pinv(J), found)

@@ -66,7 +66,7 @@ def test_derivatives_of_every_equation(kind: str) -> None:
     for c, unit in enumerate(np.eye(size)):
         by = derivative(lambda t, unit=unit: at(y + t * unit).gap)
         assert_close(here.jacobian[:, :, c], by, 1e-10, np.abs(here.jacobian).max())
-        by = derivative(lambda t, unit=unit: at(y + t * unit).work(multipliers))
+        by = derivative(lambda t, unit=unit: at(y + t * unit).generalised_force(multipliers))
         assert_close(H[:, :, c], by, 1e-9, np.abs(H).max())
     links, none = mechanism.rigid, np.zeros((4, 0))
 
@@ -81,7 +81,7 @@ def test_derivatives_of_every_equation(kind: str) -> None:
 
             def worth(t: float, k: int = k, name: str = name, x: np.ndarray = change) -> float:
                 there = at(y, changed(mechanism, k, name, t * x))
-                work = np.einsum("nc,nc->n", there.work(multipliers), virtual)
+                work = np.einsum("nc,nc->n", there.generalised_force(multipliers), virtual)
                 return float((weights * there.gap).sum() + work.sum())
 
             assert_close(np.sum(gradient * change), derivative(worth), 1e-9, 10.0)

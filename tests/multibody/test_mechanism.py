@@ -487,7 +487,7 @@ def test_rotation_vector(size):
         (lambda e: SpaceTurning(theta + e, v, a).acceleration, one.acceleration_by_theta),
         (lambda e: SpaceTurning(theta, v + e, a).acceleration, one.acceleration_by_rate),
         (lambda e: SpaceTurning(theta, v, a + e).acceleration, one.J),
-        (lambda e: SpaceTurning(theta + e, v, a).pulled(M), one.by_theta(M, -1.0)),
+        (lambda e: SpaceTurning(theta + e, v, a).jacobian_transposed(M), one.by_theta(M, -1.0)),
     )
     for function, expected in pairs:
         assert np.abs(columns(function) - expected).max() < ROUNDING
