@@ -270,7 +270,7 @@ def test_words_and_completion_need_no_solver(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.serial
 def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     """Nor anything of other commands: statistics, studies, exports."""
-    others = {"plots.design", "plots.curves", "study.studies", "multibody.standard_input"}
+    others = {"plots.design", "plots.curves", "study.studies", "exchange.standard_input"}
     others = {"scipy.stats", *(f"dolfinopt.{name}" for name in others)}
     line = ["optimize", TWO_ARM, "--no-plots", "--out", tmp_path / "out"]
     line += set_keys(*QUICK, "optimizer.max_iterations=1")

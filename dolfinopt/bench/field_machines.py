@@ -16,12 +16,23 @@ from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.multibody.closures import Loops, Tie
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.machine import rigid_spatial_body, spatial_mechanism
-from dolfinopt.multibody.mechanism import GROUND, Drives, Joint, Mechanism, plane_chain
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    plane_body,
+    rigid_bar,
+    rigid_spatial_body,
+)
+from dolfinopt.multibody.tree import (
+    GROUND,
+    Drives,
+    Joint,
+    Mechanism,
+    plane_chain,
+    spatial_mechanism,
+)
 
 # -- the flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices
 #

@@ -19,23 +19,16 @@ from dolfinopt.dynamics.measured import (
 from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, check_path, passive_coordinates, rests, rigid_motion
-from dolfinopt.multibody.inverse_dynamics import largest_change
-from dolfinopt.multibody.machine import build_mechanism, friction_of, loops_of
-from dolfinopt.multibody.mechanism import AppliedForce, Drives, Springs
+from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
+from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tree import AppliedForce, Drives, Springs
 from dolfinopt.paths import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
+from dolfinopt.scene.tables.joints import interface_number, joint_parts
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
-
-
-def soft_joints(scene: Scene) -> dict[int, JointParts]:
-    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
-    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
-    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
-    return dict(sorted(found.items()))
 
 
 def is_machine(scene: Scene) -> bool:
@@ -118,11 +111,9 @@ def _drives(scene: Scene) -> Drives:
     limits = np.full(count, np.inf)
     free, dependent = np.zeros((2, count), dtype=bool)
     dependent[passive_coordinates(scene)] = free[passive_coordinates(scene)] = True
-    rotors, soft = np.zeros(count), soft_joints(scene)
+    soft = soft_joints(scene)
     for k, one in soft.items():
-        rotors[k] = one.rotor
-        if not dependent[k]:
-            free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
+        free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
     for k, rod in enumerate(scene.rods, len(scene.movable)):
         if rod.is_spring:
             free[k], stiffness[k], damping[k] = True, rod.stiffness, rod.damping
@@ -140,7 +131,6 @@ def _drives(scene: Scene) -> Drives:
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
         stiffness=np.array([soft[k].stiffness for k in motors]),
         damping=np.array([soft[k].damping for k in motors]),
-        rotor=rotors[motors],
         friction=friction.of(np.array(motors, dtype=int)),
     )
     table = _table_of_forces(scene)
@@ -154,7 +144,6 @@ def _drives(scene: Scene) -> Drives:
         winding=control is not None and control.feed_forward == "elastic",
         table=None if table is None else Table(table.t, table.values[:, rows]),
         springs=springs,
-        rotors=None if control else rotors[rows],
         friction=friction.of(rows) if friction.acts and not control else None,
     )
 

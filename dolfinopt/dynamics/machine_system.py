@@ -36,12 +36,13 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Drives, Mechanism, repeated
+from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import complement, least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import Drives, Mechanism
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +136,13 @@ class MachineInstants:
             here[:, joints] = self.motors(y)
         return here
 
-    def motor_speeds(self, yd: np.ndarray) -> np.ndarray:
-        """Return those of motors behind springs (n, M), as their joints would have them."""
-        springs = self.machine.drives.springs
-        return self.desired.qd[:, self.machine.drives.free[springs.joints]] + self.motors(yd)
+    def motor_rates(self, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+        """Return speeds and accelerations of motors behind springs, see `RigidMotion.motors`."""
+        joints = self.machine.mechanism.motor_joints
+        rates = np.stack([self.desired.qd[:, joints], self.desired.qdd[:, joints]])
+        if len(self.machine.drives.springs.joints):  # else they are on the desired motion
+            rates += np.stack([self.motors(yd), self.motors(ydd)])
+        return rates
 
     def spring_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return the moments (n, M) with which arms pull on their motors' springs, N m."""
@@ -156,7 +160,8 @@ class MachineInstants:
             actual = desired.copy()
             actual[:, free] += change[:, :R]
             parts.append(actual)
-        return replace(self.desired, q=parts[0], qd=parts[1], qdd=parts[2])
+        q, qd, qdd = parts
+        return replace(self.desired, q=q, qd=qd, qdd=qdd, motors=self.motor_rates(yd, ydd))
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
@@ -178,27 +183,24 @@ class MachineInstants:
 
         Those of free coordinates by their law; of prescribed ones, what moves them as they move.
         """
-        if (every := repeated(len(y))) is not None:
-            return self[every].forces(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
+        every = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
+        forces, motors = np.split(every, [machine.mechanism.num_rigid], axis=1)
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
             forces -= here.work(multipliers)[:, : forces.shape[1]]
-        free, rotors = machine.drives.free, machine.drives.rotors
+        free = machine.drives.free
         forces[:, free] = self.drive_forces(y, yd)
-        if rotors is not None:
-            forces[:, free] += rotors * self.desired.qdd[:, free]
+        if not len(machine.drives.springs.joints):
+            forces[:, machine.mechanism.motor_joints] += motors
         if (friction := machine.drives.friction) is not None:
             forces[:, free] += friction.force(self.desired.qd[:, free])
         return forces
 
     def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return r (n, S); N m of joints, N of the cart, of modes as they are scaled, m."""
-        if (every := repeated(len(y))) is not None:
-            return self[every].residual(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
@@ -207,10 +209,11 @@ class MachineInstants:
         rigid = forces[:, machine.drives.free] - drives
         pulled = self.spring_forces(y, yd)
         rigid[:, springs.joints] += drives[:, springs.joints] + pulled
-        wanted = self.desired.qdd[:, machine.drives.free[springs.joints]]
-        motors = springs.rotor * (wanted + self.motors(ydd)) - pulled - drives[:, springs.joints]
+        motors = -pulled - drives[:, springs.joints]
+        if len(springs.joints):
+            motors += forces[:, machine.mechanism.num_rigid :]
         if springs.friction.acts:
-            motors += springs.friction.force(self.motor_speeds(yd))
+            motors += springs.friction.force(self.motor_rates(yd, ydd)[0])
         out = np.concatenate([rigid, rows, np.zeros_like(multipliers), motors], axis=1)
         if machine.loops is None:
             return out
@@ -231,28 +234,27 @@ class MachineInstants:
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
     ) -> DenseLinearisation:
         """Return its derivative by the coordinates `keep`, or all."""
-        if (every := repeated(len(y))) is not None:
-            return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
-        (_, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
+        (R, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         matrix = np.zeros((count, S, 3, S))
-        free = machine.drives.free
-        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, free)
-        matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
         passing = self.passing(y, yd)
         springs, every = machine.drives.springs, machine.drive_columns
         motors = every[springs.joints]
+        rigid = np.concatenate([machine.drives.free, machine.motor_coordinates])
+        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, rigid).dense()
+        places = np.concatenate([np.arange(R), motors, np.arange(R, moving)])
+        parts = tangent.reshape(count, len(places), 3, len(places))
+        matrix[:, places[:, None, None], np.arange(3)[:, None], places] = parts
         matrix[:, every, 0, every] += passing * machine.drives.stiffness
         matrix[:, every, 1, every] += passing * machine.drives.damping
         for order, value in enumerate((springs.stiffness, springs.damping)):
             for rows, sign in ((springs.joints, 1.0), (motors, -1.0)):
                 matrix[:, rows, order, springs.joints] += sign * value
                 matrix[:, rows, order, motors] -= sign * value
-        matrix[:, motors, 2, motors] += springs.rotor
         if springs.friction.acts:
-            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_speeds(yd))
+            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_rates(yd, ydd)[0])
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
             J = here.jacobian[:, :, machine.columns]  # (n, m, R + N)
@@ -303,6 +305,11 @@ class MachineSystem:
         places, joints = np.arange(self.ends[0]), self.drives.springs.joints
         places[joints] = self.ends[2] + np.arange(len(joints))
         return places
+
+    @cached_property
+    def motor_coordinates(self) -> np.ndarray:
+        """The mechanism's coordinates (M,) of motors behind springs that are controlled."""
+        return self.mechanism.num_rigid + np.arange(len(self.drives.springs.joints))
 
     @property
     def num_coordinates(self) -> int:
@@ -364,15 +371,16 @@ class MachineSystem:
         ahead = np.zeros((len(desired.q), self.ends[0]))
         winding = None
         if self.drives.rigid_feed_forward:
-            ahead += self.feed_forward(desired)
+            forces, motors = feed_forward(self.rigid, desired, self.drives, self.loops)
+            ahead += forces
             springs = self.drives.springs
             if self.drives.winding:
                 winding = np.zeros_like(ahead)
                 winding[:, springs.joints] = ahead[:, springs.joints] / springs.stiffness
-            columns = self.drives.free[springs.joints]
-            ahead[:, springs.joints] += springs.rotor * desired.qdd[:, columns]
+            ahead[:, springs.joints] += motors
             if springs.friction.acts:
-                ahead[:, springs.joints] += springs.friction.force(desired.qd[:, columns])
+                speeds = desired.qd[:, self.drives.free[springs.joints]]
+                ahead[:, springs.joints] += springs.friction.force(speeds)
         if pushes is not None:
             ahead += pushes
         return MachineInstants(self, desired, ahead, winding, self._redundant(desired))
@@ -409,7 +417,7 @@ class MachineSystem:
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.rigid, desired, self.drives, self.loops)
+        return feed_forward(self.rigid, desired, self.drives, self.loops)[0]
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -500,8 +508,9 @@ class MachineSystem:
         motion = instants.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
-        of_forces = np.zeros_like(motion.q)
+        of_forces = np.zeros((len(y), motion.q.shape[1] + len(self.mechanism.motor_joints)))
         of_forces[:, self.drives.free] = of_rigid
+        of_forces[:, self.motor_coordinates] = instants.motors(multipliers)
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
         pushed = -instants.passing(y, yd) * instants.at_drives(multipliers)
         total = self.with_feed_forward(total, instants, pushed)
@@ -526,13 +535,15 @@ class MachineSystem:
         """
         if not self.drives.rigid_feed_forward:
             return total
+        springs = self.drives.springs
+        motors = weights[:, springs.joints]
         if self.drives.winding:
-            springs = self.drives.springs
             turned = self.drives.stiffness[springs.joints] / springs.stiffness
             weights = weights.copy()
             weights[:, springs.joints] *= 1.0 + turned
         desired = instants.desired
         of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.loops, weights)
+        of_forces = np.hstack([of_forces, motors])
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
         return [a + b.padded(a) for a, b in zip(total, rigid, strict=True)]
@@ -642,18 +653,21 @@ def feed_forward(
     desired: RigidMotion,
     drives: Drives,
     loops: Loops | None,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces (n, R) that move the machine with rigid arms on the desired motion.
+
+    And those of motors behind springs (n, M) that move their rotors.
 
     In a closed loop the joints that follow from others have no drive: what they would need, the
     closures give, by multipliers of least norm.
     """
     none = np.zeros((len(desired.q), 0))
-    forces = inverse_dynamics(rigid, desired, none, none, none)[1]
+    every = inverse_dynamics(rigid, desired, none, none, none)[1]
+    forces, motors = np.split(every, [rigid.num_rigid], axis=1)
     if loops is not None:
         here = loops.at(rigid, desired.q, none)
         forces = forces - here.work(here.closing(forces, drives.dependent))
-    return forces[:, drives.free] * drives.driven
+    return forces[:, drives.free] * drives.driven, motors[:, : len(drives.springs.joints)]
 
 
 def feed_forward_weights(

@@ -28,8 +28,7 @@ from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Loops, Tie
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
+from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
     deviation,
     end_effector,
@@ -37,16 +36,13 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.loads import load_coefficients as coefficients_of
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import (
-    SPACE,
-    Rates,
-    ShapeIntegrals,
-    add_integrals,
-)
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.shape_integrals import SPACE, Rates, ShapeIntegrals, add_integrals
+from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.closures import PARTS
@@ -589,11 +585,12 @@ class _Prescribed:
     @cached_property
     def tangent(self) -> Linearisation:
         """By rigid and elastic coordinates."""
-        every = np.arange(self.motion.q.shape[1])
+        mechanism = self.mechanism
+        every = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))
         return linearise(self.mechanism, self.motion, *self.rates, None, every)
 
     def by_all(self, weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives (3, n, 1 + arms + N) by rigid and elastic coordinates."""
+        """Return the derivatives (3, n, R + M + N) by rigid, motors' and elastic coordinates."""
         rows = np.concatenate([weights, np.zeros_like(self.rates[0])], axis=1)
         return np.stack(self.tangent.transposed(rows))
 
@@ -628,8 +625,11 @@ class _Machine:
         instants, (y, yd, _) = self.instants, self.rates
         system = instants.machine
         drives = system.drives
-        given = weights.copy()
+        joints = system.mechanism.motor_joints
+        given = np.hstack([weights, np.zeros((len(weights), len(joints)))])
         given[:, drives.free] = 0.0
+        if not len(drives.springs.joints):
+            given[:, weights.shape[1] :] = weights[:, joints]
         by, bodies = self._of_prescribed(given)
         passed = instants.passing(y, yd) * weights[:, drives.free]
         by[0][:, system.drive_columns] -= passed * drives.stiffness
@@ -642,11 +642,15 @@ class _Machine:
         bodies = self.prescribed.by_bodies(weights)
         if not weights.any():
             return by, bodies
-        _, moving, last = system.ends
-        by[:, :, :moving] = self.prescribed.by_all(weights)[:, :, system.columns]
+        (_, moving, last), rigid = system.ends, system.mechanism.num_rigid
+        every = self.prescribed.by_all(weights)
+        by[:, :, last:] = every[:, :, system.motor_coordinates]
+        every = np.delete(every, np.s_[rigid : weights.shape[1]], axis=2)
+        by[:, :, :moving] = every[:, :, system.columns]
+        weights = weights[:, :rigid]
         if system.loops is None:
             return by, bodies
-        motion, q, rigid = self.prescribed.motion, self.prescribed.rates[0], weights.shape[1]
+        motion, q = self.prescribed.motion, self.prescribed.rates[0]
         here = system.loops.at(system.mechanism, motion.q, q)
         multipliers = self.instants.split(self.rates[2])[2]
         H = here.hessian(multipliers)[:, :rigid, system.columns]

@@ -27,10 +27,11 @@ from dolfinopt.motion.measured import (
     TABLE_CORNERS_LIMIT,
 )
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
+from dolfinopt.multibody.build import loops_of, skeleton
 from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.machine import loops_of, roll_pitch_yaw, skeleton
-from dolfinopt.multibody.mechanism import repeated
 from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.rotations import roll_pitch_yaw
+from dolfinopt.multibody.tree import repeated
 from dolfinopt.paths import (
     TIME,
     Curve,

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.motion.curves import Derivatives
+from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.machine import reach_of
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.tree import Mechanism
 
 
 @dataclass(frozen=True, eq=False)

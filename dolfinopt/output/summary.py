@@ -22,7 +22,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
-from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.trajectory import (
     drive_units,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.disk import read_arrays, write_arrays, write_text
-from dolfinopt.multibody.mechanism import moves
+from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.closures import PARTS
 from dolfinopt.scene.tables.joints import joint_parts

@@ -16,8 +16,8 @@ from matplotlib.tri import Triangulation
 
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.design import boundary, sides
 from dolfinopt.plots.style import (

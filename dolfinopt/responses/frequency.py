@@ -22,7 +22,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.state_space import Poles, damping_ratios, linearised, poles_of
 from dolfinopt.motion.build import rigid_motion
-from dolfinopt.multibody.machine import build_mechanism
+from dolfinopt.multibody.build import build_mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
@@ -39,6 +39,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.joints import joint_parts
 from dolfinopt.scene.tables.objective import NEEDS
 
 if TYPE_CHECKING:
@@ -167,7 +168,11 @@ def _chain(analysis: Analysis) -> Chain:
             angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
         else:
             angles = [angle] * len(bodies)
-        loads = [RigidIntegrals(arm.joint_mass, 0j, arm.joint_inertia) for arm in scene.arms]
+        rotors = [*(one.rotor for one in joint_parts(scene)[1:]), 0.0]  # of the next arm's joint
+        loads = [
+            RigidIntegrals(arm.joint_mass, 0j, arm.joint_inertia + rotor)
+            for arm, rotor in zip(scene.arms, rotors, strict=True)
+        ]
         loads[-1] = loads[-1] + RigidIntegrals(scene.payload.mass, 0j, scene.payload.moment)
         return Chain(bodies, outboard_points, angles, loads, scene.objective.attached)
 

@@ -237,7 +237,7 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
     for i, arm in enumerate(arms if isinstance(arms, list) else []):
         if not isinstance(arm, dict) or not isinstance(arm.get("sid"), str):
             continue
-        from dolfinopt.exchange.sid import read_sid  # NumPy, which other scenes do not need
+        from dolfinopt.scene.sid import read_sid  # NumPy, which other scenes do not need
 
         nodes = read_sid(Path(arm["sid"])).nodes
         if not nodes:

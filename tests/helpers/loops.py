@@ -13,9 +13,9 @@ from runs import by_root
 
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.machine import rigid_spatial_body, roll_pitch_yaw
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.rotations import roll_pitch_yaw
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_spatial_body
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 Tree = dict[str, Any]

@@ -18,8 +18,8 @@ from bodies import (
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
-from dolfinopt.multibody.mechanism import Mechanism
 from dolfinopt.multibody.ranks import complement, least_norm
+from dolfinopt.multibody.tree import Mechanism
 
 pytestmark = pytest.mark.serial
 

@@ -15,9 +15,9 @@ from runs import ROOT
 import dolfinopt as do
 from dolfinopt.multibody.closures import Tie
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.mechanism import Mechanism, plane_chain
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.multibody.tree import Mechanism, plane_chain
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots import animation, curves, design, machine, style

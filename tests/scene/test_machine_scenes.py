@@ -15,7 +15,7 @@ from runs import ROOT, TWO_ARM, refusal, refused, scene
 from scenes import put_at
 
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
-from dolfinopt.multibody.machine import loops_of
+from dolfinopt.multibody.build import loops_of
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -35,6 +35,7 @@ CONTROLLED = [
     ("control.feed_forward=flexible", 'feed_forward = "flexible"', '"rigid" | "elastic"'),
     ("control.feed_forward=elastic", 'feed_forward = "elastic"', "gear_stiffness"),
     ("arms.joint_damping=3", "arms.0.joint_damping", "without arms.joint_stiffness"),
+    ("arms.rotor_inertia=1e-4", "arms.0.rotor_inertia", "gear_ratio"),
     ("arms.gear_damping=3", "arms.0.gear_damping", "without arms.gear_stiffness"),
     ("arms.friction=[-1, 0]", "arms.0.friction", "two numbers >= 0"),
     ("arms.bearing_stiffness=[0, 0, 1e6, 0, 0, 0]", "arms.0.bearing_stiffness", "along z"),
@@ -314,6 +315,8 @@ REFUSED = [
     ((*CLOSURE, "between"), ["rocker", "rocker"], ("closures.0.between", "two arms")),
     (("closures",), [], ("joints.1.passive", "[[closures]]")),
     (("joints", 0, "passive"), True, ("joints.0.passive", "driven")),
+    (("joints", 1, "gear_stiffness"), 1e4, ("joints.1.gear_stiffness", "passive = true")),
+    (("arms", 1, "joint_stiffness"), 1e4, ("arms.1.joint_stiffness", "passive = true")),
     (("motion", "initial_joints"), [0.1], ("motion.initial_joints", "3 numbers")),
     (("objective", "kind"), "eigenfrequency", ("objective.attached", '"none"')),
 ]  # fmt: skip

@@ -737,9 +737,10 @@ def test_volume_is_limited_unless_mass_is(tables, limit):
 
 
 def test_length_of_a_body_from_a_file(tmp_path):
-    from dolfinopt.exchange.sid import write_sid
-    from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
-    from dolfinopt.multibody.standard_input import to_sid
+    from dolfinopt.exchange.in_space import in_space
+    from dolfinopt.exchange.standard_input import to_sid
+    from dolfinopt.multibody.shape_integrals import rigid_bar
+    from dolfinopt.scene.sid import write_sid
 
     write_sid(tmp_path / "bar.sid", to_sid(in_space(rigid_bar(0.8, 0.05, 1.08))))
     data = minimal()

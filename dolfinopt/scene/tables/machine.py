@@ -92,8 +92,9 @@ class Joint(Table):
     )
     gear_ratio: Ratio | None = Field(
         default=None,
-        description="revolutions of the rotor per revolution of the joint, radians per metre of a "
-        "prismatic one; default: arms.gear_ratio of the arm that it holds [-]",
+        description="revolutions of the rotor per revolution of the joint, against what the joint "
+        "sits on; radians per metre of a prismatic one; default: arms.gear_ratio of the arm that "
+        "it holds; stated with rotor_inertia [-]",
     )
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0

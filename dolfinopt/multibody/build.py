@@ -2,115 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Constants
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
-from dolfinopt.multibody.mechanism import (
+from dolfinopt.multibody.rotations import ONE, roll_pitch_yaw
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    rigid_bar,
+    rigid_spatial_body,
+)
+from dolfinopt.multibody.tree import (
     GROUND,
     Friction,
     Joint,
     JointHardware,
     Mechanism,
+    Rotor,
     Site,
     bearing_body,
     plane_chain,
+    spatial_mechanism,
     with_bearings,
 )
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_bar
 from dolfinopt.scene.load import Arm, Scene
 from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
-
-# -- rigid bodies ----------------------------------------------------------------------------
-
-
-def rigid_spatial_body(
-    mass: float,
-    centre: np.ndarray | tuple[float, ...],
-    inertia: np.ndarray | tuple[float, ...],
-    outboard_point: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
-    further_points: np.ndarray | tuple[tuple[float, ...], ...] = (),
-) -> ShapeIntegrals:
-    """Return a spatial body without elastic coordinates.
-
-    Args:
-        mass: kg.
-        centre: (3,) of mass, m.
-        inertia: (6,) xx, yy, zz, xy, xz, yz of the inertia tensor about the centre, as in URDF,
-            kg m2.
-        outboard_point: (3,) of its outboard interface, m.
-        further_points: (i, 3) of others, m.
-    """
-    r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
-    # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
-    second = 0.5 * np.trace(tensor) * ONE - tensor + mass * np.outer(r, r)
-    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
-    return ShapeIntegrals(
-        mass=float(mass),
-        w=(mass * r)[:, None],
-        W=second.reshape(9, 1, 1),
-        K=square,
-        D=square,
-        outboard=np.zeros((6 + 6 * len(further), 0)),
-        outboard_point=np.asarray(outboard_point, dtype=float),
-        K0=np.zeros((0, 0, 0)),
-        K0_outboard=np.zeros((0, 0, 0)),
-        further_points=further,
-    )
-
-
-def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
-    """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = inertia
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
-
-
-# -- rotations in space: axes and angles, URDF's frames; n instants first
-
-ONE: np.ndarray = np.eye(3)
-PERMUTATION = np.cross(ONE[:, None], ONE).transpose(2, 0, 1)  # e_cab
-_NEXT, _OTHER = np.array([1, 2, 0]), np.array([2, 0, 1])
-
-
-def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return u x v (..., 3)."""
-    return u[..., _NEXT] * v[..., _OTHER] - u[..., _OTHER] * v[..., _NEXT]
-
-
-def skew(v: np.ndarray) -> np.ndarray:
-    """Return v~ (..., 3, 3), v~ u = v x u."""
-    out = np.zeros((*v.shape, 3), dtype=v.dtype)
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out
-
-
-def times(A: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return A v (n, 3) of matrices (n, 3, 3), or one (3, 3), and vectors (n, 3)."""
-    return v @ A.T if A.ndim == 2 else np.einsum("nij,nj->ni", A, v)
-
-
-def about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return the rotations (n, 3, 3) about a unit axis (3,) by angles (n,)."""
-    A = skew(axis)
-    # Of a column NumPy takes other instructions, and another last bit, where the end of its stride
-    # touches the memory of the result.
-    angle = np.ascontiguousarray(angle)
-    s, c = np.sin(angle), np.cos(angle)
-    return ONE + s[:, None, None] * A + (1.0 - c)[:, None, None] * (A @ A)
-
-
-def roll_pitch_yaw(rpy: tuple[float, float, float]) -> np.ndarray:
-    """Return the rotation (3, 3) of URDF's fixed-axis roll, pitch, yaw: Rz(y) Ry(p) Rx(r)."""
-    x, y, z = (about(ONE[i], np.array([angle]))[0] for i, angle in enumerate(rpy))
-    R: np.ndarray = z @ y @ x
-    return R
-
 
 # -- A scene's rigid arms, payload and joints -> bodies and joints of a machine in space ---------
 
@@ -148,19 +68,6 @@ RIGID_ARMS = {2: flat_bar, 3: rigid_link}  # by the machine's dimension
 def _tensor(inertia: float | Inertia) -> Inertia:
     """Return xx, yy, zz, xy, xz, yz; a number is the moment about every axis."""
     return inertia if isinstance(inertia, tuple) else (*[inertia] * 3, 0.0, 0.0, 0.0)
-
-
-def spatial_mechanism(
-    bodies: Sequence[ShapeIntegrals],
-    joints: Sequence[Joint],
-    carried: Mapping[Site, ShapeIntegrals],
-    gravity: Sequence[float] | np.ndarray,
-    end: Site,
-) -> Mechanism:
-    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
-    loads = {site: Constants(one) for site, one in carried.items()}
-    down = np.array(gravity, dtype=float)[:, None]
-    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
 
 
 def _spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
@@ -212,7 +119,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     index = {arm.name: k for k, arm in enumerate(scene.arms)}
     coordinates = {joint.name: i for i, joint in enumerate(scene.movable)}
     by_child = {index[joint.child]: joint for joint in scene.joints}
-    joints, parts = [], joint_parts(scene)
+    joints, rotors = [], rotors_of(scene)
     for k in range(len(scene.arms)):
         one = by_child[k]
         parent, interface = GROUND, 0
@@ -229,7 +136,7 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
                 axis=axis / np.linalg.norm(axis),
                 origin=np.array(one.origin, dtype=float),
                 rotation=roll_pitch_yaw(one.rpy),
-                rotor=_rigid_rotor(parts[k]),
+                rotor=rotors[k],
                 interface=interface,
             )
         )
@@ -345,14 +252,25 @@ def _plane_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
         (scene.motion.gravity[0], scene.motion.gravity[1]),
         scene.motion.joint_height,
         hardware=[
-            JointHardware(arm.joint_mass, arm.joint_inertia, _rigid_rotor(parts))
-            for arm, parts in zip(scene.arms, joint_parts(scene), strict=True)
+            JointHardware(arm.joint_mass, arm.joint_inertia, rotor)
+            for arm, rotor in zip(scene.arms, rotors_of(scene), strict=True)
         ],
         cart_mass=scene.motion.cart_mass,
     )
     return _with_parts(mechanism, scene)
 
 
-def _rigid_rotor(parts: JointParts) -> float:
-    """Return the rotor's inertia that moves with the joint: none behind a gear's spring."""
-    return 0.0 if parts.stiffness > 0.0 else parts.rotor
+def soft_joints(scene: Scene) -> dict[int, JointParts]:
+    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
+    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
+    return dict(sorted(found.items()))
+
+
+def rotors_of(scene: Scene) -> list[Rotor | None]:
+    """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
+    motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
+    return [
+        Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
+        for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
+    ]
