@@ -15,7 +15,6 @@ from dolfinopt.dynamics.state_space import (
     Linearised,
     StateSpace,
     free_machine,
-    null_space,
     poles_of,
     state_space,
 )
@@ -80,7 +79,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     every = np.concatenate([np.arange(moving), np.arange(last, system.num_coordinates)])
     dependent = np.flatnonzero(~system.drives.driven) if system.loops else np.zeros(0, dtype=int)
     independent = np.setdiff1d(every, dependent)
-    y, yd, rest = one.rates[0].copy(), one.rates[1].copy(), np.zeros_like(one.rates[0])
+    y, yd, rest = (x * one.rates[k, None] for k, x in enumerate((1.0, 1.0, 0.0)))
     n = len(independent)
     y[0, independent], yd[0, independent] = x[:n], x[n:]
 
@@ -88,7 +87,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
         motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
         here = system.loops.at(system.mechanism, motion.q, q)
         speeds = np.hstack([motion.qd, instants.split(yd)[1]])[0]
-        bias = [speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(system.loops.count)]
+        bias = [speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(len(here.jacobian[0]))]
         return here.jacobian[0][:, system.columns], np.array(bias)
 
     if system.loops is not None:
@@ -103,13 +102,13 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
         yd[0, dependent] = -np.linalg.solve(J[:, dependent], swept)
     # The residual is linear in y''; multipliers stand there, too. What the simulation leaves at
     # the instant itself, forces of free drives above all, is an input that is held.
-    r = instants.residual(y, yd, rest)[0] - instants.residual(*one.rates)[0]
+    r = instants.residual(y, yd, rest)[0] - instants.residual(*one.rates[:, None])[0]
     units = np.eye(system.num_coordinates)
     matrix = np.stack([instants.residual(y, yd, u[None])[0] for u in units], axis=1)
     matrix -= instants.residual(y, yd, rest)[0][:, None]
     if system.loops is not None:
-        (J, bias), ydd = jacobian(y, yd), one.rates[2][0, :moving]
-        J0, bias0 = jacobian(*one.rates[:2])
+        (J, bias), ydd = jacobian(y, yd), one.rates[2, :moving]
+        J0, bias0 = jacobian(*one.rates[:2, None])
         desired = instants.desired.qdd[0, system.drives.free]
         size = len(desired)
         matrix[moving:last, :moving] = J
@@ -161,9 +160,8 @@ def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
     make, t = MACHINES[kind]
     trajectory = make()
     found, one = state_space(trajectory, t), free_machine(trajectory, t)
-    N = null_space(one)[0]
-    independent = [int(np.flatnonzero(column == 1.0)[0]) for column in N.T]
-    x = np.concatenate([one.rates[k][0, independent] for k in (0, 1)])
+    independent = one.independent
+    x = one.rates[:2, independent].ravel()
     n = len(independent)
     # By the coordinates' own masses, so that a step, and what it does, is J^(1/2).
     scale = np.sqrt(np.abs(np.diag(one.M)[independent]))
