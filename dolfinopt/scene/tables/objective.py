@@ -510,13 +510,6 @@ class Constraints(Table):
                 "add the table, or take first_frequency",
                 where,
             )
-        if scene.closure is not None:
-            raise Refusal(
-                "expected another response with [closure]: poles of kinematic loops have no "
-                "gradient; look at them with dolfinopt export DIR --state-space T",
-                where,
-                ("closure", "kind"),
-            )
         instants = self.pole_instants(scene.motion)
         horizon = scene.motion.horizon
         if sorted(set(instants)) != list(instants) or not instants or instants[-1] > horizon:
