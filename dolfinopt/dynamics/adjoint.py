@@ -13,6 +13,8 @@ doi:10.1137/151002769.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from dolfinopt.dynamics.collocation import (
@@ -30,17 +32,9 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
     ADJOINT_CORRECTION_SHARE,
     ADJOINT_CORRECTIONS_LIMIT,
-    HELD_COORDINATES_LIMIT,
     KEPT_MATRICES_BYTES,
 )
-from dolfinopt.dynamics.newton import (
-    NewtonMatrix,
-    factorise,
-    limits_for,
-    next_slow_coordinates,
-    simplified_newton_matrix,
-    windows,
-)
+from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, slow_coordinates
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -60,12 +54,11 @@ class Adjoint:
         method, self._modes = radau_iia(len(solution.nodes)), system.preconditioner()
         self._stages = stages_of(self._modes, method, solution.time_grid)
         z, zd, a = (self._modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
-        self._begin, self._at = (z, zd), (*stage_values(self._stages, z, zd, a), a)
+        self._at = *stage_values(self._stages, z, zd, a), a
         q, qd = stage_values(self._stages, solution.q, solution.qd, solution.a)
-        steps = np.diff(solution.time_grid)[:, None]
-        self._times = (solution.time_grid[:-1, None] + steps * method.c).ravel()
+        self._instants: Any = system.at_stages(solution.time_grid, method.c)
         self._rates = tuple(x.reshape(-1, q.shape[2]) for x in (q, qd, solution.a))
-        self._kept: dict[tuple[bool, bytes], _Factors] = {}
+        self._kept: dict[bytes, _Factors] = {}
 
     def gradient(self, t: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
         """Return dJ/d(constants) of every body through the trajectory's coordinates.
@@ -80,54 +73,41 @@ class Adjoint:
         # Rows in z are T' times those in q: their multipliers turn like coordinates.
         turned = self._modes.from_modes(multipliers).reshape(self._rates[0].shape)
         q, qd, a = self._rates
-        gradient = self.system.body_gradient(self._times, q, qd, a, turned)
+        gradient = self.system.body_gradient(self._instants, q, qd, a, turned)
         by_start = self._modes.gradient_from_modes(first)
         through_start = self.system.start_gradient(self.solution.q[0], by_start)
         return add_gradients(gradient, through_start) if through_start else gradient
 
     def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,)."""
-        # Newton's matrix is not the derivative where coordinates are treated as fast, or tangents
-        # as held over a step: what its answer leaves, by the exact derivative, is answered again
-        # until nothing is left.
-        stages, limits = self._stages, limits_for(self._stages)
-        if stages.preconditioner.guided and len(limits) > 1:
-            slow, _ = next_slow_coordinates(stages, limits, 0, HELD_COORDINATES_LIMIT)
-            if (answer := self._answer(by_a, by_y, slow, True)) is not None:
-                return answer
-        slow, limits = next_slow_coordinates(stages, limits, 0)
-        while (answer := self._answer(by_a, by_y, slow, False)) is None:
-            slow, limits = next_slow_coordinates(stages, limits, len(slow))
+        # Newton's matrix is not the derivative where coordinates are treated as fast: what its
+        # answer leaves, by the exact derivative, is answered again until nothing is left.
+        slow = slow_coordinates(self._stages)
+        while (answer := self._answer(by_a, by_y, slow)) is None:
+            slow = slow_coordinates(self._stages, len(slow))
         return answer
 
     def _answer(
-        self, by_a: np.ndarray, by_y: np.ndarray, slow: np.ndarray, simplified: bool
+        self, by_a: np.ndarray, by_y: np.ndarray, slow: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return what `_backwards` does by one kind of matrix, or None, see `_answered`."""
         multipliers, after = np.empty_like(by_a), np.zeros_like(by_y[0])
-        for part in reversed(windows(self._stages, slow)):
-            factors = self._factorised(part, slow, simplified)
-            found = _answered(*factors, by_a[part], by_y[part], after)
+        for part in reversed(chunks(self._stages, slow)):
+            found = _answered(*self._factorised(part, slow), by_a[part], by_y[part], after)
             if found is None:
                 return None
             multipliers[part], after = found
         return multipliers, after[0]
 
-    def _factorised(self, part: slice, slow: np.ndarray, simplified: bool) -> _Factors:
+    def _factorised(self, part: slice, slow: np.ndarray) -> _Factors:
         """Return Newton's matrix of some steps, and the exact derivative; kept if they are all."""
-        key = (simplified, slow.tobytes())
+        key = slow.tobytes()
         if key in self._kept:
             return self._kept[key]
         window = self._stages.window(part.start, part.stop)
         q, qd, a = (x[part] for x in self._at)
-        if simplified:
-            begin = self._begin[0][part], self._begin[1][part]
-            matrix = simplified_newton_matrix(window, begin, a, slow)
-        else:
-            matrix = factorise(window, q, qd, a, slow)
-        exact = matrix.tangent
-        if simplified or len(matrix.fast):
-            exact = tangent_at(window, q, qd, a)
+        matrix = factorise(window, q, qd, a, slow)
+        exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
         size = matrix.transfer.nbytes + matrix.inverse.nbytes
         if len(window.h) == len(self._stages.h) and size <= KEPT_MATRICES_BYTES:
             self._kept = {key: (matrix, exact)}

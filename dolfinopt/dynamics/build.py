@@ -15,8 +15,8 @@ from dolfinopt.dynamics.measured import (
     KEPT_INSTANTS_LIMIT,
     MOTIONS_KEPT,
     SAME_INSTANT_SHARE,
-    TABLE_BREAKPOINTS_LIMIT,
 )
+from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import largest_change
@@ -108,14 +108,16 @@ def build_system(
     mechanism: Mechanism = family.build(scene, bodies)
     instants = breakpoints(scene, family.curve)
     if scene.forces:
-        mechanism, motion = replace(mechanism, forces=forces_of(scene)), under_forces(motion, scene)
-        instants = with_rows(instants, tables_of_forces(scene), scene.motion.horizon)
+        loads = loads_of(scene)
+        mechanism = replace(mechanism, forces=forces_of(scene))
+        motion = LoadedMotion(motion, loads)
+        tables = [load.table for load in loads if load.table is not None]
+        instants = with_ends(instants, tables, scene.motion.horizon)
     if not is_machine(scene):
         return ElasticSystem(mechanism, motion, instants)
-    if scene.control is not None and scene.control.forces is not None:
-        times = _forces(scene.control.forces, scene.driven)[0]
-        instants = with_rows(instants, [times], scene.motion.horizon)
     drives = _drives(scene)
+    if drives.table is not None:
+        instants = with_ends(instants, [drives.table], scene.motion.horizon)
     loops = _loops(scene, mechanism, motion, drives)
     return MachineSystem(mechanism, motion, instants, drives, *loops)
 
@@ -129,7 +131,7 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
     mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
     if scene.forces:
         mechanism = replace(mechanism, forces=forces_of(scene))
-        motion = under_forces(lambda _: motion, scene)(t)
+        motion = LoadedMotion(lambda _: motion, loads_of(scene))(t)
     if scene.closure is None:
         return largest_change(mechanism, motion)
     drives = _drives(scene)
@@ -213,54 +215,46 @@ def _drives(scene: Scene) -> Drives:
         driven=~dependent[rows],
         rigid_feed_forward=control is not None and control.feed_forward != "none",
         winding=control is not None and control.feed_forward == "elastic",
-        table=None if table is None else lambda t: table(t)[:, rows],
+        table=None if table is None else Table(table.t, table.values[:, rows]),
         springs=springs,
         rotors=None if control else rotors[rows],
         friction=friction.of(rows) if friction.acts and not control else None,
     )
 
 
-def _table_of_forces(scene: Scene) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return the scene's table of forces as a function of time (n, 1 + arms), or None."""
+def _table_of_forces(scene: Scene) -> Table | None:
+    """Return the scene's table of forces of all rigid coordinates, or None."""
     if scene.control is None or scene.control.forces is None:
         return None
-    times, curve = _forces(scene.control.forces, scene.driven)
-    places = np.arange(scene.num_rigid)[scene.driven_columns]
-
-    def forces(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), scene.num_rigid))
-        inside = t <= times[-1]
-        out[np.ix_(inside, places)] = curve(t[inside])
-        return out
-
-    return forces
+    table = _table(scene.control.forces, scene.driven)
+    values = np.zeros((len(table.t), scene.num_rigid))
+    values[:, np.arange(scene.num_rigid)[scene.driven_columns]] = table.values
+    return Table(table.t, values)
 
 
 def check_forces(scene: Scene) -> None:
     """Raise `InputError` when the scene's tables of forces cannot be read, or lack a column."""
     _table_of_forces(scene)
-    tables_of_forces(scene)
+    loads_of(scene)
 
 
-def with_rows(
-    instants: tuple[float, ...], tables: Iterable[np.ndarray], horizon: float
+def with_ends(
+    instants: tuple[float, ...], tables: Iterable[Table], horizon: float
 ) -> tuple[float, ...]:
-    """Return the breakpoints, s, and among them the instants of tables that are not long."""
-    # The slope of their values jumps at every row, and at the last one the value itself.
-    apart, found = SAME_INSTANT_SHARE * horizon, list(instants)
-    for times in tables:
-        rows = times if len(times) <= TABLE_BREAKPOINTS_LIMIT else times[-1:]
-        for t in map(float, rows[(rows > 0.0) & (rows < horizon)]):
-            if min(abs(t - other) for other in found) > apart:
-                found.append(t)
-    return tuple(sorted(found))
+    """Return the breakpoints, s, and among them the ends of tables, beyond which they are zero."""
+    apart, breakpoints = SAME_INSTANT_SHARE * horizon, list(instants)
+    for table in tables:
+        end = float(table.t[-1])
+        if end < horizon and min(abs(end - other) for other in breakpoints) > apart:
+            breakpoints.append(end)
+    return tuple(sorted(breakpoints))
 
 
 # -- forces on interfaces, [[forces]] ------------------------------------------------------------
 
 
 def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
-    """Return where the scene's forces act; their values stand in the motion of `under_forces`."""
+    """Return where the scene's forces act; their values: `loads_of`."""
     names = [arm.name for arm in scene.arms]
     return tuple(
         AppliedForce(
@@ -274,49 +268,29 @@ def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
     )
 
 
-def under_forces(
-    motion: Callable[[np.ndarray], RigidMotion], scene: Scene
-) -> Callable[[np.ndarray], RigidMotion]:
-    """Return the motion with the values of the scene's forces at the same instants."""
-
-    def with_forces(t: np.ndarray) -> RigidMotion:
-        values = [_force_values(force, scene.dimension, t) for force in scene.forces]
-        return replace(motion(t), applied=np.stack(values, axis=1))
-
-    return with_forces
+def loads_of(scene: Scene) -> tuple[LoadHistory, ...]:
+    """Return the scene's forces and moments over time, N and N m."""
+    return tuple(_load(force, scene.dimension) for force in scene.forces)
 
 
-def _force_values(force: Force, dimension: int, t: np.ndarray) -> np.ndarray:
-    """Return force and moment at instants t (n,), (n, 3) or in space (n, 6), N and N m."""
-    static = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
-    values = np.tile(static, (len(t), 1))
-    if force.table is not None:
-        times, curve = _forces(force.table, FORCE_COLUMNS[dimension])
-        inside = t <= times[-1]
-        values[inside] += curve(t[inside])
-    return force.factor * values
+def _load(force: Force, dimension: int) -> LoadHistory:
+    """Return force and moment, (3,) or in space (6,), and the table's."""
+    constant = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
+    if force.table is None:
+        return LoadHistory(force.factor * constant)
+    table = _table(force.table, FORCE_COLUMNS[dimension])
+    return LoadHistory(force.factor * constant, Table(table.t, force.factor * table.values))
 
 
-def tables_of_forces(scene: Scene) -> list[np.ndarray]:
-    """Return the instants (n,) of every table of [[forces]], s."""
-    columns = FORCE_COLUMNS[scene.dimension]
-    files = dict.fromkeys(one.table for one in scene.forces if one.table is not None)
-    return [_forces(file, columns)[0] for file in files]
-
-
-def _forces(file: str, columns: tuple[str, ...]) -> tuple[np.ndarray, Callable[..., np.ndarray]]:
-    """Return the instants of a table of forces (n,), s, and the line through its rows."""
+def _table(file: str, columns: tuple[str, ...]) -> Table:
+    """Return a table of forces, and the instants of its rows."""
     return _read_forces(file, columns, stamp(file))
 
 
 @lru_cache(maxsize=16)
-def _read_forces(
-    file: str, columns: tuple[str, ...], written: int
-) -> tuple[np.ndarray, Callable[..., np.ndarray]]:
-    """Return what `_forces` does; `written` tells versions of the file apart."""
+def _read_forces(file: str, columns: tuple[str, ...], written: int) -> Table:
+    """Return what `_table` does; `written` tells versions of the file apart."""
     table = read_table(file, columns)
     if table.t is None:
         raise InputError(f"{file}: expected a column {TIME} besides {', '.join(columns)}")
-    from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
-
-    return table.t, make_interp_spline(table.t, table.rows, k=1)
+    return Table(table.t, table.rows)

@@ -19,7 +19,8 @@ from dolfinopt.dynamics.measured import (
     MEAN_MASS_INSTANTS,
     PROPORTION_ROUNDING_ERROR,
 )
-from dolfinopt.dynamics.system import Linearisation, State, System, relative_errors
+from dolfinopt.dynamics.system import Linearisation, State, System, relative_error
+from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
 from dolfinopt.multibody.motion import RigidMotion
@@ -78,11 +79,6 @@ class ElasticSystem:
         """Where the elastic coordinates stand among the unknowns."""
         return slice(None)
 
-    @property
-    def runs(self) -> int:
-        """One."""
-        return 1
-
     def initial_state(self) -> State:
         """Return the static equilibrium (1, N) at t = 0: zero unless loads act there.
 
@@ -94,8 +90,8 @@ class ElasticSystem:
     @cached_property
     def _equilibrium(self) -> np.ndarray:
         """That of `initial_state`: every time grid asks for it."""
-        q, found = static_equilibrium(self)
-        if not found.all():
+        q = static_equilibrium(self)
+        if q is None:
             bearings = bool(self.mechanism.bearings)
             raise ConvergenceError(
                 "the mechanism finds no static equilibrium at t = 0: the arms "
@@ -121,12 +117,6 @@ class ElasticSystem:
         squares = np.abs(np.linalg.eigvals(np.linalg.solve(stiffness, mass)))
         return float(np.sqrt(1.0 / squares.max()))
 
-    def prescribed(self, t: np.ndarray) -> np.ndarray:
-        """Return the rigid coordinates' motion and the forces at instants t, see `System`."""
-        motion = self.motion(t)
-        forces = [] if motion.applied is None else [motion.applied.reshape(len(t), -1)]
-        return np.hstack([motion.q, motion.qd, motion.qdd, *forces])
-
     def preconditioner(self: Own) -> Modes[Own]:
         """Return the arms' vibrations; simulation and adjoint ask for the same."""
         return self._modes
@@ -145,7 +135,7 @@ class ElasticSystem:
         rest = np.zeros((1, len(q)))
         tangent = self.at(np.zeros(1)).linearise(q[None], rest, rest).dense()
         multipliers = np.linalg.solve(tangent[0, :, : len(q)].T, -by_q)
-        return self.body_gradient(np.zeros(1), q[None], rest, rest, multipliers[None])
+        return self.body_gradient(self.at(np.zeros(1)), q[None], rest, rest, multipliers[None])
 
     def is_loaded_at_rest(self) -> bool:
         """Return whether anything may load the bodies at t = 0, while they are not deformed."""
@@ -155,10 +145,9 @@ class ElasticSystem:
         """Return mechanism and motion at instants t (n,), s."""
         return ElasticInstants(self.mechanism, self.motion(t))
 
-    def describe(self, q: np.ndarray) -> str:
-        """Say how far the arms' ends turn in a motion q (n, N)."""
-        angle = self.mechanism.rotations(q).max(initial=0.0)
-        return f"the arms' ends turn by {angle:.2g} rad"
+    def at_stages(self, time_grid: np.ndarray, nodes: np.ndarray) -> ElasticInstants:
+        """Return them at the stages of the steps of a grid, see `System.at_stages`."""
+        return ElasticInstants(self.mechanism, motion_at_stages(self.motion, time_grid, nodes))
 
     def deflection(self, q: np.ndarray) -> float:
         """Return the largest deflection of a body in a motion q (n, N), over its length."""
@@ -166,40 +155,38 @@ class ElasticSystem:
 
     def body_gradient(
         self,
-        t: np.ndarray,
+        instants: ElasticInstants,
         q: np.ndarray,
         qd: np.ndarray,
         qdd: np.ndarray,
         multipliers: np.ndarray,
     ) -> list[ShapeIntegrals]:
         """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals."""
-        return body_gradient(self.mechanism, self.motion(t), q, qd, qdd, multipliers)
+        return body_gradient(self.mechanism, instants.motion, q, qd, qdd, multipliers)
 
 
-def static_equilibrium(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """Return q (runs, N) at rest at t = 0 by Newton's method, and where it was found (runs,)."""
-    instants, size = system.at(np.zeros(system.runs)), system.num_coordinates
-    q = rest = np.zeros((system.runs, size))
-    before = np.full(system.runs, np.inf)
-    found, kept = np.zeros((2, system.runs), dtype=bool)
+def static_equilibrium(system: System) -> np.ndarray | None:
+    """Return q (1, N) at rest at t = 0 by Newton's method, or None."""
+    instants, size = system.at(np.zeros(1)), system.num_coordinates
+    q = rest = np.zeros((1, size))
+    before, kept = np.inf, False
     for _ in range(EQUILIBRIUM_ITERATIONS):
         residual = instants.residual(q, rest, rest)
-        found |= ~residual.any(axis=1)  # mostly at once: nothing loads the arms before they move
-        if found.all():
-            break
-        if not kept.all():
-            stiffness = instants.linearise(q, rest, rest).dense()[:, :, :size]
+        if not residual.any():  # mostly at once: nothing loads the arms before they move
+            return q
+        if not kept:
+            stiffness = instants.linearise(q, rest, rest).dense()[0, :, :size]
         try:
-            step = np.linalg.solve(stiffness, -residual[:, :, None])[:, :, 0]
+            step = np.linalg.solve(stiffness, -residual[0])[None]
         except np.linalg.LinAlgError:
-            break
-        q = np.where(found[:, None], q, q + step)
-        size_of_step = relative_errors(system, step[:, None], q[:, None])
-        stalled = (size_of_step <= EQUILIBRIUM_STALLED_ERROR) & (size_of_step >= 0.5 * before)
-        found |= (size_of_step <= EQUILIBRIUM_ROUNDING_ERROR) | stalled
-        kept = found | (size_of_step <= EQUILIBRIUM_KEPT_CONTRACTION * before)
-        before = size_of_step
-    return q, found
+            return None
+        q = q + step
+        length = relative_error(system, step, q)
+        stalled = 0.5 * before <= length <= EQUILIBRIUM_STALLED_ERROR
+        if length <= EQUILIBRIUM_ROUNDING_ERROR or stalled:
+            return q
+        kept, before = length <= EQUILIBRIUM_KEPT_CONTRACTION * before, length
+    return None
 
 
 # -- coordinates in which the elastic residual is nearly uncoupled: each arm's own vibrations ----
@@ -218,21 +205,21 @@ class Modes(Generic[Own]):
         system: in z; every arm's stiffness is the identity there.
         transforms: T (q, q) of every arm.
         inverses: T^-1.
-        frequencies: (1, N) of every coordinate, rad/s, those of an arm descending.
+        frequencies: (N,) of every coordinate, rad/s, those of an arm descending.
     """
 
     system: Own
     transforms: tuple[np.ndarray, ...]
     inverses: tuple[np.ndarray, ...]
     frequencies: np.ndarray
-    definite = guided = True
+    guided = True
 
     @cached_property
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stiffness, damping, mass (1, N) of every coordinate; the mass with all it carries."""
+        """Stiffness, damping, mass (N,) of every coordinate; the mass with all it carries."""
         bodies = self.system.mechanism.bodies
-        k = np.concatenate([np.diag(body.K) for body in bodies])[None]
-        d = np.concatenate([np.diag(body.D) for body in bodies])[None]
+        k = np.concatenate([np.diag(body.K) for body in bodies])
+        d = np.concatenate([np.diag(body.D) for body in bodies])
         return k, d, k / self.frequencies**2
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
@@ -251,14 +238,10 @@ class Modes(Generic[Own]):
         """Return dJ/dq = T^-T dJ/dz (..., N)."""
         return self._each(by_z, [inverse.T for inverse in self.inverses])
 
-    def chosen(self, runs: np.ndarray) -> Modes[Own]:
-        """Return itself: there is one run."""
-        return self
-
     def _each(self, x: np.ndarray, maps: tuple[np.ndarray, ...] | list[np.ndarray]) -> np.ndarray:
-        parts = self.system.mechanism.slices
-        pieces = [x[..., part] @ T.T for part, T in zip(parts, maps, strict=True)]
-        return np.concatenate(pieces, axis=-1)
+        parts, rows = self.system.mechanism.slices, x.reshape(-1, x.shape[-1])
+        pieces = [rows[:, part] @ T.T for part, T in zip(parts, maps, strict=True)]
+        return np.concatenate(pieces, axis=1).reshape(x.shape)
 
 
 def modes_of(system: Own) -> Modes[Own]:
@@ -281,7 +264,7 @@ def modes_of(system: Own) -> Modes[Own]:
         inverses.append(inverse)
         frequencies.append(1.0 / np.sqrt(np.maximum(squares, np.finfo(float).tiny)))
     changed = replace(system, mechanism=replace(mechanism, bodies=tuple(bodies)))
-    every = np.concatenate(frequencies)[None]
+    every = np.concatenate(frequencies)
     return Modes(changed, tuple(transforms), tuple(inverses), every)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.measured import EQUILIBRIUM_ITERATIONS, MACHINE_EQUILIBRIUM_ROUNDING_ERROR
 from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
@@ -284,11 +285,6 @@ class MachineSystem:
         """Where the elastic coordinates stand among the unknowns."""
         return slice(*self.ends[:2])
 
-    @property
-    def runs(self) -> int:
-        """One."""
-        return 1
-
     @cached_property
     def elastic(self) -> ElasticSystem:
         """The same machine, its rigid coordinates on the desired motion exactly."""
@@ -325,8 +321,18 @@ class MachineSystem:
 
     def at(self, t: np.ndarray) -> MachineInstants:
         """Return the machine at instants t (n,), s."""
-        desired = self.motion(t)
-        ahead = np.zeros((len(t), self.ends[0]))
+        table = self.drives.table
+        return self._along(self.motion(t), None if table is None else table(t))
+
+    def at_stages(self, time_grid: np.ndarray, nodes: np.ndarray) -> MachineInstants:
+        """Return it at the stages of the steps of a grid, see `System.at_stages`."""
+        table = self.drives.table
+        pushes = None if table is None else table.at_stages(time_grid, nodes)
+        return self._along(motion_at_stages(self.motion, time_grid, nodes), pushes)
+
+    def _along(self, desired: RigidMotion, pushes: np.ndarray | None) -> MachineInstants:
+        """Return the machine on a desired motion, with a table's forces (n, R) of its drives."""
+        ahead = np.zeros((len(desired.q), self.ends[0]))
         winding = None
         if self.drives.rigid_feed_forward:
             ahead += self.feed_forward(desired)
@@ -338,8 +344,8 @@ class MachineSystem:
             ahead[:, springs.joints] += springs.rotor * desired.qdd[:, columns]
             if springs.friction.acts:
                 ahead[:, springs.joints] += springs.friction.force(desired.qd[:, columns])
-        if self.drives.table is not None:
-            ahead += self.drives.table(t)
+        if pushes is not None:
+            ahead += pushes
         return MachineInstants(self, desired, ahead, winding)
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
@@ -406,7 +412,7 @@ class MachineSystem:
 
     def body_gradient(
         self,
-        t: np.ndarray,
+        instants: MachineInstants,
         y: np.ndarray,
         yd: np.ndarray,
         ydd: np.ndarray,
@@ -415,10 +421,10 @@ class MachineSystem:
         """Return the derivative of sum_n multipliers_n . residual_n by every body's integrals.
 
         Args:
-            t: (n,) instants, s.
+            instants: n of them.
             y, yd, ydd, multipliers: (n, S).
         """
-        instants, moving = self.at(t), self.ends[1]
+        moving = self.ends[1]
         motion = instants.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
@@ -430,7 +436,7 @@ class MachineSystem:
         if self.loops is None:
             return total
         # -J' f . multipliers, by which the frames move in their direction, and the gaps' part.
-        moved = np.zeros((len(t), motion.q.shape[1] + q.shape[1]))
+        moved = np.zeros((len(y), motion.q.shape[1] + q.shape[1]))
         moved[:, self.columns] = multipliers[:, :moving]
         here = self.loops.at(self.mechanism, motion.q, q)
         parts = here.gradient(self.gap_scale * of_gap, ground, -moved)
@@ -472,7 +478,7 @@ class MachineSystem:
         multipliers, some = np.zeros_like(right), self._at_start
         matrix = self._at_rest(tangent)[np.ix_(some, some)]
         multipliers[some] = np.linalg.solve(matrix.T, -right[some])
-        return self.body_gradient(np.zeros(1), y[None], rest, ydd, multipliers[None])
+        return self.body_gradient(self.at(np.zeros(1)), y[None], rest, ydd, multipliers[None])
 
     def _at_rest(self, tangent: np.ndarray) -> np.ndarray:
         """Return the derivative (S, S) by coordinates and multipliers of a tangent (S, 3 S)."""
@@ -497,17 +503,9 @@ class MachineSystem:
         rigid = np.sqrt(squares).max(axis=-1)
         return np.concatenate([rigid[..., None], arms], axis=-1)
 
-    def prescribed(self, t: np.ndarray) -> None:
-        """Return nothing: drives give way, and joints that follow have vibrations of their own."""
-
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration with rigid coordinates held, rad/s."""
         return self.elastic.slowest_frequency()
-
-    def describe(self, y: np.ndarray) -> str:
-        """Say how far the arms' ends turn in a motion y (n, S)."""
-        R, moving, _ = self.ends
-        return self.elastic.describe(y[:, R:moving])
 
     def deflection(self, y: np.ndarray) -> float:
         """Return the largest deflection of an arm in a motion y (n, S), over its length."""
@@ -524,11 +522,11 @@ class MachineSystem:
         arms = self.elastic.preconditioner()
         changed = replace(self, mechanism=arms.system.mechanism)
         (R, moving, _), size = self.ends, self.num_coordinates
-        frequencies = np.zeros((1, size))
-        frequencies[:, R:moving] = arms.frequencies
-        k, d, m = np.ones((1, size)), np.zeros((1, size)), np.ones((1, size))
+        frequencies = np.zeros(size)
+        frequencies[R:moving] = arms.frequencies
+        k, d, m = np.ones(size), np.zeros(size), np.ones(size)
         for each, value in zip((k, d, m), arms.uncoupled, strict=True):
-            each[:, R:moving] = value
+            each[R:moving] = value
         return MachineModes(changed, arms, slice(R, moving), frequencies, (k, d, m))
 
 
@@ -545,7 +543,6 @@ class MachineModes:
     columns: slice
     frequencies: np.ndarray
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
-    definite = False
     guided = True
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
@@ -563,10 +560,6 @@ class MachineModes:
     def gradient_from_modes(self, by_z: np.ndarray) -> np.ndarray:
         """Return dJ/dq (..., S)."""
         return self._with(by_z, self.arms.gradient_from_modes)
-
-    def chosen(self, runs: np.ndarray) -> MachineModes:
-        """Return itself: there is one run."""
-        return self
 
     def _with(self, x: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         out = x.copy()

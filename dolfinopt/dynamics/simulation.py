@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.dynamics import batch, generalized_alpha, radau
+from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.build import build_system, closure_of, desired_motion, rests_of
-from dolfinopt.dynamics.collocation import GivenUp, Solution, response_instants
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
+from dolfinopt.dynamics.march import BEYOND, REMEDY
 from dolfinopt.dynamics.measured import (
-    BATCH_NEWTON_SHARE,
     DEFLECTION_LIMIT,
     DRIVES_CHUNK,
     JOINT_LIMIT_ROUNDING,
     KEPT_MATRICES_BYTES,
 )
-from dolfinopt.dynamics.newton import ONE_RUN
-from dolfinopt.dynamics.radau import BEYOND, REMEDY
+from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.dynamics.system import Linearisation
+from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
@@ -428,85 +428,51 @@ def simulate(
     Raises:
         ConvergenceError: the integrator gave up; the message says what to try.
     """
-    (found,) = simulate_batch([scene], [bodies], profile, [start])
+    (found,) = simulate_all([scene], [bodies], profile, [start])
     if isinstance(found, ConvergenceError):
         raise found
     return found
 
 
-def simulate_batch(
+def simulate_all(
     scenes: Sequence[Scene],
     bodies: Sequence[list[ShapeIntegrals]],
     profile: Profile,
     starts: Sequence[Solution | None] = (),
-    *,
-    differentiated: bool = False,
 ) -> list[Trajectory | ConvergenceError]:
-    """Integrate the same design in many scenes at once, each to its `simulation.tolerance`.
-
-    Scenes may differ in payload, motion, gravity, damping and, by the factors of `body.scaled`, in
-    material; whatever else differs is simulated by itself. The common steps are those of the scene
-    that needs most, so that a trajectory depends on the other scenes within the tolerance, not on
-    their order.
+    """Integrate several scenes, each to its `simulation.tolerance`; those of one motion share it.
 
     Args:
         scenes: any number of them.
         bodies: of each, from the cart outwards.
         profile: counts the simulations.
         starts: solution of a nearby design for each, or None.
-        differentiated: whether gradients are asked of the trajectories: Newton's method then leaves
-            1e-7 instead of 1e-3 of the tolerance, as it does of a single trajectory.
 
     Returns:
         In the scenes' order; of one that fails, or bends by more than `DEFLECTION_LIMIT` of an
         arm's length, its error, see `simulate`.
     """
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
-    problems = _problems(scenes, bodies)
-    found: list[Trajectory | ConvergenceError | None] = [None] * len(scenes)
-    groups: dict[tuple[str, float, int, float], list[int]] = {}
-    for i, scene in enumerate(scenes):
-        options = scene.simulation
-        key = (options.integrator, options.tolerance, options.stages, options.rho_inf)
-        groups.setdefault(key, []).append(i)
-    for (integrator, tolerance, stages, rho_inf), group in groups.items():
-        own, begun = [problems[i] for i in group], [starts[i] for i in group]
-        with profile.phase("simulation"):
-            if integrator == "radau":
-                goal = ONE_RUN.goal if differentiated else BATCH_NEWTON_SHARE
-                solutions = _by_radau(own, tolerance, stages, profile, begun, goal)
-            else:
-                solve, rest = generalized_alpha.integrate, (tolerance, rho_inf, profile)
-                solutions = [batch.attempted(solve, one, *rest) for one in own]
-        for i, one in zip(group, solutions, strict=True):
-            if isinstance(one, ConvergenceError):
-                found[i] = one
-                continue
-            trajectory = _trajectory(problems[i], scenes[i], one)
-            found[i] = _refused(trajectory) or trajectory
-            profile.counts.simulations += 1
-    return [one for one in found if one is not None]
+    results: list[Trajectory | ConvergenceError] = []
+    for problem, scene, start in zip(_problems(scenes, bodies), scenes, starts, strict=True):
+        try:
+            results.append(_simulated(problem, scene, profile, start))
+        except ConvergenceError as error:
+            results.append(error)
+    return results
 
 
-def _by_radau(
-    problems: Sequence[Problem],
-    tolerance: float,
-    stages: int,
-    profile: Profile,
-    starts: Sequence[Solution | None],
-    goal: float,
-) -> list[Solution | ConvergenceError]:
-    """Return the solutions in their order: chains on prescribed motions together, others alone."""
-    alike = {i: one for i, one in enumerate(problems) if isinstance(one, ElasticSystem)}
-    own = {i: one for i, one in alike.items() if one.mechanism.dim.d == 2}
-    together, begun = list(own), [starts[i] for i in own]
-    solved = batch.integrate([*own.values()], tolerance, stages, profile, begun, goal)
-    found = dict(zip(together, solved, strict=True))
-    for i, one in enumerate(problems):
-        if i not in found:
-            options = (tolerance, stages, profile, starts[i])
-            found[i] = batch.attempted(radau.integrate, one, *options)
-    return [found[i] for i in range(len(problems))]
+def _simulated(
+    problem: Problem, scene: Scene, profile: Profile, start: Solution | None
+) -> Trajectory:
+    """Return the motion of a problem, or raise why there is none."""
+    options = scene.simulation
+    with profile.phase("simulation"):
+        solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
+    profile.counts.simulations += 1
+    trajectory = _trajectory(problem, scene, solution)
+    _check_deflections(trajectory)
+    return trajectory
 
 
 def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -> list[Problem]:
@@ -528,16 +494,16 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
     return problems
 
 
-def _refused(trajectory: Trajectory) -> ConvergenceError | None:
-    """Return why a motion is none of flexible arms any more, or None."""
+def _check_deflections(trajectory: Trajectory) -> None:
+    """Raise `GivenUp` where a motion is none of flexible arms any more."""
     arms, deflections = trajectory.scene.arms, trajectory.deflections
     worst = int(np.argmax(deflections)) if len(deflections) else 0
     if not len(deflections) or deflections[worst] <= DEFLECTION_LIMIT:
-        return None
+        return
     name = f"arm {arms[worst].name!r}" if worst < len(arms) else "a link"
-    return GivenUp(
+    raise GivenUp(
         f"{name} deflects by {100.0 * deflections[worst]:.3g} % of its length: {BEYOND}; "
-        f"{REMEDY.replace('them', 'the arm', 1)}"
+        f"{REMEDY.replace('the arms', 'the arm', 1)}"
     )
 
 
@@ -775,10 +741,11 @@ def load_gradient(
     multipliers = np.zeros((len(t), probe.system.num_coordinates))
     for part, by in zip(probe.places, by_coefficients, strict=True):
         multipliers[:, part] = -by
-    tangent = probe.system.at(t).linearise(*at)
+    instants = probe.system.at(t)
+    tangent = instants.linearise(*at)
     by_rates = np.stack(tangent.transposed(multipliers))[:, :, probe.own]
     y, yd, ydd = at
-    wide = probe.system.body_gradient(t, y, yd, ydd, multipliers)
+    wide = probe.system.body_gradient(instants, y, yd, ydd, multipliers)
     parts = [
         by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)

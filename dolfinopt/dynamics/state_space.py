@@ -392,10 +392,10 @@ class Poles:
         change = (along[..., None, :] * offsets).reshape(3, S, -1).transpose(0, 2, 1)
         rows = (left[:, None, :] * shares).reshape(S, -1).T.copy()
         rates = self.one.rates[:, None] + change
-        t = np.repeat(self.one.t, len(rows))
-        tangent = system.at(t).linearise(*rates)
+        instants = system.at(np.repeat(self.one.t, len(rows)))
+        tangent = instants.linearise(*rates)
         by_rates = np.stack([x.sum(axis=0) for x in tangent.transposed(rows)])
-        by_bodies = system.body_gradient(t, *rates, rows)
+        by_bodies = system.body_gradient(instants, *rates, rows)
         if system.loops is not None:
             held = (held[:, :, None, :] * shares).reshape(*held.shape[:2], -1)
             own, parts = self._by_constraints(change, held.transpose(0, 2, 1))

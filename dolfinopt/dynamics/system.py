@@ -69,12 +69,9 @@ class Preconditioner(Protocol):
 
     Attributes:
         system: in z.
-        frequencies: (runs, N) of every coordinate by itself, rad/s; 0 of what must be treated
-            densely.
-        uncoupled: stiffness, damping and mass (runs, N) of every coordinate by itself.
-        definite: whether mass and stiffness are: matrices are then inverted without pivots.
-        guided: whether zero is a guess of the whole motion: then all steps are solved at once,
-            with the simplified Newton matrix.
+        frequencies: (N,) of every coordinate by itself, rad/s; 0 of what must be treated densely.
+        uncoupled: stiffness, damping and mass (N,) of every coordinate by itself.
+        guided: whether zero is a guess of the whole motion: then all steps are solved at once.
     """
 
     @property
@@ -84,8 +81,6 @@ class Preconditioner(Protocol):
     @property
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
     @property
-    def definite(self) -> bool: ...
-    @property
     def guided(self) -> bool: ...
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
@@ -94,32 +89,32 @@ class Preconditioner(Protocol):
     def from_modes(self, z: np.ndarray) -> np.ndarray:
         """Return q (..., N)."""
 
-    def chosen(self, runs: np.ndarray) -> Preconditioner:
-        """Return that of some of the runs, by index."""
-
 
 class System(Protocol):
-    """N coordinates over a horizon; several runs of as many coordinates may be one system.
+    """N coordinates over a horizon.
 
     Attributes:
         num_coordinates: N.
-        runs: equal problems side by side, mostly 1; instants are ordered run after run.
         breakpoints: ascending instants, first 0 and last the horizon, between which the residual
-            is a smooth function of time; steps end there. Of the first run. s.
+            is a smooth function of time but for the rows of tables; steps end there. s.
     """
 
     @property
     def num_coordinates(self) -> int: ...
     @property
-    def runs(self) -> int: ...
-    @property
     def breakpoints(self) -> tuple[float, ...]: ...
 
     def at(self, t: np.ndarray) -> Instants:
-        """Return the system at instants t (runs n,), s."""
+        """Return the system at instants t (n,), s."""
+
+    def at_stages(self, time_grid: np.ndarray, nodes: np.ndarray) -> Instants:
+        """Return it at the nodes (s,) of the steps of a grid (n + 1,), s; see `tables`.
+
+        What tables hold counts there by its moments over the step, so that no row is lost.
+        """
 
     def initial_state(self) -> State:
-        """Return q, qd (runs, N) at t = 0.
+        """Return q, qd (1, N) at t = 0.
 
         Raises:
             ConvergenceError: there is none.
@@ -136,16 +131,6 @@ class System(Protocol):
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration, rad/s: eight steps a period are tried first."""
 
-    def prescribed(self, t: np.ndarray) -> np.ndarray | None:
-        """Return all that makes it move (n, k) at instants t (n,); None: there is more to it.
-
-        Motions and forces as functions of time, which fewer steps may do for: see
-        `radau.integrate`.
-        """
-
-    def describe(self, q: np.ndarray) -> str:
-        """Say how far a motion q (n, N) goes, for a message: "the arms' ends turn by 2 rad"."""
-
     def deflection(self, q: np.ndarray) -> float:
         """Return the largest deflection of a body in a motion q (n, N), over its length."""
 
@@ -154,14 +139,14 @@ class System(Protocol):
 
 
 class Unchanged:
-    """A system in its own coordinates: all of them are treated densely, with pivots."""
+    """A system in its own coordinates: all of them are treated densely, and it is marched."""
 
-    definite = guided = False
+    guided = False
 
     def __init__(self, system: System) -> None:
         """Take the system."""
         self.system = system
-        size = (1, system.num_coordinates)
+        size = system.num_coordinates
         self.frequencies = np.zeros(size)
         self.uncoupled = (np.ones(size), np.zeros(size), np.ones(size))
 
@@ -181,10 +166,6 @@ class Unchanged:
         """Return dJ/dz."""
         return by_z
 
-    def chosen(self, runs: np.ndarray) -> Unchanged:
-        """Return itself: there is one run."""
-        return self
-
 
 class Measured(Protocol):
     """Anything with a system's norm."""
@@ -195,12 +176,12 @@ class Measured(Protocol):
 
 def relative_error(system: Measured, error: np.ndarray, q: np.ndarray) -> float:
     """Return the largest error in time over the largest value, worst group; both (n, N)."""
-    return float(relative_errors(system, error, q))
+    return float((system.norm(error) * inverse_size(system.norm(q))).max(initial=0.0))
 
 
-def relative_errors(system: Measured, error: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return `relative_error` of several runs (...); error and q (..., n, N)."""
-    size = system.norm(q)
-    largest = size.max(axis=-1, keepdims=True)
-    size = np.where(largest == 0.0, 1.0, np.maximum(size, RESTING_GROUP_SHARE * largest))
-    return (system.norm(error) / size).max(axis=-1)
+def inverse_size(size: np.ndarray) -> np.ndarray:
+    """Return what errors of every group are multiplied by to be relative, of its size (groups,)."""
+    largest = size.max(initial=0.0)
+    if largest == 0.0:
+        return np.ones_like(size)
+    return 1.0 / np.maximum(size, RESTING_GROUP_SHARE * largest)

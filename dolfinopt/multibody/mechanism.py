@@ -12,11 +12,11 @@ Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -134,7 +134,7 @@ class Drives:
         rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
         winding: whether motors behind springs are asked to turn ahead of their joints by what the
             springs give under u_ff.
-        table: of instants t (n,), s, forces (n, R) that are added; or None.
+        table: `dynamics.tables.Table` of forces (R) that are added; or None.
         springs: between drives and arms, where a drive is controlled.
         rotors: (R,) inertia of rotors on the desired motion, before springs, which their motors
             move as well, kg m2; or None.
@@ -147,7 +147,7 @@ class Drives:
     limits: np.ndarray
     driven: np.ndarray
     rigid_feed_forward: bool = False
-    table: Callable[[np.ndarray], np.ndarray] | None = None
+    table: Any = None
     springs: Springs = NO_SPRINGS
     rotors: np.ndarray | None = None
     friction: Friction | None = None

@@ -13,8 +13,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import uniform_design
-from dolfinopt.dynamics.collocation import counted
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.measured import (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.collocation import counted
+from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,

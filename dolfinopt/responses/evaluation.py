@@ -15,7 +15,7 @@ import numpy as np
 from dolfinopt.arms.arm import chain_of, stiffening_of
 from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.dynamics.simulation import Trajectory, simulate, simulate_all
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.inverse_dynamics import Stiffening
 from dolfinopt.multibody.shape_integrals import (
@@ -383,29 +383,34 @@ def _simulate(
     starts: Sequence[Sequence[Solution]],
 ) -> list[Trajectory | ConvergenceError]:
     """Simulate scenes, with all their scenarios."""
-    posed: list[Scene] = []
-    begun: list[Solution | None] = []
-    sizes = []
+    nominal, found = chain_of(scenes[0], owned), []
     for scene, start in zip(scenes, starts, strict=True):
         group = [scene, *pose_scenarios(scene)]
-        posed += group
-        begun += [*start, *[None] * (len(group) - len(start))]
-        sizes.append(len(group))
-    nominal = chain_of(scenes[0], owned)
-    bodies = [nominal, *(bodies_in(scenes[0], other, owned) for other in posed[1:])]
-    # Slopes are asked of a single evaluation at most.
-    alone = len(scenes) == 1
-    every = simulate_batch(posed, bodies, profile, begun, differentiated=alone)
-    found: list[Trajectory | ConvergenceError] = []
-    for size in sizes:
-        parts, every = every[:size], every[size:]
-        failed = [one for one in parts if isinstance(one, ConvergenceError)]
-        if failed:
-            found.append(failed[0])
-            continue
-        own, *rest = (one for one in parts if isinstance(one, Trajectory))
-        found.append(replace(own, scenarios=tuple(rest)))
+        bodies = [
+            nominal if one is scenes[0] else bodies_in(scenes[0], one, owned) for one in group
+        ]
+        found.append(_with_scenarios(group, bodies, profile, start))
     return found
+
+
+def _with_scenarios(
+    group: Sequence[Scene],
+    bodies: Sequence[list[ShapeIntegrals]],
+    profile: Profile,
+    starts: Sequence[Solution],
+) -> Trajectory | ConvergenceError:
+    """Simulate a scene and its scenarios, which begin with its motion unless theirs is known."""
+    first, others = starts[0] if starts else None, starts[1:]
+    try:
+        nominal = simulate(group[0], bodies[0], profile, first)
+        guesses = [*others, *[nominal.solution] * (len(group) - 1 - len(others))]
+        scenarios = [
+            simulate(scene, own, profile, guess)
+            for scene, own, guess in zip(group[1:], bodies[1:], guesses, strict=True)
+        ]
+    except ConvergenceError as error:
+        return error
+    return replace(nominal, scenarios=tuple(scenarios))
 
 
 def _motion(trajectory: Trajectory) -> Motion:
@@ -552,7 +557,7 @@ def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> fl
     linear = [[linear_part(body) for body in chain] for chain in bodies]
     largest = 0.0
     pairs = zip(
-        simulate_batch(group, bodies, profile), simulate_batch(group, linear, profile), strict=True
+        simulate_all(group, bodies, profile), simulate_all(group, linear, profile), strict=True
     )
     for stiffened, without in pairs:
         if isinstance(stiffened, ConvergenceError) or isinstance(without, ConvergenceError):

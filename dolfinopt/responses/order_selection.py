@@ -15,7 +15,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
-from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.dynamics.simulation import Trajectory, simulate_all
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
@@ -239,7 +239,7 @@ def _simulate(
     scene, *others = scenes
     bodies = [chain_of(scene, owned), *(bodies_in(scene, other, owned) for other in others)]
     found = []
-    for one in simulate_batch(scenes, bodies, profile):
+    for one in simulate_all(scenes, bodies, profile):
         if isinstance(one, ConvergenceError):
             raise one
         found.append(one)

@@ -33,7 +33,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.disk import make_folder, write_text
-from dolfinopt.dynamics.simulation import Trajectory, simulate_batch
+from dolfinopt.dynamics.simulation import Trajectory, simulate_all
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.state import HistoryRow
@@ -312,9 +312,8 @@ def simulate_samples(
         assert nominal.trajectory is not None
         owned = {k: nominal.trajectory.mechanism.bodies[k] for k in nominal.arms}
         bodies = [bodies_in(nominal.scene, scene, owned) for scene in scenes]
-        # At once: less than half the time of one after the other.
         starts = [nominal.trajectory.solution] * len(scenes)
-        yield from simulate_batch(scenes, bodies, Profile(), starts)
+        yield from simulate_all(scenes, bodies, Profile(), starts)
 
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name

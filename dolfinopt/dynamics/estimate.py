@@ -1,0 +1,176 @@
+"""Error of a collocation solution: what one stage more changes, and what no stage resolves.
+
+The polynomial is put into the method with s + 1 stages on the same steps; Newton's step from there
+is the error to its leading order, propagation included. The same step with nothing propagated is
+every step's own error, from which new steps are chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.dynamics.collocation import (
+    Collocation,
+    Stages,
+    lagrange_derivatives,
+    lagrange_integrals,
+    radau_iia,
+    residual_at,
+    stage_values,
+    stages_of,
+    step_beginnings,
+    step_ends,
+)
+from dolfinopt.dynamics.measured import COMPARED_STEP_COUNTS, STABILITY_ROUNDING_ERROR
+from dolfinopt.dynamics.newton_matrix import chunks, factorise, slow_coordinates
+from dolfinopt.dynamics.system import State, inverse_size
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Error of a solution.
+
+    Attributes:
+        error: largest relative error of the coordinates.
+        steps: (n,) relative error that every step adds.
+        size: (groups,) of the motion, that errors are relative to.
+    """
+
+    error: float
+    steps: np.ndarray
+    size: np.ndarray
+
+
+def estimate(
+    stages: Stages,
+    time_grid: np.ndarray,
+    state: State,
+    a: np.ndarray,
+    size: np.ndarray | None = None,
+) -> Estimate:
+    """Return the error of accelerations a (n, s, N) on the steps of a grid (n + 1,).
+
+    Args:
+        stages: of the steps.
+        time_grid: their ends, s.
+        state: q, qd (1, N) that they begin with.
+        a: what was found.
+        size: (groups,) of a longer motion of which this is a part, or None.
+    """
+    system, method = stages.preconditioner.system, radau_iia(len(stages.method.c) + 1)
+    richer = stages_of(stages.preconditioner, method, time_grid)
+    begin = step_beginnings(stages, state, a)
+    a = lagrange_integrals(stages.method.c, method.c)[0] @ a
+    q, _ = stage_values(richer, *begin, a)
+    every, alone = _corrections(richer, begin, a)
+    reached = system.norm(q.reshape(-1, q.shape[2]))
+    size = reached if size is None else np.maximum(size, reached)
+    scale = inverse_size(size)
+    largest = system.norm(every.reshape(-1, q.shape[2])) * scale
+    return Estimate(float(largest.max()), (system.norm(alone) * scale).max(axis=-1), size)
+
+
+def _corrections(richer: Stages, begin: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return Newton's change of q (n, s + 1, N), over all steps and of each by itself."""
+    # Chunk by chunk: of long horizons the blocks have no room.
+    slow = slow_coordinates(richer)
+    before, every, alone = np.zeros((2, a.shape[2])), np.empty_like(a), np.empty_like(a)
+    for part in chunks(richer, slow):
+        steps, b = richer.window(part.start, part.stop), a[part]
+        q, qd = stage_values(steps, begin[0][part], begin[1][part], b)
+        residual = residual_at(steps, q, qd, b)
+        matrix = factorise(steps, q, qd, b, slow)
+        change, every[part] = matrix.solve(residual, before)
+        _, alone[part] = matrix.solve(residual, before, alone=True)
+        ends = step_ends(steps, (before[:1], before[1:]), change)
+        before = np.stack([x[-1] for x in ends])
+    return every, alone
+
+
+# -- the error of vibrations that steps do not resolve, which one stage more does not see --------
+#
+# Where the prescribed motion sets in, changes its law or ends, loads have breakpoints, and every
+# vibration sets in with an amplitude of its own. Steps much longer than its period damp it out by
+# the method with s stages and with s + 1 alike: the difference of both says nothing about it.
+# Without damping it is there to the end, though. So estimated by the amplitude at each breakpoint,
+# asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
+
+
+def unresolved(stages: Stages, time_grid: np.ndarray, state: State, a: np.ndarray) -> float:
+    """Return the relative error of free vibrations that the steps do not resolve."""
+    preconditioner = stages.preconditioner
+    vibrates = preconditioner.frequencies > 0.0
+    if not vibrates.any():
+        return 0.0  # nothing is known of single coordinates
+    q, qd = stage_values(stages, *step_beginnings(stages, state, a), a)
+    steps = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
+    missed = _free_vibrations(stages, (q, qd, a), state[0][0], steps)
+    return stages.relative(np.where(vibrates, missed, 0.0)[None, None], q)
+
+
+@np.errstate(all="ignore")  # of what has no mass or does not vibrate
+def _free_vibrations(
+    stages: Stages,
+    states: tuple[np.ndarray, np.ndarray, np.ndarray],
+    rest: np.ndarray,
+    breakpoint_steps: np.ndarray,
+) -> np.ndarray:
+    """Return the error of every coordinate's free vibrations (N,), in its units.
+
+    With the load F = m a + d qd + k q that a coordinate feels, and w^2 = k / m, a jump of F, F',
+    F'' excites (F - F'' / w^2) / k and F' / (k w) of cosine and sine.
+
+    Args:
+        stages: of the steps.
+        states: q, qd, a (n, s, N) at the stages.
+        rest: (N,) coordinates before they move.
+        breakpoint_steps: (P,) steps behind which the motion's law changes; the first is 0.
+    """
+    k, d, m = stages.preconditioner.uncoupled
+    jumps = _jumps(stages, states, breakpoint_steps)
+    jumps[0, 0] -= k * rest
+    fastest = 1e30  # rad/s: beyond, squares overflow
+    square = np.minimum(k / m, fastest**2)
+    amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
+    decay = np.minimum(0.5 * (d / m), fastest)
+    rate = -decay + np.sqrt((decay * decay - square).astype(complex))
+    h = stages.h[breakpoint_steps, None]
+    richer = radau_iia(len(stages.method.c) + 1)
+    lost = _lost(richer, rate * h, len(stages.h) - breakpoint_steps)
+    return np.sqrt(np.square(amplitude * lost).sum(axis=0))
+
+
+def _jumps(
+    stages: Stages,
+    states: tuple[np.ndarray, np.ndarray, np.ndarray],
+    breakpoint_steps: np.ndarray,
+) -> np.ndarray:
+    """Return the jumps of F, F', F'' (3, P, N) at breakpoints, from zero at first."""
+    k, d, m = stages.preconditioner.uncoupled
+    ends = lagrange_derivatives(stages.method.c, np.array([0.0, 1.0]))  # (3, 2, s)
+    sides = []
+    for end, steps in zip(
+        ends.swapaxes(0, 1), (breakpoint_steps, breakpoint_steps[1:] - 1), strict=True
+    ):
+        q, qd, a = (x[steps] for x in states)
+        load = m * a + d * qd + k * q
+        power = stages.h[steps, None] ** -np.arange(3.0)[:, None, None]
+        sides.append(np.einsum("ij,pjk->ipk", end, load) * power)
+    after, before = sides
+    after[:, 1:] -= before
+    return after
+
+
+def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the largest |exp(j z) - R(z)^j| of free vibrations, j steps on."""
+    # R(z) = 1 + z b' (1 - z A)^-1 1 is the method's stability function, z (P, N) are eigenvalues
+    # times step.
+    values, X = np.linalg.eig(method.A)
+    weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
+    R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)
+    j = np.unique(np.geomspace(1.0, steps.max(), COMPARED_STEP_COUNTS).round())
+    apart = np.abs(np.exp(z[..., None] * j) - R[..., None] ** j)
+    seen = (j <= steps[:, None, None]) & (apart > STABILITY_ROUNDING_ERROR * j)
+    return np.where(seen, apart, 0.0).max(axis=-1)

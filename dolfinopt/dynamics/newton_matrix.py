@@ -1,0 +1,304 @@
+"""Newton's matrix over a run of steps: dense in the slow coordinates, diagonal in the fast ones.
+
+In modal coordinates a coordinate whose vibration is much faster than the steps follows its loads
+almost quasi-statically: what the rest of its row holds, mass times acceleration, is small beside
+the stiffness. Newton's matrix keeps of its row the diagonal and what the slow coordinates do to it;
+the slow rows keep all of their slow columns,
+    [ P_ss   0   ]
+    [ J_fs  p_ff ],
+each of them block lower bidiagonal over the steps. The residual itself stays exact, so that the
+matrix decides about the number of iterations alone; with every coordinate slow it is exact.
+Without J_fs, which costs a tenth of an iteration, it takes two to three times as many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.blas import dtbsv
+
+from dolfinopt.dynamics.collocation import (
+    Stages,
+    end_gain,
+    stage_values,
+    tangent_at,
+    vector_jacobian_product,
+)
+from dolfinopt.dynamics.measured import DENSE_COORDINATES, MATRIX_BYTES, SLOW_ANGLES
+from dolfinopt.dynamics.system import Linearisation
+
+
+def slow_coordinates(stages: Stages, more_than: int = 0) -> np.ndarray:
+    """Return the first set of more than so many slow coordinates, ascending.
+
+    All of few coordinates, or where no vibrations are known; else those up to an angle w h of
+    `SLOW_ANGLES` in the median step, and the slowest one always.
+    """
+    angles = stages.angles
+    if len(angles) > DENSE_COORDINATES and stages.preconditioner.guided:
+        for limit in SLOW_ANGLES:
+            slow = np.flatnonzero(angles <= max(limit, angles.min()))
+            if len(slow) > more_than:
+                return slow
+    return np.arange(len(angles))
+
+
+def has_room(stages: Stages, slow: np.ndarray) -> bool:
+    """Return whether the matrix of all steps fits in `MATRIX_BYTES`."""
+    return len(chunks(stages, slow)) == 1
+
+
+def chunks(stages: Stages, slow: np.ndarray) -> list[slice]:
+    """Return runs of steps whose matrices fit in `MATRIX_BYTES`: mostly one."""
+    s, count = len(stages.method.c), len(stages.h)
+    step = 8 * (s * s + 2 * s + 8) * max(len(slow), 1) ** 2
+    length = max(1, int(MATRIX_BYTES / step))
+    return [slice(i, min(i + length, count)) for i in range(0, count, length)]
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonMatrix:
+    """Newton's matrix at some iterate, ready to be solved with.
+
+    Attributes:
+        stages: n steps.
+        tangent: of all rows by the slow coordinates at the stages.
+        slow, fast: ascending coordinates (S,), (F,).
+        inverse: (n, s S, s S) of the slow blocks.
+        answer: (n, s, S, 2 S) change of their a by their state at the step's beginning.
+        transfer: (n, 2 S, 2 S) change of that state over a step by that before it.
+        band: the same for `bidiagonal_solve`.
+        fast_inverse: (s, s, n, F).
+        fast_loads: (2, n, s, F) change of the fast rows by their state at the beginning.
+        fast_transfer: (n, 2, 2, F).
+        fast_band: the same for `bidiagonal_solve`, coordinate after coordinate.
+    """
+
+    stages: Stages
+    tangent: Linearisation
+    slow: np.ndarray
+    fast: np.ndarray
+    inverse: np.ndarray
+    answer: np.ndarray
+    transfer: np.ndarray
+    band: np.ndarray
+    fast_inverse: np.ndarray
+    fast_loads: np.ndarray
+    fast_transfer: np.ndarray
+    fast_band: np.ndarray
+
+    def solve(
+        self, residual: np.ndarray, before: np.ndarray, alone: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the change of a that takes `residual` away, and that of q, both (n, s, N).
+
+        Args:
+            residual: (n, s, N).
+            before: (2, N) change of q, qd at the beginning of the first step.
+            alone: every step by itself, with no change at its beginning.
+        """
+        step, shift = np.empty_like(residual), np.empty_like(residual)
+        slow = self._solve_slow(residual[:, :, self.slow], before[:, self.slow], alone)
+        step[:, :, self.slow], shift[:, :, self.slow] = slow[0], slow[1]
+        if len(self.fast):
+            a, q, qd = (x.reshape(-1, len(self.slow)) for x in slow)
+            change = self.tangent.times(q, qd, a, self.fast)
+            left = residual[:, :, self.fast] + change.reshape(*residual.shape[:2], -1)
+            step[:, :, self.fast], shift[:, :, self.fast] = self._solve_fast(
+                left, before[:, self.fast], alone
+            )
+        return step, shift
+
+    def _solve_slow(
+        self, residual: np.ndarray, before: np.ndarray, alone: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the changes of a, q, qd (n, s, S)."""
+        count, s, size = residual.shape
+        forced = -(self.inverse @ residual.reshape(count, s * size, 1)).reshape(residual.shape)
+        y = np.zeros((count, 2 * size))
+        if not alone:
+            y[0] = before.ravel()
+            y[1:] = end_gain(self.stages, forced[..., None])[:-1, :, 0]
+            y = bidiagonal_solve(self.band, y)
+        answer = self.answer.reshape(count, s * size, -1)
+        step = forced + (answer @ y[:, :, None]).reshape(residual.shape)
+        return step, *stage_values(self.stages, y[:, :size], y[:, size:], step)
+
+    def _solve_fast(
+        self, residual: np.ndarray, before: np.ndarray, alone: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the changes of a and q (n, s, F)."""
+        forced = -_diagonal(self.fast_inverse, residual)
+        count, _, size = residual.shape
+        y = np.zeros((count, 2, size))
+        if not alone:
+            y[0] = before
+            y[1:] = end_gain(self.stages, forced[..., None])[:-1].reshape(-1, 2, size)
+            y = bidiagonal_solve(self.fast_band, _in_turn(y))
+            y = y.reshape(size, count, 2).transpose(1, 2, 0)
+        loads = y[:, None, 0] * self.fast_loads[0] + y[:, None, 1] * self.fast_loads[1]
+        step = forced - _diagonal(self.fast_inverse, loads)
+        return step, stage_values(self.stages, y[:, 0], y[:, 1], step)[0]
+
+    def solve_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return multipliers (n, s, N): J + sum multipliers . residual, by this matrix, rests.
+
+        Args:
+            by_a: (n, s, N) gradient of J by the accelerations.
+            by_y: (n, 2, N) by the states (q, qd) at the steps' beginnings.
+            after: (2, N) by the state at the end of the last.
+        """
+        multipliers = np.zeros_like(by_a)
+        by_a_s, by_y_s = by_a[:, :, self.slow], by_y[:, :, self.slow]
+        if len(self.fast):
+            multipliers[:, :, self.fast] = self._fast_transposed(
+                by_a[:, :, self.fast], by_y[:, :, self.fast], after[:, self.fast]
+            )
+            shape = (*by_a.shape[:2], len(self.slow))
+            slow = self.tangent.transposed(multipliers.reshape(-1, by_a.shape[2]))
+            more_a, more_y = vector_jacobian_product(self.stages, *(x.reshape(shape) for x in slow))
+            by_a_s, by_y_s = by_a_s + more_a, by_y_s + more_y
+        multipliers[:, :, self.slow] = self._slow_transposed(by_a_s, by_y_s, after[:, self.slow])
+        return multipliers
+
+    def _slow_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        count, s, size = by_a.shape
+        # dJ by the state before a step if the accelerations answer it: y -> a = answer y.
+        answer = self.answer.reshape(count, s * size, -1)
+        flat = by_a.reshape(count, -1, 1)
+        direct = (by_y.reshape(count, -1, 1) + answer.swapaxes(1, 2) @ flat)[:, :, 0]
+        direct[-1] += after.ravel() @ self.transfer[-1]
+        p = np.concatenate([bidiagonal_solve(self.band, direct, 1)[1:], after.reshape(1, -1)])
+        flat = flat + _end_gradient(self.stages, p).reshape(flat.shape)
+        return -(self.inverse.swapaxes(1, 2) @ flat).reshape(by_a.shape)
+
+    def _fast_transposed(self, by_a: np.ndarray, by_y: np.ndarray, after: np.ndarray) -> np.ndarray:
+        inverse = self.fast_inverse.swapaxes(0, 1)
+        answered = _diagonal(inverse, by_a)
+        direct = by_y - np.einsum("injk,njk->nik", self.fast_loads, answered)
+        direct[-1] += np.einsum("ik,ijk->jk", after, self.fast_transfer[-1])
+        count, _, size = direct.shape
+        p = bidiagonal_solve(self.fast_band, _in_turn(direct), 1).reshape(size, count, 2)
+        p = np.concatenate([p.transpose(1, 2, 0)[1:], after[None]])
+        return -_diagonal(inverse, by_a + _end_gradient(self.stages, p.reshape(len(p), -1)))
+
+
+def factorise(
+    stages: Stages, q: np.ndarray, qd: np.ndarray, a: np.ndarray, slow: np.ndarray
+) -> NewtonMatrix:
+    """Return Newton's matrix at an iterate, inverted; nan where a block is singular.
+
+    Args:
+        stages: n steps.
+        q, qd, a: (n, s, N) at their stages.
+        slow: coordinates that are treated densely.
+    """
+    return matrix_of(stages, tangent_at(stages, q, qd, a, slow), slow)
+
+
+def matrix_of(stages: Stages, tangent: Linearisation, slow: np.ndarray) -> NewtonMatrix:
+    """Return Newton's matrix of a tangent by the slow coordinates at the n s stages."""
+    fast = np.setdiff1d(np.arange(stages.preconditioner.system.num_coordinates), slow)
+    block, beginning = _blocks(stages, tangent.dense())
+    try:
+        inverse = np.linalg.inv(block)
+    except np.linalg.LinAlgError:
+        inverse = np.full_like(block, np.nan)  # refused by whoever asked
+    size = len(slow)
+    answer = -(inverse @ beginning).reshape(len(block), -1, size, 2 * size)
+    transfer = end_gain(stages, answer) + np.eye(2 * size)
+    diagonal = np.arange(size)
+    transfer[:, diagonal, size + diagonal] += stages.h[:, None]
+    dense = (inverse, answer, transfer, band_of(transfer))
+    single = _diagonal_matrix(stages, *(x[fast] for x in stages.preconditioner.uncoupled))
+    return NewtonMatrix(stages, tangent, slow, fast, *dense, *single)
+
+
+def _blocks(stages: Stages, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps' residuals by accelerations (n, s S, s S) and first state (n, s S, 2 S)."""
+    method, size = stages.method, jacobian.shape[1]
+    count, s = len(stages.h), len(method.c)
+    by_q, by_v, by_a = np.split(jacobian.reshape(count, s, size, 3 * size), 3, axis=3)
+    h = stages.h[:, None, None]
+    by_stage = np.stack([h * method.A, h * h * method.A2])[:, :, :, None, :, None]
+    block = by_stage[0] * by_v[:, :, :, None]
+    block += by_stage[1] * by_q[:, :, :, None]
+    every = np.arange(s)
+    block[:, every, :, every] += by_a.swapaxes(0, 1)
+    late = by_v + h[..., None] * method.c[:, None, None] * by_q
+    beginning = np.concatenate([by_q, late], axis=3)
+    return block.reshape(count, s * size, -1), beginning.reshape(count, s * size, -1)
+
+
+def _diagonal_matrix(
+    stages: Stages, k: np.ndarray, d: np.ndarray, m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return inverse, loads, transfer and its band of the fast coordinates, one by one.
+
+    The rows m a + d qd + k q of all stages, m + h A d + h^2 A^2 k, are diagonal in the
+    eigenvectors of A: no matrix is inverted.
+
+    Args:
+        stages: n steps.
+        k, d, m: (F,).
+    """
+    method, h = stages.method, stages.h[:, None]
+    values, X = np.linalg.eig(method.A)
+    s, count = len(values), len(h)
+    ha = h * values[:, None, None]  # (s, n, 1)
+    parts = (X[:, None] * np.linalg.inv(X).T).reshape(s * s, s)
+    each = 1.0 / (m + ha * (d + ha * k))
+    inverse = (parts @ each.reshape(s, -1)).real.reshape(s, s, count, -1)
+    loads = np.empty((2, count, s, len(k)))
+    loads[0] = k
+    loads[1] = d + h[:, :, None] * method.c[:, None] * k
+    transfer = np.empty((count, 2, 2, len(k)))
+    for i in range(2):
+        answer = -_diagonal(inverse, loads[i])[..., None]
+        transfer[:, :, i] = end_gain(stages, answer)[:, :, 0].reshape(count, 2, -1)
+        transfer[:, i, i] += 1.0
+    transfer[:, 0, 1] += h
+    chain = transfer.transpose(3, 0, 1, 2)
+    return inverse, loads, transfer, band_of(chain.reshape(-1, 2, 2), count)
+
+
+def band_of(transfer: np.ndarray, length: int | None = None) -> np.ndarray:
+    """Return the matrix of y_n+1 - T_n y_n, transfer T (n, m, m), as BLAS wants its lower bands.
+
+    The end of a run of `length` steps is not the beginning of the next.
+    """
+    count, m, _ = transfer.shape
+    length = length or count
+    bands = np.zeros((count, m, 2 * m))  # of column j: rows j to j + 2 m - 1
+    i, j = np.indices((m, m))
+    bands[:, j, m + i - j] = -transfer
+    bands[length - 1 :: length] = 0.0
+    return bands.reshape(count * m, 2 * m).T
+
+
+def bidiagonal_solve(band: np.ndarray, y: np.ndarray, transposed: int = 0) -> np.ndarray:
+    """Return y_n+1 = T_n y_n + gain_n (n, m) from y_0 and the gains (n, m), or the transposed.
+
+    One call of BLAS instead of a loop over the steps.
+    """
+    k = len(band) - 1
+    return dtbsv(k, band, y.ravel(), lower=1, trans=transposed, diag=1).reshape(y.shape)
+
+
+def _in_turn(y: np.ndarray) -> np.ndarray:
+    """Return states (n, 2, F) of uncoupled coordinates one after the other, (F n, 2)."""
+    return y.transpose(2, 0, 1).reshape(-1, 2)
+
+
+def _diagonal(matrices: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return, coordinate by coordinate, the products (n, s, F) of matrices (s, s, n, F)."""
+    return np.einsum("ijnk,njk->nik", matrices, x)
+
+
+def _end_gradient(stages: Stages, p: np.ndarray) -> np.ndarray:
+    """Return the gradient by a (n, s, S) from that p (n, 2 S) by the states after each step."""
+    h = stages.h[:, None, None]
+    by_q, by_v = np.split(p[:, None], 2, axis=2)
+    method = stages.method
+    return h * h * method.A2[-1][:, None] * by_q + h * method.A[-1][:, None] * by_v
