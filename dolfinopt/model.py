@@ -357,6 +357,7 @@ class Model:
         if kind not in (None, *get_args(GradientKind)):
             raise InputError(f"kind {kind!r}: expected one of {', '.join(get_args(GradientKind))}")
         scene = self.scene
+        scene.check_designed()
         if kind is not None:
             objective = scene.objective.model_copy(update={"gradient": kind})
             scene = scene.model_copy(update={"objective": objective})
@@ -475,6 +476,7 @@ class Model:
         from dolfinopt.part.folder import file_names, write_parts
         from dolfinopt.part.part import Curves, make_parts, mesh_parts
 
+        self.scene.check_designed()
         out = None if folder is None else Path(folder)
         if out is not None:
             on_root(self._world, check_sources, out, file_names(self.scene), self.scene)

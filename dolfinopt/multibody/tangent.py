@@ -110,7 +110,7 @@ class Tangent:
             rows = jacobian[:, body.columns]
             for part in body.parts:
                 part.write(body.kept, rows)
-        found = jacobian.reshape(count, every // 3, -1, 3).swapaxes(2, 3)
+        found = jacobian.reshape(count, every // 3, every // 3, 3).swapaxes(2, 3)
         return found.reshape(jacobian.shape)
 
     def times(
