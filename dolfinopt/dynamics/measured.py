@@ -78,6 +78,8 @@ MACHINE_EQUILIBRIUM_ROUNDING_ERROR = 1e-13  # the same of machines, beside the c
 # A relative step below it that is not half of the one before is rounding of an ill-conditioned
 # stiffness.
 EQUILIBRIUM_STALLED_ERROR = 1e-8
+# rad, or lengths over the reach, of free coordinates: a thousand times their own rounding.
+DEVIATION_ROUNDING = 1e-12
 IDENTITY_ROUNDING_ERROR = 1e-9  # of T'KT that is still taken for the identity
 PROPORTION_ROUNDING_ERROR = 1e-12  # relative, of integrals that are a factor times others
 MEAN_MASS_INSTANTS = 3  # whose mass is averaged: 1 to 9 cost the same iterations

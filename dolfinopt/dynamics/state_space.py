@@ -121,8 +121,9 @@ class Linearised:
     @cached_property
     def time_step(self) -> float:
         """Time in which the motion goes as far as differences need, s."""
-        speed, rate = self.size(self.rates[1:].T)
-        return POLE_STEP / max(speed + np.sqrt(rate), POLE_STEP)
+        rigid = self.system.mechanism.num_rigid
+        speed, rate = self._size(self.motion[1:, :rigid].T, self.motion[1:, rigid:].T)
+        return float(POLE_STEP / max(speed + np.sqrt(rate), POLE_STEP))
 
     @cached_property
     def to_rates(self) -> tuple[np.ndarray, np.ndarray]:
@@ -214,11 +215,14 @@ class Linearised:
     def size(self, displaced: np.ndarray) -> np.ndarray:
         """Return how far columns of displacements (S, k) move or turn frames, m or rad."""
         R, moving, last = self.system.ends
+        rigid = np.concatenate([displaced[:R], displaced[last:]])
+        return self._size(rigid, displaced[R:moving])
+
+    def _size(self, rigid: np.ndarray, elastic: np.ndarray) -> np.ndarray:
         mechanism = self.system.mechanism
-        parts = [displaced[:R], displaced[last:]]
-        for body, part in zip(mechanism.bodies, mechanism.slices, strict=True):
-            parts.append(body.outboard @ displaced[R:moving][part])
-        return np.abs(np.concatenate(parts)).max(axis=0, initial=0.0)
+        parts = zip(mechanism.bodies, mechanism.slices, strict=True)
+        moved = [rigid, *(body.outboard @ elastic[part] for body, part in parts)]
+        return np.abs(np.concatenate(moved)).max(axis=0, initial=0.0)
 
 
 def linearised(system: MachineSystem, t: float, rates: tuple[np.ndarray, ...]) -> Linearised:

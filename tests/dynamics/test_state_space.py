@@ -18,7 +18,7 @@ from dolfinopt.dynamics.state_space import (
     poles_of,
     state_space,
 )
-from dolfinopt.scene.load import scene_from_dict
+from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
 MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
@@ -209,6 +209,98 @@ def test_least_damping_follows_the_control() -> None:
         assert (result.evaluation.constraints[-1] <= 0.0) == (measured >= 0.05)
         ratios.append(measured)
     assert ratios[1] > 1.2 * ratios[0]
+
+
+# -- closed loops of rigid arms, linearised by hand ------------------------------------------------
+
+
+def of_second_order(M: np.ndarray, D: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return the poles (2 n,) of M z'' + D z' + K z = 0, sorted."""
+    n = len(M)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
+    return np.sort_complex(np.linalg.eigvals(A))
+
+
+def bar(name: str, length: float) -> dict:
+    """Return a rigid arm in space that weighs nothing."""
+    return {"name": name, "rigid": True, "length": length, "mass": 0.0, "inertia": [0.0] * 6}
+
+
+def parallelogram(folder: Path, **tables) -> Scene:
+    """Return four bars on two motors about one axis that carry a payload, controlled.
+
+    Its closure is a pin about z: two of its five equations keep the bars together, those across
+    the plane are redundant.
+    """
+    (folder / "turn.csv").write_text("t,first,second\n0,2.0,0.6\n0.3,1.2,1.0\n")
+    chain = (("first", "ground", "a"), ("elbow", "a", "ab"),
+             ("second", "ground", "b"), ("wrist", "b", "ba"))  # fmt: skip
+    joints = [
+        {"name": name, "type": "revolute", "parent": parent, "child": child, "axis": [0, 0, 1],
+         "passive": name in ("elbow", "wrist")}
+        for name, parent, child in chain
+    ]  # fmt: skip
+    tree = {
+        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.3, "density": DENSITY},
+        "arms": [bar("a", 0.3), bar("ab", 0.4), bar("b", 0.4), bar("ba", 0.3)],
+        "joints": joints,
+        "closures": [{"name": "pin", "kind": "pin", "between": ["ba", "ab"], "axis": [0, 0, 1]}],
+        "motion": {"path": "joints", "file": "turn.csv", "horizon": 0.4, "gravity": [0, 0, -9.81],
+                   "initial_joints": [2.0, -1.4, 0.6, 1.4]},
+        "payload": {"arm": "ab", "mass": 0.5},
+        "control": {"stiffness": [500.0, 400.0], "damping": [5.0, 4.0]},
+    }  # fmt: skip
+    return scene_from_dict(with_keys(tree, tables), str(folder / "parallelogram.toml"))
+
+
+def test_poles_of_a_loop_in_space(tmp_path) -> None:
+    """Two coordinates, in motion: T = m |a e(alpha) + b e(beta)|'^2 / 2; the response is theirs."""
+    limits = {"damping_ratio": 0.1, "poles_at": [0.0, 0.1, 0.2]}
+    result = do.Model(parallelogram(tmp_path, constraints=limits)).simulate()
+    trajectory, ratios = result.trajectory, []
+    m, a, b = 0.5, 0.3, 0.4
+    for t in limits["poles_at"]:
+        motion = trajectory.at(np.array([t])).motion
+        (q, second), (w, v), (wd, vd) = (x[0, [0, 2]] for x in (motion.q, motion.qd, motion.qdd))
+        c, s = np.cos(q - second), np.sin(q - second)
+        M = m * np.array([[a * a, a * b * c], [a * b * c, b * b]])
+        D = np.diag([5.0, 4.0]) + 2.0 * m * a * b * s * np.array([[0.0, v], [-w, 0.0]])
+        turned = m * a * b * np.array([[c * v * v - s * vd], [-c * w * w - s * wd]])
+        exact = of_second_order(M, D, np.diag([500.0, 400.0]) + turned * [1.0, -1.0])
+        found = np.sort_complex(state_space(trajectory, t).poles)
+        assert np.abs(found - exact).max() < 1e-8 * np.abs(exact).max()
+        ratios.append((-exact.real / np.abs(exact)).min())
+    assert result.evaluation.values_of("damping_ratio")[0] == pytest.approx(min(ratios), rel=1e-8)
+
+
+def test_poles_of_a_loop_in_the_plane() -> None:
+    """A slider-crank in motion: (J + m x'^2) of its angle, with the slider's place x."""
+    J, m, r, rod = 0.01, 0.5, 0.15, 0.3
+    tree = loop_tree(control={"stiffness": [2e3], "damping": [20.0]}, payload={"mass": m})
+    tree["arms"] = [
+        {**tree["arms"][0], "inertia": J},
+        {**tree["arms"][1], "rigid": True, "mass": 0.0, "inertia": 0.0},
+    ]
+    trajectory = trajectory_of(scene_from_dict(tree))
+    motion = trajectory.at(np.array([0.03])).motion
+    angle, speed, rate = (float(x[0, 1]) for x in (motion.q, motion.qd, motion.qdd))
+
+    def inertia(z: np.ndarray) -> np.ndarray:
+        slope = -r * np.sin(z) - r * r * np.sin(z) * np.cos(z) / np.sqrt(
+            rod * rod - r * r * np.sin(z) ** 2
+        )
+        return J + m * slope**2
+
+    h = 1e-3
+    before, here, after = (float(inertia(angle + k * h)) for k in (-1.0, 0.0, 1.0))
+    slope, curvature = (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h)
+    exact = of_second_order(
+        np.array([[here]]),
+        np.array([[20.0 + slope * speed]]),
+        np.array([[2e3 + slope * rate + 0.5 * curvature * speed**2]]),
+    )
+    found = np.sort_complex(state_space(trajectory, 0.03).poles)
+    assert np.abs(found - exact).max() < 1e-5 * np.abs(exact).max()  # of the differences
 
 
 def test_instant_within_the_motion() -> None:
