@@ -367,6 +367,28 @@ class Model:
         _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
         return self._gathered(gradient(scene, partition, arms, trajectory, self._profile))
 
+    def state_space(self, t: float, x: Design = None, *, below: float | None = None) -> StateSpace:
+        """Return the machine linearised about its motion at an instant.
+
+        Args:
+            t: the instant, s.
+            x: the design, see the class; None: the initial one.
+            below: frequency below which the poles are to hold 1 %, Hz: the arms take as many
+                coordinates as that needs. None: those of the scene; `StateSpace.accurate_below`
+                tells up to where they do.
+
+        Raises:
+            InputError: the instant is not within the motion, or as `simulate` does.
+            ConvergenceError: no number of coordinates does; or as `simulate` does.
+        """
+        from dolfinopt.responses.linearised_machine import linearised_machine
+
+        partition, arms, x_phys = self._prepared(x)
+        choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
+        return linearised_machine(
+            self.scene, partition, arms, x_phys, t, self._profile, below=below
+        )
+
     def optimize(
         self,
         folder: str | Path | None = None,

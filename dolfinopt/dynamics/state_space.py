@@ -49,6 +49,7 @@ class StateSpace:
         states, inputs, outputs: their names.
         input_units, output_units: N, N m; m, rad.
         closed: whether the control acts; otherwise the drives' forces are free inputs.
+        accurate_below: frequency below which the poles hold 1 %, Hz; nan where it is not known.
     """
 
     time: float
@@ -62,6 +63,7 @@ class StateSpace:
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     closed: bool
+    accurate_below: float = np.nan
 
     @property
     def poles(self) -> np.ndarray:
