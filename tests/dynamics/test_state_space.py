@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
-from runs import refusal
+from runs import ROOT, refusal
 
 import dolfinopt as do
 from dolfinopt.dynamics.simulation import Trajectory
@@ -18,6 +18,7 @@ from dolfinopt.dynamics.state_space import (
     poles_of,
     state_space,
 )
+from dolfinopt.responses.linearised_machine import accurate_below
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -301,6 +302,49 @@ def test_poles_of_a_loop_in_the_plane() -> None:
     )
     found = np.sort_complex(state_space(trajectory, 0.03).poles)
     assert np.abs(found - exact).max() < 1e-5 * np.abs(exact).max()  # of the differences
+
+
+# -- how many coordinates the poles need -----------------------------------------------------------
+
+
+def largest_error(poles: np.ndarray, exact: np.ndarray, below: float, slowest: float) -> float:
+    """Return the largest relative distance of a pole below a frequency, Hz, from its partner."""
+    found = [0.0]
+    for one, other in ((poles, exact), (exact, poles)):
+        for pole in one[np.abs(one) < 2.0 * np.pi * below]:
+            found.append(np.abs(pole - other).min() / max(abs(pole), slowest))
+    return max(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "t", "below", "many"),
+    [("two_arm", 1.0, 500.0, 60), ("controlled_two_arm", 1.0, 500.0, 60),
+     ("spatial_arm", 0.3, 100.0, 40), ("four_bar", 0.1, 1000.0, 40)],
+)  # fmt: skip
+def test_poles_hold_what_is_said(name: str, t: float, below: float, many: int) -> None:
+    """Of the demos, one a loop, against far more coordinates: as they are, and as asked for."""
+    model = do.Model(ROOT / "demos" / f"{name}.toml")
+    exact = do.Model(model.scene, f"reduction.coordinates={many}").simulate().state_space(t).poles
+    slowest = 1.0 / model.scene.motion.horizon
+    few, enough = model.state_space(t), model.state_space(t, below=below)
+    assert few.accurate_below < below <= enough.accurate_below
+    for found in (few, enough):
+        assert largest_error(found.poles, exact, found.accurate_below, slowest) < 0.01
+        # Some pole is no better above.
+        assert largest_error(found.poles, exact, np.inf, slowest) > 0.01
+    assert len(few.poles) < len(enough.poles) < len(exact)
+
+
+def test_frequency_below_which_poles_are_pairs() -> None:
+    """The first one that is 0.5 % off, in either set; near zero they are measured by a rate."""
+    exact = np.array([1e-4, -1.0 + 99.0j, -200.0, 300.0j])
+    assert accurate_below(exact, exact, 1.0) == np.inf
+    for changed, first in (
+        ([-1e-3, *exact[1:]], np.inf), ([1e-4, -1.0 + 98.0j, *exact[2:]], 98.0051),
+        ([*exact[:2], -201.5, 300j], 200.0), (exact[:3], 300.0), ([*exact, 150.0], 150.0),
+    ):  # fmt: skip
+        found = accurate_below(np.array(changed), exact, 1.0)
+        assert found == pytest.approx(0.99 * first / (2.0 * np.pi), rel=1e-5)
 
 
 def test_instant_within_the_motion() -> None:
