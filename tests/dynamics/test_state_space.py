@@ -10,14 +10,10 @@ from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
 from runs import ROOT, refusal
 
 import dolfinopt as do
+from dolfinopt.dynamics.linearised import Linearised
+from dolfinopt.dynamics.poles import poles_of
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.state_space import (
-    Linearised,
-    StateSpace,
-    free_machine,
-    poles_of,
-    state_space,
-)
+from dolfinopt.dynamics.state_space import StateSpace, free_machine, state_space
 from dolfinopt.responses.linearised_machine import accurate_below
 from dolfinopt.scene.load import Scene, scene_from_dict
 
@@ -88,7 +84,9 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
         motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
         here = system.loops.at(system.mechanism, motion.q, q)
         speeds = np.hstack([motion.qd, instants.split(yd)[1]])[0]
-        bias = [speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(len(here.jacobian[0]))]
+        bias = [
+            speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(len(here.jacobian[0]))
+        ]
         return here.jacobian[0][:, system.columns], np.array(bias)
 
     if system.loops is not None:
