@@ -70,7 +70,7 @@ class Poles:
         instants = system.at(np.repeat(self.one.t, len(rows)))
         tangent = instants.linearise(*rates)
         by_rates = np.stack([x.sum(axis=0) for x in tangent.transposed(rows)])
-        by_bodies = system.body_gradient(instants, *rates, rows)
+        by_bodies = system.body_gradient(instants, rates[0], rates[1], rates[2], rows)
         if system.loops is not None:
             held = (held[:, :, None, :] * shares).reshape(*held.shape[:2], -1)
             own, parts = self._by_constraints(change, held.transpose(0, 2, 1))
@@ -81,7 +81,7 @@ class Poles:
     def _by_constraints(
         self, change: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        """Return the derivatives of sum_kn weights_kn . d^k g_n / dt^k, by rates (3, R + N), bodies.
+        """Return the slopes of sum_kn weights_kn . d^k g_n / dt^k by rates (3, R + N), and bodies.
 
         Args:
             change: (3, n, S) of the rates, of every motion along which g is differentiated.
