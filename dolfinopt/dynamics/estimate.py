@@ -23,8 +23,12 @@ from dolfinopt.dynamics.collocation import (
     step_beginnings,
     step_ends,
 )
-from dolfinopt.dynamics.measured import COMPARED_STEP_COUNTS, STABILITY_ROUNDING_ERROR
-from dolfinopt.dynamics.newton_matrix import chunks, factorise, slow_coordinates
+from dolfinopt.dynamics.measured import (
+    COMPARED_STEP_COUNTS,
+    ESTIMATE_ANGLE,
+    STABILITY_ROUNDING_ERROR,
+)
+from dolfinopt.dynamics.newton_matrix import chunks, factorise, up_to_angle
 from dolfinopt.dynamics.system import State, inverse_size
 
 
@@ -75,7 +79,7 @@ def estimate(
 def _corrections(richer: Stages, begin: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return Newton's change of q (n, s + 1, N), over all steps and of each by itself."""
     # Chunk by chunk: of long horizons the blocks have no room.
-    slow = slow_coordinates(richer)
+    slow = up_to_angle(richer, ESTIMATE_ANGLE)
     before, every, alone = np.zeros((2, a.shape[2])), np.empty_like(a), np.empty_like(a)
     for part in chunks(richer, slow):
         steps, b = richer.window(part.start, part.stop), a[part]

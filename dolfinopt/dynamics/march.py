@@ -25,7 +25,7 @@ from dolfinopt.dynamics.system import Preconditioner, State
 from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.progress import SlowWork
 
-WINDOW_LIMITS = Limits(iterations=12, shortest=0.25, goal=1e-2)
+WINDOW_LIMITS = Limits(iterations=12, shortest=0.25, goal=1e-4)
 REMEDY = (
     "stiffen the arms (material.young_modulus, interpolation.floor, design.minimum) or slow the "
     "motion (motion.duration)"
@@ -34,6 +34,31 @@ BEYOND = (
     f"beyond {100 * DEFLECTION_LIMIT:.0f} % no floating frame with linear elasticity holds, "
     "which leaves out how much an arm gets shorter as it bends"
 )
+
+
+def march_on_grid(stages: Stages, state: State, tolerance: float, limits: Limits) -> np.ndarray:
+    """Return accelerations (n, s, N) on given steps, each few from what the last ones end with.
+
+    Args:
+        stages: n steps.
+        state: q, qd (1, N) that they begin with.
+        tolerance: relative error of the coordinates.
+        limits: of Newton's method.
+
+    Raises:
+        ConvergenceError: Newton's method fails in some of them.
+    """
+    count, shape = len(stages.h), (len(stages.method.c), state[0].shape[1])
+    a = np.zeros((1, *shape))
+    for first in range(0, count, WINDOW_STEPS[0]):
+        window = stages.window(first, min(first + WINDOW_STEPS[0], count))
+        held = np.broadcast_to(a[-1, -1], (len(window.h), *shape))
+        found = newton(window, state, held, tolerance, limits)
+        if not found.converged:
+            raise GivenUp(f"Newton's method fails at step {first + 1} of {count}; {REMEDY}")
+        q, qd = step_ends(window, state, found.a)
+        a, state = np.concatenate([a, found.a]), (q[-1:], qd[-1:])
+    return a[1:]
 
 
 @dataclass(frozen=True, eq=False)

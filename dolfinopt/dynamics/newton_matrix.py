@@ -32,16 +32,23 @@ from dolfinopt.dynamics.system import Linearisation
 def slow_coordinates(stages: Stages, more_than: int = 0) -> np.ndarray:
     """Return the first set of more than so many slow coordinates, ascending.
 
-    All of few coordinates, or where no vibrations are known; else those up to an angle w h of
-    `SLOW_ANGLES` in the median step, and the slowest one always.
+    All of few coordinates; else those up to an angle of `SLOW_ANGLES`, in turn.
+    """
+    size = stages.preconditioner.system.num_coordinates
+    limits = SLOW_ANGLES if size > DENSE_COORDINATES else ()
+    sets = (up_to_angle(stages, limit) for limit in limits)
+    return next((slow for slow in sets if len(slow) > more_than), np.arange(size))
+
+
+def up_to_angle(stages: Stages, limit: float) -> np.ndarray:
+    """Return the coordinates that vibrate by an angle w h up to a limit in the median step, rad.
+
+    The slowest one always; all where nothing guides a free coordinate.
     """
     angles = stages.angles
-    if len(angles) > DENSE_COORDINATES and stages.preconditioner.guided:
-        for limit in SLOW_ANGLES:
-            slow = np.flatnonzero(angles <= max(limit, angles.min()))
-            if len(slow) > more_than:
-                return slow
-    return np.arange(len(angles))
+    if not stages.preconditioner.guided:
+        return np.arange(len(angles))
+    return np.flatnonzero(angles <= max(limit, angles.min()))
 
 
 def has_room(stages: Stages, slow: np.ndarray) -> bool:
@@ -217,18 +224,20 @@ def matrix_of(stages: Stages, tangent: Linearisation, slow: np.ndarray) -> Newto
 
 def _blocks(stages: Stages, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the steps' residuals by accelerations (n, s S, s S) and first state (n, s S, 2 S)."""
-    method, size = stages.method, jacobian.shape[1]
-    count, s = len(stages.h), len(method.c)
-    by_q, by_v, by_a = np.split(jacobian.reshape(count, s, size, 3 * size), 3, axis=3)
-    h = stages.h[:, None, None]
-    by_stage = np.stack([h * method.A, h * h * method.A2])[:, :, :, None, :, None]
-    block = by_stage[0] * by_v[:, :, :, None]
-    block += by_stage[1] * by_q[:, :, :, None]
-    every = np.arange(s)
-    block[:, every, :, every] += by_a.swapaxes(0, 1)
-    late = by_v + h[..., None] * method.c[:, None, None] * by_q
-    beginning = np.concatenate([by_q, late], axis=3)
-    return block.reshape(count, s * size, -1), beginning.reshape(count, s * size, -1)
+    method, (count, s) = stages.method, (len(stages.h), len(stages.method.c))
+    h, size = stages.h[:, None, None], jacobian.shape[1]
+    by_rates = jacobian.reshape(count, s, size, 3, size)
+    # q, qd and qdd of stage i by the accelerations of stage j: h^2 (A A)_ij, h A_ij, 1_ij; and by
+    # q and qd of the beginning: 1, 0, 0 and c_i h, 1, 0.
+    mean = np.broadcast_to(np.eye(s), (count, s, s))
+    by_stage = np.stack([h * h * method.A2, h * method.A, mean], axis=3)
+    by_first = np.zeros((count, s, 2, 3))
+    by_first[:, :, 0, 0] = by_first[:, :, 1, 1] = 1.0
+    by_first[:, :, 1, 0] = stages.h[:, None] * method.c
+    shape = (count, s * size, -1)
+    return (by_stage[:, :, None] @ by_rates).reshape(shape), (
+        by_first[:, :, None] @ by_rates
+    ).reshape(shape)
 
 
 def _diagonal_matrix(

@@ -21,10 +21,11 @@ from dolfinopt.dynamics.collocation import (
     step_beginnings,
 )
 from dolfinopt.dynamics.estimate import estimate, unresolved
-from dolfinopt.dynamics.march import REMEDY, March
+from dolfinopt.dynamics.march import REMEDY, March, march_on_grid
 from dolfinopt.dynamics.measured import (
     ACCEPTED_SHARE,
     AIM,
+    FINER_GRID_RATIOS,
     GRIDS_LIMIT,
     LOST_MOTION_ERROR,
     MARCH_ERROR_SHARE,
@@ -66,7 +67,13 @@ def integrate(
     """
     if system.num_coordinates == 0:
         return _prescribed(system, stages)
-    solution = _Integration(system.preconditioner(), tolerance, stages, guess).run()
+    preconditioner = system.preconditioner()
+    grid = None
+    if guess is not None and guess.a.shape[2] == system.num_coordinates:
+        grid = known_grid(system, guess, tolerance, stages)
+    if grid is None:
+        grid = first_grid(preconditioner.system, tolerance, stages)
+    solution = _Integration(preconditioner, grid, tolerance, stages, guess).run()
     profile.counts.newton_iterations += solution.iterations
     return solution
 
@@ -89,11 +96,13 @@ def on_grid(
         ConvergenceError: Newton's method does not converge.
     """
     preconditioner = system.preconditioner()
-    run = _Integration(preconditioner, tolerance, stages, guess)
-    run.time_grid = time_grid
-    a, converged = run.solve(run.first_guess())
-    if not converged:
-        raise ConvergenceError(f"Newton's method fails with {len(a)} time steps; {REMEDY}")
+    run = _Integration(preconditioner, time_grid, tolerance, stages, guess)
+    if guess is None and not preconditioner.guided:
+        a = run.marched_on_grid()
+    else:
+        a, converged = run.solve(run.first_guess())
+        if not converged:
+            raise ConvergenceError(f"Newton's method fails with {len(a)} time steps; {REMEDY}")
     return _changed(run.judged(a)[0], preconditioner.from_modes)
 
 
@@ -106,51 +115,63 @@ class _Integration:
     """
 
     def __init__(
-        self, preconditioner: Preconditioner, tolerance: float, stages: int, guess: Solution | None
+        self,
+        preconditioner: Preconditioner,
+        time_grid: np.ndarray,
+        tolerance: float,
+        stages: int,
+        guess: Solution | None,
     ) -> None:
         self._preconditioner, self._system = preconditioner, preconditioner.system
         self._tolerance, self._stages = tolerance, stages
-        known = None
-        if guess is not None and guess.a.shape[2] == self._system.num_coordinates:
-            known = known_grid(self._system, guess, tolerance, stages)
-            self._last: Solution | None = _changed(guess, preconditioner.to_modes)
-        else:
-            self._last = None
-        self.time_grid = first_grid(self._system, tolerance, stages) if known is None else known
+        if guess is not None and guess.a.shape[2] != self._system.num_coordinates:
+            guess = None
+        self._last = None if guess is None else _changed(guess, preconditioner.to_modes)
+        self.time_grid = time_grid
         self.strategy = Strategy.HORIZON if preconditioner.guided else Strategy.FREE
         self._step_error = MARCH_ERROR_SHARE * tolerance
         self._state = self._system.initial_state()
-        self._iterations, self._progress = 0, SlowWork("simulation")
+        self._iterations, self._stalled, self._unresolved = 0, 0, 0.0
+        self._progress = SlowWork("simulation")
         self._kept: tuple[np.ndarray, Stages] | None = None
 
     def run(self) -> Solution:
         """Return the solution whose error is small enough."""
-        marching, stalled = self.strategy is Strategy.FREE, 0
+        marching = self.strategy is Strategy.FREE
         for _ in range(GRIDS_LIMIT):
             self._progress.tell(f"{len(self.time_grid) - 1} time steps")
             a = None if marching else self._over_horizon()
             marched = a is None
-            a = self._marched() if a is None else a
-            solution, errors = self.judged(a)
+            solution, errors = self.judged(self._marched() if a is None else a)
             marching = not solution.error <= LOST_MOTION_ERROR
+            if marching and marched:
+                break  # finer steps do not find it either
             if marching:
-                self._step_error *= 0.01 if marched else 1.0
-                self.strategy = (
-                    Strategy.LOST if self.strategy is Strategy.HORIZON else self.strategy
-                )
+                if self.strategy is Strategy.HORIZON:
+                    self.strategy = Strategy.LOST
                 continue
             before, self._last = self._last, solution
             if solution.error <= ACCEPTED_SHARE * self._tolerance:
                 return _changed(solution, self._preconditioner.from_modes)
-            over = solution.error / (AIM * self._tolerance)
-            if marched:
-                self._step_error = min(self._step_error, errors.max()) / over
-            grid = finer(self._system, self.time_grid, errors, 1.0 / over, self._stages)
-            stalled += before is not None and solution.error > STALLED_RATIO * before.error
-            if len(grid) > STEPS_LIMIT or stalled > STALLED_GRIDS_LIMIT:
+            grid = self._finer(errors, before, marched)
+            if len(grid) > STEPS_LIMIT or self._stalled > STALLED_GRIDS_LIMIT:
                 break
             self.time_grid = grid
         return self._best()
+
+    def _finer(self, errors: np.ndarray, before: Solution | None, marched: bool) -> np.ndarray:
+        """Return the steps that should meet the tolerance, from the errors (n,) of the last ones."""
+        assert self._last is not None
+        error = self._last.error
+        over = error / (AIM * self._tolerance)
+        if marched:
+            self._step_error = min(self._step_error, errors.max()) / over
+        stalls = before is not None and error > STALLED_RATIO * before.error
+        self._stalled += stalls
+        # Vibrations that are not resolved hardly get smaller with more steps, until they are.
+        unresolved = stalls or self._unresolved > 0.5 * error
+        least = FINER_GRID_RATIOS[1] if unresolved else FINER_GRID_RATIOS[0]
+        return finer(self._system, self.time_grid, errors, 1.0 / over, self._stages, least)
 
     def _best(self) -> Solution:
         """Return what was found last if it meets the tolerance itself, or say why there is none."""
@@ -174,7 +195,8 @@ class _Integration:
         a, converged = self.solve(self.first_guess())
         if converged:
             return a
-        self.strategy = Strategy.FAILED
+        if self.strategy is Strategy.HORIZON:
+            self.strategy = Strategy.FAILED
         return None
 
     def _marched(self) -> np.ndarray:
@@ -185,6 +207,10 @@ class _Integration:
         ).run()
         self.time_grid, self._iterations = march.time_grid, self._iterations + march.iterations
         return self.solve(march.a)[0]
+
+    def marched_on_grid(self) -> np.ndarray:
+        """Return accelerations on the present steps, found some steps after the others."""
+        return march_on_grid(self._steps(), self._state, self._tolerance, HORIZON_LIMITS)
 
     def first_guess(self) -> np.ndarray:
         """Return accelerations (n, s, N) to begin with: of the last motion, or zero."""
@@ -204,7 +230,8 @@ class _Integration:
         """Return the solution with its estimated error, and the errors (n,) that steps add."""
         stages = self._steps()
         found = estimate(stages, self.time_grid, self._state, a)
-        error = found.error + unresolved(stages, self.time_grid, self._state, a)
+        self._unresolved = unresolved(stages, self.time_grid, self._state, a)
+        error = found.error + self._unresolved
         begin, c = step_beginnings(stages, self._state, a), stages.method.c
         spent, how = self._iterations, self.strategy
         return Solution(self.time_grid, c, *begin, a, error, spent, how), found.steps

@@ -31,7 +31,9 @@ def first_grid(system: System, tolerance: float, stages: int) -> np.ndarray:
     slowest, horizon = system.slowest_frequency(), system.breakpoints[-1]
     pieces = len(system.breakpoints) - 1
     smooth = 20 * min(pieces, 4) + 5 * max(pieces - 4, 0)  # many pieces are short ones
-    count = np.clip(STEPS_PER_PERIOD * horizon * slowest / (2.0 * np.pi), smooth, FIRST_GRID_STEPS)
+    count = max(STEPS_PER_PERIOD * horizon * slowest / (2.0 * np.pi), smooth)
+    if count > FIRST_GRID_STEPS:  # stiff arms follow their loads, which may be slow
+        count = smooth
     usual = USUAL_ERROR * USUAL_ERROR_RATIO ** (stages - 4)
     growth = (usual / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
     return even_steps(system, int(np.ceil(count * np.clip(growth, 0.6, 1.6))))
@@ -48,7 +50,12 @@ def known_grid(system: System, guess: Solution, tolerance: float, stages: int) -
 
 
 def finer(
-    system: System, time_grid: np.ndarray, errors: np.ndarray, share: float, stages: int
+    system: System,
+    time_grid: np.ndarray,
+    errors: np.ndarray,
+    share: float,
+    stages: int,
+    least: float,
 ) -> np.ndarray:
     """Return steps of like errors whose sum is a share of what it was.
 
@@ -60,13 +67,15 @@ def finer(
         errors: (n,) that every step adds.
         share: of the sum that may be left.
         stages: s.
+        least: growth of their number.
     """
     order = stages + 2
     errors = np.maximum(errors, 1e-4 * errors.max() + np.finfo(float).tiny)
     aim = (errors.sum() * share / (errors ** (1.0 / order)).sum()) ** (order / (order - 1.0))
     density = (errors / aim) ** (1.0 / order)
     growth = density.sum() / len(errors)
-    return spread(density * np.clip(growth, *FINER_GRID_RATIOS) / growth, time_grid, system)
+    wanted = np.clip(growth, least, FINER_GRID_RATIOS[-1])
+    return spread(density * wanted / growth, time_grid, system)
 
 
 def spread(density: np.ndarray, time_grid: np.ndarray, system: System) -> np.ndarray:

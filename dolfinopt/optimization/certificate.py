@@ -286,11 +286,9 @@ def without_exact_gradient(scene: Scene) -> str:
     """Return why the scene has no exact gradient, in words; "" if it has one."""
     if not needs(scene, "motion"):
         return ""
-    method, integrator = scene.reduction.method, scene.simulation.integrator
+    method = scene.reduction.method
     if METHODS[method].adjoint is None:
         return f'reduction.method = "{method}" has no adjoint'
-    if integrator != "radau":
-        return f'simulation.integrator = "{integrator}" has no adjoint'
     return ""
 
 

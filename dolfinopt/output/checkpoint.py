@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.disk import write_arrays
-from dolfinopt.dynamics.collocation import Solution
+from dolfinopt.dynamics.collocation import Solution, Strategy
 from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.inverse_dynamics import Stiffening
@@ -278,6 +278,7 @@ def arrays_of(
     for k, solution in enumerate(memory.solutions):
         for name, field in (*SOLUTION.items(), ("error", "error")):
             arrays[f"solution{k}/{name}"] = getattr(solution, field)
+        arrays[f"solution{k}/strategy"] = solution.strategy.name
     for key, by_arm in columns.items():
         arrays |= {f"arm{k}/{key}": value for k, value in by_arm.items()}
     return arrays
@@ -330,7 +331,8 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
     while f"solution{len(solutions)}/error" in arrays:
         of = f"solution{len(solutions)}"
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
-        solutions.append(Solution(**parts, error=float(arrays[f"{of}/error"]), iterations=0))
+        error, strategy = float(arrays[f"{of}/error"]), Strategy[str(arrays[f"{of}/strategy"])]
+        solutions.append(Solution(**parts, error=error, iterations=0, strategy=strategy))
     change, age, held = arrays["last"].tolist()
     best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
     iteration = best["iteration"] = int(best["iteration"])

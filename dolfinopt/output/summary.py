@@ -132,6 +132,7 @@ def summarise(
             **_of_designs(run, traits),
             **_of_responses(run),
             "simulation_error_estimate": run.evaluation.error,
+            "integrator": None if run.trajectory is None else _integrator(run.trajectory),
             "reduction": _reduction(scene, run.choice),
             "stiffening": _stiffening(stiffening_of(run.arms)),
             "warnings": _all_warnings(run, traits),
@@ -327,6 +328,16 @@ def _cost(run: Simulated, wall: float) -> dict[str, Any]:
         "counts": asdict(sum(counted or (), Counts())),
         "peak_memory_mb": max(memory or [0.0]),
         "ranks": world.size,
+    }
+
+
+def _integrator(trajectory: Trajectory) -> dict[str, Any]:
+    """Return how the motion was integrated, and why so."""
+    solution = trajectory.solution
+    return {
+        "method": f"Radau IIA, {len(solution.nodes)} stages",
+        "strategy": solution.strategy.value,
+        "steps": len(solution.a),
     }
 
 

@@ -214,8 +214,7 @@ class _Comparison:
 def _timed(scene: Scene) -> Scene:
     """Return the scene simulated so well that time steps do not matter to the comparison."""
     tolerance = min(scene.simulation.tolerance, TIME_ERROR_SHARE * scene.reduction.tolerance)
-    # The estimate is of the bases: with the quick integrator whatever the scene's.
-    update = {"tolerance": tolerance, "integrator": "radau"}
+    update = {"tolerance": tolerance}
     simulation = scene.simulation.model_copy(update=update)
     return scene.model_copy(update={"simulation": simulation})
 

@@ -296,7 +296,23 @@ def implausible(scene: Scene) -> list[str]:
 
     Every sentence names key, value, what is usual, and what follows from it.
     """
-    return [*_materials(scene), *_sizes(scene), *_motion(scene), *_solid_ends(scene)]
+    return [
+        *_materials(scene),
+        *_sizes(scene),
+        *_motion(scene),
+        *_solid_ends(scene),
+        *_without_effect(scene),
+    ]
+
+
+def _without_effect(scene: Scene) -> list[str]:
+    keys = sorted({"integrator", "rho_inf"} & scene.simulation.model_fields_set)
+    return [
+        f"simulation.{key} is read without effect: every motion is integrated by Radau IIA, see "
+        "simulation.tolerance"
+        for key in keys
+        if key == "rho_inf" or scene.simulation.integrator != "radau"
+    ]
 
 
 def _materials(scene: Scene) -> list[str]:

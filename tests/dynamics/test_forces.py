@@ -11,7 +11,7 @@ from machines import energies, fork, trajectory_of, two_arm, with_keys
 from runs import scene
 
 import dolfinopt as do
-from dolfinopt.dynamics.simulation import simulate_batch
+from dolfinopt.dynamics.simulation import simulate_all
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -135,9 +135,9 @@ def test_scenarios_of_forces_are_simulated_together() -> None:
     scenes.append(scene(*quick))
     bodies = list(do.Model(scenes[0]).simulate().trajectory.mechanism.bodies)
     profile = Profile()
-    every = simulate_batch(scenes, [bodies] * 3, profile)
+    every = simulate_all(scenes, [bodies] * 3, profile)
     for one, found in zip(scenes, every, strict=True):
-        (alone,) = simulate_batch([one], [bodies], profile)
+        (alone,) = simulate_all([one], [bodies], profile)
         t = np.linspace(0.0, 2.0, 50)
         a, b = found.at(t).deviation, alone.at(t).deviation
         assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()

@@ -155,13 +155,13 @@ def done(plan, folder):
 def batches(monkeypatch):
     """How many scenes every call of the simulation took on this rank."""
     sizes = []
-    whole = evaluation.simulate_batch
+    whole = evaluation.simulate_all
 
     def count(scenes, *args, **options):
         sizes.append(len(scenes))
         return whole(scenes, *args, **options)
 
-    monkeypatch.setattr(evaluation, "simulate_batch", count)
+    monkeypatch.setattr(evaluation, "simulate_all", count)
     return sizes
 
 
@@ -375,7 +375,7 @@ def test_foreign_checkpoint_is_not_used(plan, done, tmp_path):
 def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypatch):
     """The next run tries again, and what failed alone; designs that were not found are named."""
     _, outcomes = done
-    whole = evaluation.simulate_batch
+    whole = evaluation.simulate_all
 
     def fail_at_four(scenes, *args, **options):
         error = do.ConvergenceError("no solution at 4 kg")
@@ -386,7 +386,7 @@ def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypat
         raise do.ConvergenceError("no way")
 
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "simulate_batch", fail_at_four)
+        patch.setattr(evaluation, "simulate_all", fail_at_four)
         patch.setattr(computing, "optimize", fail)
         first = run_cases(plan[:6], shared_tmp_path, WORLD, shown=False)
     told = sorted(one.failure for one in first.failures)

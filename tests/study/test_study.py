@@ -408,14 +408,14 @@ def test_failures_end_with_status_one(folder, monkeypatch):
     """The table names what failed and holds the rest."""
     from dolfinopt.responses import evaluation
 
-    whole = evaluation.simulate_batch
+    whole = evaluation.simulate_all
 
     def fail_at_seven(scenes, *args, **options):
         error = ConvergenceError("no solution")
         found = whole(scenes, *args, **options)
         return [error if s.payload.mass == 7.25 else one for s, one in zip(scenes, found)]
 
-    monkeypatch.setattr(evaluation, "simulate_batch", fail_at_seven)
+    monkeypatch.setattr(evaluation, "simulate_all", fail_at_seven)
     with pytest.raises(ConvergenceError, match=r"mass = 7\.25: no solution \(and 1 more\)"):
         run(TWO_ARM, "payload", "--vary", "payload.mass=4,7.25", *SETTINGS, "--out", folder)
     WORLD.barrier()

@@ -143,7 +143,7 @@ def test_what_is_known_is_not_done_again(chunks, given, shared_tmp_path):
 def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
     """Ctrl-C in the third chunk: two are kept, and the end is the same."""
     count = 3 * CHUNK - 1
-    honest, calls = computing.simulate_batch, []
+    honest, calls = computing.simulate_all, []
 
     def interrupted(scenes, *others):
         calls.append(1)
@@ -151,7 +151,7 @@ def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return honest(scenes, *others)
 
-    monkeypatch.setattr(computing, "simulate_batch", interrupted)
+    monkeypatch.setattr(computing, "simulate_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
         respond(payloads(count), tmp_path / "a", SELF)
     (found, again, _), (expected, all_of_it, _) = (
@@ -176,7 +176,7 @@ def test_ranks_do_not_matter(chunks, given, tmp_path, shared_tmp_path):
 @alone
 def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch):
     """What was found is kept for this run; the command ends with status 1."""
-    honest = computing.simulate_batch
+    honest = computing.simulate_all
 
     def failing(scenes, *others):
         return [
@@ -188,7 +188,7 @@ def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch)
     heavy = np.flatnonzero(masses(CHUNK - 1) > 6.25) + 1
     assert 0 < len(heavy) < CHUNK - 1
     with monkeypatch.context() as patch:
-        patch.setattr(computing, "simulate_batch", failing)
+        patch.setattr(computing, "simulate_all", failing)
         found, _, failures = respond(cases, tmp_path, SELF)
         with pytest.raises(ConvergenceError, match=r"sample \d+ \(payload.*\): too heavy \(and"):
             run(TWO_ARM, "--random", MASS, "--samples", 10, "--design", given, *overrides(*SMALL),

@@ -151,12 +151,6 @@ class Closures(Table):
         if self.name.casefold() in map(str.casefold, taken):
             raise Refusal("expected a name that no joint or other closure has", (*at, "name"))
         self._check_ends(scene, at)
-        if scene.simulation.integrator != "radau":
-            raise Refusal(
-                'expected "radau" with [[closures]]: its stages keep the loops closed',
-                ("simulation", "integrator"),
-                (*at, "kind"),
-            )
         if self.is_spring and scene.control is not None:
             raise Refusal(
                 "expected 0 with [control]: a driven rod has its drive's gains there",

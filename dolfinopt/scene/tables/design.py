@@ -490,13 +490,6 @@ class Optimizer(Table):
                 ("reduction", "method"),
                 own,
             )
-        if scene.simulation.integrator != "radau":
-            raise Refusal(
-                'expected "radau" with optimizer.exact_iterations: only its trajectory has an '
-                "adjoint",
-                ("simulation", "integrator"),
-                own,
-            )
 
 
 # -- [part]: what `dolfinopt part` makes of a result, unless its options say otherwise ----------

@@ -382,12 +382,6 @@ class Closure(Table):
                 ("motion", "path"),
                 (*at, "kind"),
             )
-        if scene.simulation.integrator != "radau":
-            raise Refusal(
-                'expected "radau" with [closure]: its stages keep the loop closed',
-                ("simulation", "integrator"),
-                (*at, "kind"),
-            )
         self._check_springs(scene, at)
         if self.kind == "pin":
             self._check_end(scene, at)

@@ -271,9 +271,11 @@ class Simulation(Table):
         le=0.1,
         description="relative error allowed in the elastic coordinates [-]",
     )
-    integrator: Integrator = Field(default="radau", description="time integration method [-]")
+    integrator: Integrator = Field(
+        default="radau", description="without effect: every motion is integrated by Radau IIA [-]"
+    )
     rho_inf: float = Field(
-        default=0.8, ge=0, le=1, description="spectral radius at infinity of generalised-alpha [-]"
+        default=0.8, ge=0, le=1, description="without effect, see simulation.integrator [-]"
     )
     stages: int = Field(default=4, ge=2, le=5, description="stages of the Radau IIA method [-]")
     stiffening: bool | Literal["auto"] = Field(

@@ -195,12 +195,6 @@ class Objective(Table):
                 ("reduction", "method"),
                 key,
             )
-        if because and scene.simulation.integrator != "radau":
-            raise Refusal(
-                f'expected "radau" with {because}: only its trajectory has an adjoint{remedy}',
-                ("simulation", "integrator"),
-                key,
-            )
 
     def _why_exact(self, scene: Scene) -> tuple[str, Loc]:
         """Return what asks for the exact gradient of a motion, and its key; "" if nothing does."""
