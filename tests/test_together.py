@@ -228,7 +228,7 @@ PLACES = [
     (evaluating, LONE, frequency, "rigid_integrals", PERIOD),
     (evaluating, LONE, design_state, "loaded_modes", FREQUENCY),
     (evaluating, LONE, frequency, "squared_period", PERIOD),
-    (evaluating, 0, evaluation, "simulate_all"),
+    (evaluating, 0, evaluation, "simulate"),
     (evaluating, 0, evaluation, "_motion"),
     (a_batch, LONE, arm.Arm, "under", STATIC),
     (gradients, LONE, motion, "esl_gradient"),

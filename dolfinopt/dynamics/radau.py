@@ -137,7 +137,7 @@ class _Integration:
 
     def run(self) -> Solution:
         """Return the solution whose error is small enough."""
-        marching = self.strategy is Strategy.FREE
+        marching = self.strategy is Strategy.FREE and not self._knows_steps()
         for _ in range(GRIDS_LIMIT):
             self._progress.tell(f"{len(self.time_grid) - 1} time steps")
             a = None if marching else self._over_horizon()
@@ -159,8 +159,12 @@ class _Integration:
             self.time_grid = grid
         return self._best()
 
+    def _knows_steps(self) -> bool:
+        """Return whether the first steps are those of a nearby motion."""
+        return self._last is not None and self._last.time_grid is self.time_grid
+
     def _finer(self, errors: np.ndarray, before: Solution | None, marched: bool) -> np.ndarray:
-        """Return the steps that should meet the tolerance, from the errors (n,) of the last ones."""
+        """Return steps that should meet the tolerance, from the errors (n,) of the last ones."""
         assert self._last is not None
         error = self._last.error
         over = error / (AIM * self._tolerance)

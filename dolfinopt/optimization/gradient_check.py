@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.arms.arm import Patterns
-from dolfinopt.dynamics.radau import AIM
+from dolfinopt.dynamics.measured import AIM
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.measured import (
@@ -177,7 +177,9 @@ def _fixed_objective(
     base: Trajectory | None,
 ) -> Callable[[Cells], float]:
     """Return J(x), of a motion with the load cases and time steps of `base`."""
-    start, response = () if base is None else base.solutions, objective_of(scene)
+    # Of the error that is aimed at, so that every scenario keeps its steps.
+    error, solutions = AIM * scene.simulation.tolerance, () if base is None else base.solutions
+    start, response = [replace(one, error=error) for one in solutions], objective_of(scene)
 
     def value(x: Cells) -> float:
         x_phys = _physical(partition, arms, patterns, x)

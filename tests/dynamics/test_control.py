@@ -113,16 +113,6 @@ def test_stiff_springs_are_rigid_drives() -> None:
     assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
 
 
-def test_generalised_alpha() -> None:
-    """The conventional method finds the same motion, to the error it says it has."""
-    tree = small(SOFT | ROTORS, motion={"horizon": 1.0, "duration": 1.0}, payload={"mass": 2.0})
-    options = {"integrator": "generalized-alpha", "tolerance": 3e-3}
-    other, _ = machine(simulated(with_keys(tree, {"simulation": options})))
-    trajectory, _ = machine(simulated(tree))
-    assert apart(other.deviation, trajectory.deviation) < 3e-3  # measured 6.8e-4
-    assert apart(other.joint_forces, trajectory.joint_forces) < 6e-3  # 8.0e-4
-
-
 def test_motors_on_the_desired_motion_move_their_rotors() -> None:
     """Without control the drives give what the springs take, and what the rotors' inertia does."""
     light, heavy = (

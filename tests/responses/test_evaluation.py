@@ -13,7 +13,8 @@ from runs import TWO_ARM, refused
 
 import dolfinopt as do
 from dolfinopt.arms.arm import chain_of
-from dolfinopt.dynamics.collocation import Solution, radau_iia, response_instants
+from dolfinopt.dynamics.collocation import Solution, radau_iia
+from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.multibody.kinematics import deviation
 from dolfinopt.multibody.shape_integrals import rigid_bar
 from dolfinopt.responses.constraints import load_cases, objective

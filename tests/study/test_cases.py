@@ -152,17 +152,17 @@ def done(plan, folder):
 
 
 @pytest.fixture
-def batches(monkeypatch):
-    """How many scenes every call of the simulation took on this rank."""
-    sizes = []
-    whole = evaluation.simulate_all
+def simulated(monkeypatch):
+    """The payloads of the scenes that were simulated on this rank, kg."""
+    payloads = []
+    whole = evaluation.simulate
 
-    def count(scenes, *args, **options):
-        sizes.append(len(scenes))
-        return whole(scenes, *args, **options)
+    def count(scene, *others):
+        payloads.append(scene.payload.mass)
+        return whole(scene, *others)
 
-    monkeypatch.setattr(evaluation, "simulate_all", count)
-    return sizes
+    monkeypatch.setattr(evaluation, "simulate", count)
+    return payloads
 
 
 def test_files_and_outcomes(plan, done):
@@ -192,16 +192,16 @@ def test_files_and_outcomes(plan, done):
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
-def test_ranks_do_not_matter(plan, done, tmp_path, shared_tmp_path, batches):
+def test_ranks_do_not_matter(plan, done, tmp_path, shared_tmp_path, simulated):
     """Done on each rank alone: the same bits as together, in any order; every job is done once."""
     _, together = done
     single = run_cases(plan[::-1], tmp_path, SELF, shown=False)
     assert single.computed == together.computed
     for case, outcome in single.by_case.items():
         assert_same(outcome, together[case])
-    batches.clear()
+    simulated.clear()
     run_cases(plan[3:], shared_tmp_path / "all", WORLD, shown=False)
-    assert sum(WORLD.allgather(sum(batches))) == 3
+    assert sum(WORLD.allgather(len(simulated))) == 3
 
 
 def test_second_run_computes_nothing(plan, done, monkeypatch):
@@ -247,7 +247,7 @@ def test_chosen_coordinates_are_those_of_each_scene():
 
 
 @alone
-def test_sweep_is_one_batch(tmp_path, batches):
+def test_sweep_is_one_batch(tmp_path, simulated):
     """The first bears the account of all; in any order the same cases."""
     sweep = [Case(scene(f"payload.mass={mass}")) for mass in np.linspace(4.0, 8.0, 5)]
     outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
@@ -256,30 +256,30 @@ def test_sweep_is_one_batch(tmp_path, batches):
     counts = [outcomes[case].summary()["counts"] for case in sweep]
     assert [one["simulations"] for one in counts] == [5 * (case is first) for case in sweep]
     assert [one["factorisations"] for one in counts] == [2 * (case is first) for case in sweep]
-    assert run_cases(sweep[::-1], tmp_path, SELF, shown=False).computed == 0 and batches == [5]
+    assert run_cases(sweep[::-1], tmp_path, SELF, shown=False).computed == 0 and len(simulated) == 5
 
 
 @alone
-def test_what_scales_the_arms_is_one_batch(tmp_path, batches):
+def test_what_scales_the_arms_is_one_batch(tmp_path, simulated):
     """Against arms that are assembled and reduced anew."""
     changes = ("material.density=2900", "material.young_modulus=60e9", "arms.arm1.thickness=0.012")
     sweep = [Case(scene(change)) for change in changes]
     outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
-    assert batches == [3]
+    assert len(simulated) == 3
     for case in sweep:
         [single] = simulate_scenarios([case.scene], None)
         assert_close(outcomes[case], single.evaluation)
 
 
 @alone
-def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batches):
+def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, simulated):
     """What is there stays as it is, and all are right to the tolerance in any company."""
     _, outcomes = done
     [case, *_] = together = plan[3:6]
     first = run_cases([case], tmp_path, SELF, shown=False)
     kept = first[case].design.stat().st_mtime_ns
     after = run_cases(together, tmp_path, SELF, shown=False)
-    assert batches == [1, 2] and after.computed == 2
+    assert len(simulated) == 3 and after.computed == 2
     assert after[case].design.stat().st_mtime_ns == kept
     assert after[case].compliance == first[case].compliance
     for one in together:
@@ -287,7 +287,7 @@ def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, batche
 
 
 @alone
-def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch, batches):
+def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch, simulated):
     """Nothing of it is in place: it is computed anew as a whole, to the same bits."""
     _, outcomes = done
     written = []
@@ -304,7 +304,7 @@ def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch
             run_cases(plan[3:6], tmp_path, SELF, shown=False)
     assert not list(tmp_path.rglob("summary.json"))
     again = run_cases(plan[3:6], tmp_path, SELF, shown=False)
-    assert again.computed == 3 and batches == [3, 3]
+    assert again.computed == 3 and len(simulated) == 6
     for case in plan[3:6]:
         assert_same(again[case], outcomes[case])
 
@@ -375,18 +375,18 @@ def test_foreign_checkpoint_is_not_used(plan, done, tmp_path):
 def test_failure_does_not_sink_the_others(plan, done, shared_tmp_path, monkeypatch):
     """The next run tries again, and what failed alone; designs that were not found are named."""
     _, outcomes = done
-    whole = evaluation.simulate_all
+    whole = evaluation.simulate
 
-    def fail_at_four(scenes, *args, **options):
-        error = do.ConvergenceError("no solution at 4 kg")
-        found = whole(scenes, *args, **options)
-        return [error if s.payload.mass == 4.0 else one for s, one in zip(scenes, found)]
+    def fail_at_four(scene, *others):
+        if scene.payload.mass == 4.0:
+            raise do.ConvergenceError("no solution at 4 kg")
+        return whole(scene, *others)
 
     def fail(*args, **kwargs):
         raise do.ConvergenceError("no way")
 
     with monkeypatch.context() as patch:
-        patch.setattr(evaluation, "simulate_all", fail_at_four)
+        patch.setattr(evaluation, "simulate", fail_at_four)
         patch.setattr(computing, "optimize", fail)
         first = run_cases(plan[:6], shared_tmp_path, WORLD, shown=False)
     told = sorted(one.failure for one in first.failures)
