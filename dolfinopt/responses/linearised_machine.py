@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from math import ceil
+from sys import maxsize
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,7 +62,7 @@ def linearised_machine(
         for k, arm in arms.items():
             arm.set_design(x_phys[k])
     decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
-    most = partition.world.allreduce(_most(arms), min)
+    every = partition.world.allreduce(_fewest_dofs(arms), min)
     count = partition.world.allreduce(_largest(arms), max)
 
     def model(method: str, count: int) -> StateSpace:
@@ -73,22 +74,22 @@ def linearised_machine(
         found = model(scene.reduction.method, count)
         if not scene.cell_counts:
             return replace(found, accurate_below=np.inf)
-        richer = model(RICHER_METHOD, min(RICHER_RATIO * count, most))
+        richer = model(RICHER_METHOD, min(RICHER_RATIO * count, every))
         held = accurate_below(found.poles, richer.poles, 1.0 / scene.motion.horizon)
         if below is None or held >= below:
             return replace(found, accurate_below=held)
-        if RICHER_RATIO * count >= most:
+        if count >= min(POLE_COORDINATES_LIMIT, every):
             raise ConvergenceError(
                 f"--below {below:g}: with {count} coordinates of an arm the poles hold "
-                f"{100.0 * POLE_ERROR:g} % below {held:.4g} Hz; more coordinates are not tried: "
-                "give a lower frequency"
+                f"{100.0 * POLE_ERROR:g} % below {held:.4g} Hz, and no more are tried; ask for a "
+                "lower frequency"
             )
-        count = min(ceil(POLE_COORDINATES_GROWTH * count), most // RICHER_RATIO)
+        count = min(ceil(POLE_COORDINATES_GROWTH * count), POLE_COORDINATES_LIMIT, every)
 
 
-def _most(arms: Mapping[int, Arm]) -> int:
+def _fewest_dofs(arms: Mapping[int, Arm]) -> int:
     """Return how many coordinates all of this rank's arms can have."""
-    return min([POLE_COORDINATES_LIMIT, *(arm.elastic.num_dofs for arm in arms.values())])
+    return min((arm.elastic.num_dofs for arm in arms.values()), default=maxsize)
 
 
 def _largest(arms: Mapping[int, Arm]) -> int:

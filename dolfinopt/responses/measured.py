@@ -70,7 +70,7 @@ POLE_ERROR = 0.01  # of a pole, over its size, that an exported machine may have
 # hold it against four to sixteen times as many; with 1 one of spatial_arm.toml did not.
 POLE_ERROR_SHARE = 0.5
 POLE_COORDINATES_GROWTH = 1.25
-POLE_COORDINATES_LIMIT = 200  # of an arm: a spatial machine of two takes a minute
+POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tries
 
 # -- poles -----------------------------------------------------------------------------------
 

@@ -333,6 +333,14 @@ def test_poles_hold_what_is_said(name: str, t: float, below: float, many: int) -
     assert len(few.poles) < len(enough.poles) < len(exact)
 
 
+def test_as_many_coordinates_as_there_are() -> None:
+    """Of few cells all poles are those of the finite elements; far too many are not tried."""
+    few = two_arm("arms.cells=[8,2]", "arms.passive=0", "design.filter_radius=0")
+    assert do.Model(scene_from_dict(few)).state_space(1.0, below=1e9).accurate_below == np.inf
+    with pytest.raises(do.ConvergenceError, match="--below 1e.09: with 100 coordinates"):
+        do.Model(scene_from_dict(two_arm())).state_space(0.0, below=1e9)
+
+
 def test_frequency_below_which_poles_are_pairs() -> None:
     """The first one that is 0.5 % off, in either set; near zero they are measured by a rate."""
     exact = np.array([1e-4, -1.0 + 99.0j, -200.0, 300.0j])
