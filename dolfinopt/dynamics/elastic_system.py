@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import prod
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -111,7 +112,10 @@ class ElasticSystem:
         return self.mechanism.norm(q)
 
     def slowest_frequency(self) -> float:
-        """Return that of the slowest vibration of the undeformed mechanism at t = 0, rad/s."""
+        """Return that of the slowest vibration of the undeformed mechanism at t = 0, rad/s.
+
+        0 of rigid arms.
+        """
         size = self.num_coordinates
         if size == 0:
             return 0.0
@@ -243,7 +247,7 @@ class Modes(Generic[Own]):
         return self._each(by_z, [inverse.T for inverse in self.inverses])
 
     def _each(self, x: np.ndarray, maps: tuple[np.ndarray, ...] | list[np.ndarray]) -> np.ndarray:
-        parts, rows = self.system.mechanism.slices, x.reshape(-1, x.shape[-1])
+        parts, rows = self.system.mechanism.slices, x.reshape(prod(x.shape[:-1]), x.shape[-1])
         pieces = [rows[:, part] @ T.T for part, T in zip(parts, maps, strict=True)]
         return np.concatenate(pieces, axis=1).reshape(x.shape)
 

@@ -29,6 +29,7 @@ import numpy as np
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.measured import (
     CLOSURE_COMPLIANCE_SHARE,
+    DEVIATION_ROUNDING,
     EQUILIBRIUM_ITERATIONS,
     MACHINE_EQUILIBRIUM_ROUNDING_ERROR,
 )
@@ -573,7 +574,8 @@ class MachineSystem:
     def norm(self, y: np.ndarray) -> np.ndarray:
         """Return the largest norm over n instants (..., groups): free coordinates, then arms.
 
-        Multipliers are not measured: their order is lower, and nothing depends on them.
+        Multipliers are not measured: their order is lower, and nothing depends on them; nor is the
+        rounding of free coordinates, all that is left of rigid arms that feed-forward moves.
         """
         R, moving, _ = self.ends
         arms = self.mechanism.norm(y[..., R:moving])
@@ -582,8 +584,8 @@ class MachineSystem:
         scale, joints = self.rigid_scale, self.drives.springs.joints
         squares = np.square(scale * y[..., :R]).sum(axis=-1)
         squares += np.square(scale[joints] * y[..., self.ends[2] :]).sum(axis=-1)
-        rigid = np.sqrt(squares).max(axis=-1)
-        return np.concatenate([rigid[..., None], arms], axis=-1)
+        rigid = np.sqrt(squares).max(axis=-1) - DEVIATION_ROUNDING * scale.max()
+        return np.concatenate([np.maximum(rigid, 0.0)[..., None], arms], axis=-1)
 
     def slowest_frequency(self) -> float:
         """Return that of the slowest vibration with rigid coordinates held, rad/s."""

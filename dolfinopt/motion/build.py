@@ -10,8 +10,16 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion import plane
-from dolfinopt.motion.constraints import Constraints, Derivatives, Target, part_of
-from dolfinopt.motion.curves import along, curve_by_chord, curve_by_laws, inverse
+from dolfinopt.motion.constraints import Constraints, Target
+from dolfinopt.motion.curves import (
+    Derivatives,
+    Words,
+    along,
+    curve_by_chord,
+    curve_by_laws,
+    inverse,
+    part_of,
+)
 from dolfinopt.motion.measured import (
     DENSE_INSTANTS,
     LEAST_ROWS,
@@ -360,10 +368,9 @@ def _with_springs(joints: Derivatives, scene: Scene) -> Derivatives:
 def _chain(t: np.ndarray, scene: Scene) -> Derivatives:
     """Return cart and joints (n, 1 + arms) of a chain in the plane on its path."""
     motion, path = scene.motion, desired_path(t, scene)
-    words = plane.Messages(scene.source, _remedies(scene))
     if len(scene.arms) == 1:
-        length = scene.arms[0].length
-        return plane.one_arm_on(t, path, length, motion.joint_height, motion.elbow, words)
+        length, height = scene.arms[0].length, motion.joint_height
+        return plane.one_arm_on(t, path, length, height, motion.elbow, _words(scene))
     found = _bare_chain(t, path, scene)
     # Both angles of a direction, whole turns apart, are right; the dense motion tells which.
     times, reference = _continuous_shoulder(scene, file_stamp(motion))
@@ -375,10 +382,11 @@ def _chain(t: np.ndarray, scene: Scene) -> Derivatives:
 def _bare_chain(t: np.ndarray, path: Derivatives, scene: Scene) -> Derivatives:
     """Return cart and joints of two and more arms, the first angle up to whole turns."""
     motion, bend = scene.motion, plane.bend_of(tuple(arm.length for arm in scene.arms))
-    follow = motion.cart_follow if motion.base == "cart" else None
-    base = plane.Base(follow, motion.base_position, motion.joint_height)
-    words = plane.Messages(scene.source, _remedies(scene))
-    return plane.chain_on(t, path, bend, base, motion.elbow, words)
+    p, v, a = (motion.cart_follow * np.array([1.0, 0.0]) * x for x in path)
+    if motion.base == "fixed":
+        p, v, a = np.tile([motion.base_position, 0.0], (len(t), 1)), 0.0 * v, 0.0 * a
+    base = p + np.array([0.0, motion.joint_height]), v, a
+    return plane.chain_on(t, path, base, bend, motion.elbow, _words(scene))
 
 
 @lru_cache(maxsize=64)
@@ -389,7 +397,7 @@ def _continuous_shoulder(scene: Scene, stamp: int) -> tuple[np.ndarray, np.ndarr
     return t, np.unwrap(alpha)
 
 
-def _remedies(scene: Scene) -> str:
+def _words(scene: Scene) -> Words:
     """Return the keys that move the path or the shoulder."""
     motion = scene.motion
     keys = {
@@ -401,7 +409,8 @@ def _remedies(scene: Scene) -> str:
         keys.append("motion.base_position")
     elif len(scene.arms) > 1:
         keys.append("motion.cart_follow")
-    return f"{', '.join(keys)}, motion.joint_height or the arms' length"
+    moved = f"{', '.join(keys)}, motion.joint_height or the arms' length"
+    return Words(scene.source, moved, "")
 
 
 # -- joints that follow ----------------------------------------------------------------------
@@ -419,7 +428,7 @@ def follower(scene: Scene) -> Follower:
 @lru_cache(maxsize=32)
 def _follower(scene: Scene, stamp: int) -> Follower:
     from dolfinopt.motion.follower import Follower
-    from dolfinopt.motion.task import Task, Words
+    from dolfinopt.motion.task import Task
 
     motion, names = scene.motion, tuple(scene.rigid_units)
     springs = [one.name for one in scene.rods if not one.driven]

@@ -15,18 +15,11 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.motion.curves import Derivatives
 from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.tree import Mechanism
-
-Derivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives
-
-
-def part_of(values: Derivatives, columns: slice | None) -> Derivatives:
-    """Return some columns of all three; None: of values (n,) the one column (n, 1)."""
-    q, qd, qdd = (x[:, columns] for x in values)
-    return q, qd, qdd
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.constraints import Derivatives
 from dolfinopt.paths import TIME, Curve, Law, Table, move_ends, piecewise, stops_of
+
+Derivatives = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives
+
+
+def part_of(values: Derivatives, columns: slice | None) -> Derivatives:
+    """Return some columns of all three; None: of values (n,) the one column (n, 1)."""
+    q, qd, qdd = (x[:, columns] for x in values)
+    return q, qd, qdd
+
+
+@dataclass(frozen=True)
+class Words:
+    """What messages name: where the motion is stated, and the keys that change it and its start."""
+
+    source: str
+    motion: str
+    start: str
 
 
 def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:

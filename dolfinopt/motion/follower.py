@@ -15,7 +15,8 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.constraints import Derivatives, Target
+from dolfinopt.motion.constraints import Target
+from dolfinopt.motion.curves import Derivatives
 from dolfinopt.motion.measured import SAMPLES, TURN_LIMIT
 from dolfinopt.motion.singular import BranchLost, Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.constraints import Derivatives
-from dolfinopt.motion.curves import inverse
+from dolfinopt.motion.curves import Derivatives, Words, inverse
 from dolfinopt.motion.measured import SINGULAR_DISTANCE_SHARE
 from dolfinopt.paths import Law, Values
 
@@ -82,37 +81,6 @@ def rotation(
 
 
 # -- chains ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Base:
-    """What carries the first joint.
-
-    Attributes:
-        follow: the cart's x over the path's; None of a fixed base.
-        position: x of a fixed base, m.
-        height: y of the first joint, m.
-    """
-
-    follow: float | None
-    position: float
-    height: float
-
-    def x(self, path: Derivatives) -> Derivatives:
-        """Return its x and two derivatives (n,) for a path (n, 2)."""
-        if self.follow is None:
-            rest = np.zeros(len(path[0]))
-            return rest + self.position, rest, rest
-        x, xd, xdd = (self.follow * p[:, 0] for p in path)
-        return x, xd, xdd
-
-
-@dataclass(frozen=True)
-class Messages:
-    """Where a path is stated, and the keys that move it or its base."""
-
-    source: str
-    remedies: str
 
 
 @dataclass(frozen=True)
@@ -184,15 +152,15 @@ def bend_of(lengths: tuple[float, ...]) -> Bend:
 
 
 def chain_on(
-    t: np.ndarray, path: Derivatives, bend: Bend, base: Base, elbow: int, words: Messages
+    t: np.ndarray, path: Derivatives, base: Derivatives, bend: Bend, elbow: int, words: Words
 ) -> Derivatives:
     """Return cart and joints (n, 1 + arms) of two and more arms, the first angle up to turns.
 
     Args:
         t: (n,) instants, s, for messages.
         path: of the end (n, 2).
+        base: x and y of the first joint (n, 2).
         bend: the chain.
-        base: what carries it.
         elbow: sign of the elbows' angle.
         words: for messages.
 
@@ -201,9 +169,7 @@ def chain_on(
     """
     # With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
     # accelerations from its derivatives, two real equations each for the rates of alpha and beta.
-    cart = base.x(path)
-    r, rd, rdd = (p[:, 0] - x + 1j * p[:, 1] for p, x in zip(path, cart, strict=True))
-    r = r - 1j * base.height
+    r, rd, rdd = ((p - b) @ [1.0, 1j] for p, b in zip(path, base, strict=True))
     distance = np.abs(r)
     _check_distance(t, distance, bend, words)
     beta = elbow * np.arccos(bend.cosine(distance**2))
@@ -222,13 +188,14 @@ def chain_on(
     elbows = len(bend.lengths) - 1
     angles = (alpha, beta), (alpha_d, beta_d), (alpha_dd, beta_dd)
     q, qd, qdd = (
-        np.column_stack([x, a, *(elbows * [b])]) for x, (a, b) in zip(cart, angles, strict=True)
+        np.column_stack([x[:, 0], a, *(elbows * [b])])
+        for x, (a, b) in zip(base, angles, strict=True)
     )
     return q, qd, qdd
 
 
 def one_arm_on(
-    t: np.ndarray, path: Derivatives, length: float, height: float, elbow: int, words: Messages
+    t: np.ndarray, path: Derivatives, length: float, height: float, elbow: int, words: Words
 ) -> Derivatives:
     """Return cart and joint (n, 2) of one arm: L sin(alpha) is the path's height over the joint's.
 
@@ -252,7 +219,7 @@ def one_arm_on(
     )
 
 
-def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, words: Messages) -> None:
+def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, words: Words) -> None:
     """Raise when the shoulder's distance to the path leaves the reach of the arms."""
     margin = SINGULAR_DISTANCE_SHARE * max(bend.lengths)
     near, far = bend.reach
@@ -270,11 +237,11 @@ def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, words: Mess
             raise InputError(
                 f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
                 f"{distance[worst]:.6g} m from the shoulder, {word}: arms of {arms}{bent} need a "
-                f"distance between {near:g} m and {far:g} m; change {words.remedies}"
+                f"distance between {near:g} m and {far:g} m; change {words.motion}"
             )
 
 
-def _check_height(t: np.ndarray, height: np.ndarray, length: float, words: Messages) -> None:
+def _check_height(t: np.ndarray, height: np.ndarray, length: float, words: Words) -> None:
     """Raise when the path is higher or lower than one arm reaches."""
     wrong = np.flatnonzero(~(np.abs(height) <= (1.0 - SINGULAR_DISTANCE_SHARE) * length))
     if wrong.size:
@@ -283,7 +250,7 @@ def _check_height(t: np.ndarray, height: np.ndarray, length: float, words: Messa
         raise InputError(
             f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
             f"{abs(height[worst]):.6g} m {side} the shoulder, upright or out of reach: one arm of "
-            f"{length:g} m needs less than {length:g} m; change {words.remedies}"
+            f"{length:g} m needs less than {length:g} m; change {words.motion}"
         )
 
 

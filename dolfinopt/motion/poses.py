@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.motion.constraints import Derivatives
+from dolfinopt.motion.curves import Derivatives
 from dolfinopt.multibody.dimension import SpaceTurning
 
 RPY = ("roll", "pitch", "yaw")

@@ -296,32 +296,21 @@ class ClosedLoops:
                 found[site.way[-1]] = own
         return found
 
-    def _loads(self, multipliers: np.ndarray) -> list[Loads]:
-        """Return the loads of every closure on its two frames."""
-        every, found, k = multipliers.T, [], 0
-        for tie, (a, b) in zip(self.loops.ties, self._sites, strict=True):
-            parts = []
-            for one in tie.equations:
-                parts.append(_scaled(one.loads(a, b), every[k]))
-                k += 1
-            found.append(_sum(parts))
-        return found
-
-    def _changes(self, multipliers: np.ndarray, moved: Sequence[Moved]) -> list[Loads]:
-        """Return how they change by motions of the frames of every closure."""
-        every, found, k = multipliers.T, [], 0
-        for tie, (a, b), by in zip(self.loops.ties, self._sites, moved, strict=True):
-            parts = []
-            for one in tie.equations:
-                parts.append(_scaled(one.changes(a, b, by), every[k]))
-                k += 1
-            found.append(_sum(parts))
+    def _loads(self, multipliers: np.ndarray, moved: Sequence[Moved] | None = None) -> list[Loads]:
+        """Return the loads of every closure on its two frames, or their change as frames move."""
+        weights, found = iter(multipliers.T), []
+        for k, (tie, sites) in enumerate(zip(self.loops.ties, self._sites, strict=True)):
+            every = [
+                one.loads(*sites) if moved is None else one.changes(*sites, moved[k])
+                for one in tie.equations
+            ]
+            found.append(_sum([_scaled(loads, next(weights)) for loads in every]))
         return found
 
     def hessian(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the derivative of `generalised_force` by all coordinates (n, C, C)."""
         moved = [(a.by_place, a.by_spin, b.by_place, b.by_spin) for a, b in self._sites]
-        changes = self._changes(multipliers, moved)
+        changes = self._loads(multipliers, moved)
         size, count = self.posed.mechanism.num_rigid + self.posed.q.shape[1], len(self.posed.q)
         found = np.zeros((count, size, size))
         for sites, loads, changed in zip(
@@ -367,7 +356,7 @@ class ClosedLoops:
                 by["K0_outboard"] = np.zeros_like(body.K0_outboard)
         moved = [(*a.along(virtual), *b.along(virtual)) for a, b in self._sites]
         values = self._loads(weights)
-        forces, changes = self._loads(multipliers), self._changes(multipliers, moved)
+        forces, changes = self._loads(multipliers), self._loads(multipliers, moved)
         for sites, value, load, change in zip(self._sites, values, forces, changes, strict=True):
             for site, of_gap, of_force, by in zip(sites, value, load, change, strict=True):
                 self._add_gradient(found, site, of_gap, of_force, by, virtual)

@@ -204,7 +204,7 @@ def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]
     flexible = [arm.name for arm in scene.arms if arm.flexible]
     loaded = zip(flexible, run.evaluation.loaded_frequencies, strict=False)
     return {
-        "grayness": float(np.average(grays, weights=volumes)),
+        "grayness": float(np.average(grays, weights=volumes)) if traits else 0.0,
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
         "connected": max((one.contacts.pieces for one in traits.values()), default=0),
         "contacts": {name: _contacts(one.contacts) for name, one in by_arm.items()},

@@ -3,7 +3,7 @@
 The first frequency of every arm is that with what it carries, as objective and as limit. Under
 [control] the machine is linearised about its simulated motion at the instants of
 `constraints.poles_at`: damping ratio and frequency of the closed loop's poles have exact gradients.
-Poles move with the bodies and with the motion: `dynamics.state_space` has both derivatives, the
+Poles move with the bodies and with the motion: `dynamics.poles` has both derivatives, the
 adjoint of the trajectory the second part.
 """
 
@@ -18,9 +18,10 @@ import numpy as np
 from dolfinopt.arms.arm import fixed_body
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.modes import Chain, LoadedModes, RigidIntegrals, rigid_integrals
+from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.state_space import Poles, damping_ratios, linearised, poles_of
 from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.build import build_mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of

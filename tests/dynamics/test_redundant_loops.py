@@ -9,7 +9,7 @@ import pytest
 from loops import bennett, closed, cranks
 
 import dolfinopt as do
-from dolfinopt.dynamics.machine_system import MachineSystem, feed_forward
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 
@@ -77,4 +77,3 @@ def test_forces_of_least_norm_are_smooth(tmp_path) -> None:
     J = here.jacobian[:, :, dependent]
     range_of = np.einsum("nkd,ndj,nj->nk", J, np.linalg.pinv(J), found)
     assert np.abs(range_of - found).max() < 1e-10 * np.abs(found).max()
-    assert feed_forward(system.rigid, desired, system.drives, system.loops).shape[1] == 2

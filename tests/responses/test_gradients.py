@@ -323,7 +323,12 @@ CASES = [
     case("controlled", "pole_frequency", UNFORESEEN, slow=True),
     case("controlled", "damping_ratio", GRAVITY, "control.limits=[150.0,200.0,150.0]", *SPRINGY,
          "arms.joint_damping=3.0", "constraints.damping_below=60.0", *FINER, slow=True),
-    case("space", "damping_ratio", HELD, BENT, slow=True),
+    case("space", "damping_ratio", HELD, BENT, "simulation.tolerance=1e-5", slow=True),
+    # In closed loops: of the motions that the constraints leave, too, and of their rates.
+    case("slider", "pole_frequency", CRANK.replace("2e3", "2e5"), BENT, GRAVITY),
+    case("pin", "damping_ratio", CRANK, "constraints.poles_at=[0.03,0.08]"),
+    case("boom", "damping_ratio", BOOM_HELD),
+    case("loop", "damping_ratio", BENT, "control={stiffness=[100.0], damping=[0.1]}"),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", kind, "design.filter_radius=0.05", *FINER)
       for kind in get_args(ObjectiveKind) if kind not in POLES),

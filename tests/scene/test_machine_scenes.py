@@ -109,9 +109,6 @@ def test_two_arms_that_cannot_be(make, told):
         ("slider", {"arms": [CRANK | {"joint_stiffness": 1.0, "gear_stiffness": 1.0}, ROD]},
          ["arms.0.joint_stiffness (crank) = 1.0", "only one of"]),
         # Where it cannot be assembled the instant is named.
-        ("slider", {"control": {"stiffness": [2e3], "damping": [20.0]},
-                    "constraints": {"pole_frequency": 3.0}},
-         ["constraints.pole_frequency", "closure"]),
         ("slider", {"closure": {"point": [0.0, 1.0]}},
          ["closures: at t = 0 s the loop of closure", "cannot be closed"]),
         ("slider", {"closure": {"point": [0.0, 0.25]}},

@@ -509,7 +509,6 @@ CONTRADICTIONS = [
     (2, SHARED | {"arms.1.density": 1.0}, "arms.1.density (arm2) = 1.0", "no value"),
     (2, SHARED | {"arms.1.rigid": True}, "arms.1", "only one of design, pattern"),
     (2, {"arms.1.design": "arm3"}, "arms.1.design", 'design of its own: "arm1"'),
-    (2, {"arms.0.rigid": True, "arms.1.rigid": True}, "arms", "at least one arm with a design"),
     # Limits and what they need.
     (2, {"objective.kind": "mass", "constraints.mass": 1.0}, "objective", "under [constraints]"),
     (2, {"constraints.tip_deflection": [1e-3, 1e-3, 1e-3]}, "constraints.tip_deflection = [",

@@ -41,8 +41,9 @@ class Interface(Table):
     )
     radius: Length | None = Field(
         default=None,
-        description="of an arm made of cells: the sides of cells on its surface whose middle is "
-        "at most so far from the point are the interface; with axis, of the bore [m]",
+        description="of an arm made of cells: the sides of cells on its surface whose middle lies "
+        "within this distance of the point, each as a whole, are the interface; with axis, of the "
+        "bore [m]",
     )
     axis: Vector | None = Field(
         default=None,
