@@ -73,6 +73,15 @@ class Tangent:
     own: np.ndarray
     order: np.ndarray | slice
 
+    @classmethod
+    def of_matrix(cls, matrix: np.ndarray, keep: np.ndarray | None = None) -> Tangent:
+        """Return that of W rows by W coordinates and their rates (n, W, W, 3), by some or all."""
+        count, size = matrix.shape[:2]
+        own = np.arange(size) if keep is None else keep
+        right = (matrix if keep is None else matrix[:, :, keep]).reshape(count, size, -1)
+        block = Block(slice(0, size), slice(0, right.shape[2]), None, right)
+        return cls((block,), own, slice(None))
+
     def window(self, first: int, last: int) -> Tangent:
         """Return the instants first..last - 1."""
         part, blocks = slice(first, last), []

@@ -337,7 +337,7 @@ def test_as_many_coordinates_as_there_are() -> None:
     """Of few cells all poles are those of the finite elements; far too many are not tried."""
     few = two_arm("arms.cells=[8,2]", "arms.passive=0", "design.filter_radius=0")
     assert do.Model(scene_from_dict(few)).state_space(1.0, below=1e9).accurate_below == np.inf
-    with pytest.raises(do.ConvergenceError, match="--below 1e.09: with 100 coordinates"):
+    with pytest.raises(do.ConvergenceError, match=r"--below 1e.09: with 100 coordinates"):
         do.Model(scene_from_dict(two_arm())).state_space(0.0, below=1e9)
 
 
