@@ -15,9 +15,8 @@ from dolfinopt.dynamics.measured import (
     EQUILIBRIUM_KEPT_CONTRACTION,
     EQUILIBRIUM_ROUNDING_ERROR,
     EQUILIBRIUM_STALLED_ERROR,
-    IDENTITY_ROUNDING_ERROR,
     MEAN_MASS_INSTANTS,
-    PROPORTION_ROUNDING_ERROR,
+    ROUNDING,
 )
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_error
 from dolfinopt.dynamics.tables import motion_at_stages
@@ -292,7 +291,7 @@ def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     # uses them sees that the coordinates are uncoupled by them.
     changed = body.in_basis(T)
     one = np.eye(len(changed.K))
-    if np.abs(changed.K - one).max(initial=0.0) > IDENTITY_ROUNDING_ERROR:
+    if np.abs(changed.K - one).max(initial=0.0) > ROUNDING:
         return changed
     share = proportion([body.K], [body.D])
     return replace(changed, K=one, D=changed.D if share is None else share * one)
@@ -307,6 +306,6 @@ def proportion(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> float
     place = np.unravel_index(np.abs(here[k]).argmax(), here[k].shape)
     factor = float(there[k][place] / here[k][place])
     for a, b, size in zip(here, there, largest, strict=True):
-        if np.abs(b - factor * a).max(initial=0.0) > PROPORTION_ROUNDING_ERROR * abs(factor) * size:
+        if np.abs(b - factor * a).max(initial=0.0) > ROUNDING * abs(factor) * size:
             return None
     return factor

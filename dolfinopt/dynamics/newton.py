@@ -12,12 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Stages, at_stages, residual_at, step_ends
-from dolfinopt.dynamics.measured import (
-    KEPT_CONTRACTION,
-    LEAST_CONTRACTION,
-    ROUNDING_STEP,
-    SETTLED_SHARE,
-)
+from dolfinopt.dynamics.measured import KEPT_CONTRACTION, SETTLED_SHARE
 from dolfinopt.dynamics.newton_matrix import (
     NewtonMatrix,
     chunks,
@@ -109,8 +104,7 @@ def newton(
             step = None
             continue
         at, rate = there, following.length / step.length if step.length > 0.0 else 0.0
-        left = max(rate, LEAST_CONTRACTION) / (1.0 - min(rate, 0.5)) * following.length
-        if share == 1.0 and (left <= limits.goal * tolerance or following.length <= ROUNDING_STEP):
+        if share == 1.0 and rate * following.length <= limits.goal * tolerance:
             return Iterate(at.a + following.change, True, iteration)
         if share == 1.0 and rate <= KEPT_CONTRACTION:
             step = following
