@@ -29,6 +29,7 @@ from dolfinopt.dynamics.measured import (
     GRIDS_LIMIT,
     LOST_MOTION_ERROR,
     MARCH_ERROR_SHARE,
+    ROUNDING,
     STEPS_LIMIT,
 )
 from dolfinopt.dynamics.newton import Limits, newton_in_chunks
@@ -150,7 +151,8 @@ class _Integration:
             if solution.error <= ACCEPTED_SHARE * self._tolerance:
                 return _changed(solution, self._preconditioner.from_modes)
             grid = self._finer(errors, before, marched)
-            if len(grid) > STEPS_LIMIT or self._stalled > 3:
+            lost = solution.error < ROUNDING and self._stalled
+            if lost or len(grid) > STEPS_LIMIT or self._stalled > 3:
                 break
             self.time_grid = grid
         return self._best()
