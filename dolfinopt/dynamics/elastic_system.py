@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
+from scipy.linalg import LinAlgError, eigh
 
 from dolfinopt.dynamics.measured import (
     EQUILIBRIUM_ITERATIONS,
@@ -274,15 +274,12 @@ def _vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     if len(K) == 0:  # a rigid body
         return K, K, np.zeros(0)
     try:
-        L = cholesky(K, lower=True)
+        m, T = eigh(0.5 * (M + M.T), K)
     except LinAlgError:  # indefinite by rounding: its own coordinates do, if not as well
         scale = np.sqrt(np.abs(np.diag(K)))
         scale[scale == 0.0] = 1.0
         return np.diag(1.0 / scale), np.diag(scale), np.abs(np.diag(M)) / scale**2
-    half = solve_triangular(L, M, lower=True)
-    scaled = solve_triangular(L, half.T, lower=True)
-    m, Y = eigh(0.5 * (scaled + scaled.T))
-    return solve_triangular(L, Y, trans="T", lower=True), (L @ Y).T, np.maximum(m, 0.0)
+    return T, T.T @ K, np.maximum(m, 0.0)
 
 
 def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
