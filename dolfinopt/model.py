@@ -357,6 +357,7 @@ class Model:
         if kind not in (None, *get_args(GradientKind)):
             raise InputError(f"kind {kind!r}: expected one of {', '.join(get_args(GradientKind))}")
         scene = self.scene
+        scene.check_designed()
         if kind is not None:
             objective = scene.objective.model_copy(update={"gradient": kind})
             scene = scene.model_copy(update={"objective": objective})
@@ -365,6 +366,28 @@ class Model:
             choose_coordinates(scene, partition, arms, x_phys, self._profile)
         _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
         return self._gathered(gradient(scene, partition, arms, trajectory, self._profile))
+
+    def state_space(self, t: float, x: Design = None, *, below: float | None = None) -> StateSpace:
+        """Return the machine linearised about its motion at an instant.
+
+        Args:
+            t: the instant, s.
+            x: the design, see the class; None: the initial one.
+            below: frequency below which the poles are to hold 1 %, Hz: the arms take as many
+                coordinates as that needs. None: those of the scene; `StateSpace.accurate_below`
+                tells up to where they do.
+
+        Raises:
+            InputError: the instant is not within the motion, or as `simulate` does.
+            ConvergenceError: no number of coordinates does; or as `simulate` does.
+        """
+        from dolfinopt.responses.linearised_machine import linearised_machine
+
+        partition, arms, x_phys = self._prepared(x)
+        choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
+        return linearised_machine(
+            self.scene, partition, arms, x_phys, t, self._profile, below=below
+        )
 
     def optimize(
         self,
@@ -475,6 +498,7 @@ class Model:
         from dolfinopt.part.folder import file_names, write_parts
         from dolfinopt.part.part import Curves, make_parts, mesh_parts
 
+        self.scene.check_designed()
         out = None if folder is None else Path(folder)
         if out is not None:
             on_root(self._world, check_sources, out, file_names(self.scene), self.scene)

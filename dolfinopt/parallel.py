@@ -80,7 +80,7 @@ def partition_arms(world: MPI.Comm, cells: Mapping[int, int], *, whole: bool = F
     if world.size <= len(arms):
         mine = tuple(arms[world.rank :: world.size])
         color = world.rank
-    elif max(cells.values()) >= SPLIT_CELLS and not whole:
+    elif max(cells.values(), default=0) >= SPLIT_CELLS and not whole:
         color = world.rank * len(arms) // world.size
         mine = (arms[color],)
     else:

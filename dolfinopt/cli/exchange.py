@@ -69,6 +69,13 @@ KINDS = (".sid", ".sid.npz", ".fem")
     "RUN/state-space or results/SCENE-state-space",
 )
 @click.option(
+    "--below",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="HZ",
+    help="with --state-space: poles below this frequency hold 1 %; the arms take as many "
+    "coordinates as that needs; default: those of the scene",
+)
+@click.option(
     "--before",
     type=PATH,
     metavar="DIR",
@@ -82,6 +89,7 @@ def export(
     overrides: tuple[str, ...],
     urdf: bool,
     instant: float | None,
+    below: float | None,
     before: Path | None,
 ) -> None:
     """Write the reduced arms of SCENE for other multibody codes, or its linearised machine.
@@ -93,8 +101,10 @@ def export(
     if instant is not None:
         if urdf or before is not None:
             raise InputError("--state-space: expected no --urdf and no --before with it")
-        _export_state_space(scene, instant, design, out, overwrite, overrides)
+        _export_state_space(scene, instant, below, design, out, overwrite, overrides)
         return
+    if below is not None:
+        raise InputError("--below: expected --state-space with it")
     if urdf:
         if design is not None or overrides:
             raise InputError("--urdf: expected no --design and no --set, they are the run's")
@@ -110,13 +120,13 @@ def export(
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.exchange.mbdyn import write_fem
-    from dolfinopt.exchange.sid import write_sid, write_sid_npz
     from dolfinopt.output.design import arms_with_design
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import decide_stiffening
     from dolfinopt.responses.order_selection import choose_coordinates
     from dolfinopt.scene.load import pose_scenarios
+    from dolfinopt.scene.sid import write_sid, write_sid_npz
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
     claim(world, folder, overwrite, names, scene=loaded)
@@ -152,6 +162,7 @@ STATE_SPACE = ("state_space.npz", "state_space.mat")
 def _export_state_space(
     source: Path,
     instant: float,
+    below: float | None,
     design: Path | None,
     out: Path | None,
     overwrite: bool,
@@ -164,30 +175,19 @@ def _export_state_space(
             raise InputError("--design: expected none with the folder of a run, which has its own")
         design, folder = source / "design.npz", out or source / "state-space"
     world, loaded = _machine(source, overrides)
-    if not 0.0 <= instant <= loaded.motion.horizon:
-        raise InputError(
-            f"--state-space {instant:g}: expected an instant from 0 to motion.horizon = "
-            f"{loaded.motion.horizon:g} [s]"
-        )
-    claim(world, folder, overwrite, STATE_SPACE, scene=loaded)
-    from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.dynamics.state_space import state_space
+    from dolfinopt.dynamics.state_space import check_instant
     from dolfinopt.output.design import arms_with_design
-    from dolfinopt.parallel import on_root, together
+    from dolfinopt.parallel import together
     from dolfinopt.profiling import Profile
-    from dolfinopt.responses.evaluation import evaluate
+    from dolfinopt.responses.linearised_machine import linearised_machine
     from dolfinopt.responses.order_selection import choose_coordinates
 
+    check_instant(loaded, instant)
+    claim(world, folder, overwrite, STATE_SPACE, scene=loaded)
     profile = Profile()
     partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
-    trajectory: Trajectory | None = evaluate(loaded, partition, arms, x_phys, profile)[1]
-
-    def found() -> StateSpace:
-        assert trajectory is not None
-        return state_space(trajectory, instant)
-
-    model = on_root(world, found)
+    model = linearised_machine(loaded, partition, arms, x_phys, instant, profile, below=below)
     prepare(world, folder)
     with together(world):
         if world.rank == 0:
@@ -223,6 +223,7 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
         f"{kind}, at {model.time:g} s: {len(model.states)} states, {len(model.inputs)} inputs, "
         f"{len(model.outputs)} outputs; in {npz}, {mat.name}"
     )
+    click.echo(f"  {_accuracy(model.accurate_below)}")
     poles = [pole for pole in model.poles if pole.imag >= 0.0]
     for pole in poles[:5]:
         size = abs(pole)
@@ -238,12 +239,19 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
         )
 
 
+def _accuracy(frequency: float) -> str:
+    """Return how far the poles can be trusted, against twice as many coordinates, Hz."""
+    if frequency == float("inf"):
+        return "all poles hold 1 %"
+    return f"poles below {frequency:.4g} Hz hold 1 %, those above need more coordinates (--below)"
+
+
 def _why(scene: Scene, index: int) -> str:
     """Return why an arm has no files; of a rigid one what another program needs of it."""
     if not scene.arms[index].rigid:
         return "it comes from a file"
     from dolfinopt.arms.arm import fixed_body
-    from dolfinopt.multibody.shape_integrals import in_space
+    from dolfinopt.exchange.in_space import in_space
 
     body = in_space(fixed_body(scene, index))
     centre, tensor = body.inertia_about_centre()
@@ -258,8 +266,8 @@ def _why(scene: Scene, index: int) -> str:
 
 def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
-    from dolfinopt.multibody.shape_integrals import in_space, plate_moments
-    from dolfinopt.multibody.standard_input import lumped_nodes, modal_element, to_sid
+    from dolfinopt.exchange.in_space import in_space, plate_moments
+    from dolfinopt.exchange.standard_input import lumped_nodes, modal_element, to_sid
 
     body = arm.reduce(x_phys)
     title = f"{arm.mesh.name} of {arm.scene.name}"

@@ -64,6 +64,7 @@ def optimize(
     if resume and overwrite:
         raise InputError("--resume, --overwrite: expected only one of them")
     world, loaded = load(scene, overrides)
+    loaded.check_designed()
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
     from dolfinopt.output.folders import working_alone
@@ -211,6 +212,7 @@ def gradient(
     if kind is not None:
         overrides = (*overrides, f'objective.gradient="{kind}"')
     world, loaded = load(scene, overrides)
+    loaded.check_designed()
     from dolfinopt.optimization.gradient_check import check_exact
     from dolfinopt.output.design import arms_with_design, write_gradient
     from dolfinopt.profiling import Profile

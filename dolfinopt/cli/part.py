@@ -125,8 +125,7 @@ def part(
         raise InputError("--resume, --overwrite: expected only one of them")
     scene: Scene = on_root(world, scene_of, folder)
     target = out or folder / "part"
-    if not scene.cell_counts:
-        raise InputError(f"{folder}: no arm has a design: all are rigid or come from files")
+    scene.check_designed()
     given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip

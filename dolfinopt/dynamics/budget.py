@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.kinematics import end_effector_gradient
-
-if TYPE_CHECKING:
-    from dolfinopt.dynamics.simulation import Trajectory
-    from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.ranks import least_norm
 
 # Kinds of parts, and the words for all of a kind.
 KINDS = {
@@ -80,74 +77,70 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     """
     worst = int(np.argmax(trajectory.distance))
     size = float(trajectory.distance[worst])
-    closure = trajectory.closure
-    if size == 0.0 or (closure is not None and closure.count > 1):  # a pin holds the end
+    closure = trajectory.scene.closure
+    if size == 0.0 or (closure is not None and closure.kind == "pin"):  # it holds the end
         return None
-    at = slice(worst, worst + 1)
-    desired = trajectory.desired[at]
-    by_q, by_rigid = _derivatives(trajectory, desired, trajectory.deviation[at] / size)
-    found = [*_elastic(trajectory, worst, by_q), *_rigid(trajectory, worst, by_rigid)]
+    seen = trajectory.at(trajectory.t[worst : worst + 1])
+    by_rigid, by_q = _derivatives(seen, seen.deviation / size)
+    found = [*_elastic(seen, by_q), *_rigid(seen, by_rigid)]
     linear = sum(deflection for _, _, deflection in found)
     if linear == 0.0:
         return None
-    parts = [Contribution(kind, name, x, x / linear) for kind, name, x in found]
     order = list(KINDS)
-    parts.sort(key=lambda one: order.index(one.kind))
-    return Budget(float(trajectory.t[worst]), size, linear, tuple(parts))
+    found.sort(key=lambda one: order.index(one[0]))
+    parts = tuple(Contribution(kind, name, x, x / linear) for kind, name, x in found)
+    return Budget(float(seen.t[0]), size, linear, parts)
 
 
-def _derivatives(
-    trajectory: Trajectory, desired: RigidMotion, direction: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return those of the end-effector's place along a direction (1, d): (N,), (R,)."""
-    mechanism, none = trajectory.mechanism, np.zeros((1, trajectory.mechanism.num_coordinates))
+def _derivatives(seen: Trajectory, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return those of the end-effector's place along a direction (1, d): (R,), (N,)."""
+    mechanism, problem, desired = seen.mechanism, seen.problem, seen.desired
+    none = np.zeros((1, mechanism.num_coordinates))
     by_q, by_rigid, _ = end_effector_gradient(mechanism, desired, none, direction)
-    problem = trajectory.problem
-    if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
-        return by_q[0], by_rigid[0]
-    G = problem.rigid_loops.at(mechanism, desired.q, none).jacobian[0]
-    dependent = problem.drives.free[~problem.drives.driven]
     every = np.concatenate([by_rigid[0], by_q[0]])
-    every -= np.linalg.solve(G[:, dependent].T, every[dependent]) @ G
-    return every[by_rigid.shape[1] :], every[: by_rigid.shape[1]]
+    if isinstance(problem, MachineSystem) and problem.loops is not None:
+        G = problem.loops.at(mechanism, desired.q, none).jacobian
+        dependent = problem.drives.dependent
+        weights = least_norm(G[:, :, dependent].swapaxes(1, 2), every[None, dependent])
+        every -= (weights @ G[0])[0]
+    return every[: by_rigid.shape[1]], every[by_rigid.shape[1] :]
 
 
-def _elastic(
-    trajectory: Trajectory, worst: int, by_q: np.ndarray
-) -> Iterator[tuple[str, str, float]]:
+def _elastic(seen: Trajectory, by_q: np.ndarray) -> Iterator[tuple[str, str, float]]:
     """Yield what links and bearings contribute."""
-    mechanism, scene = trajectory.mechanism, trajectory.scene
-    q, joints = trajectory.q_e[worst], scene.joint_names
-    names = [("link", arm.name) for arm in scene.arms]
+    mechanism, joints, q = seen.mechanism, seen.scene.joint_names, seen.q_e[0]
+    names = [("link", arm.name) for arm in seen.scene.arms]
     names += [("bearing", joints[k]) for k in mechanism.bearings]
     for (kind, name), part in zip(names, mechanism.slices, strict=True):
         if part.stop > part.start:
             yield kind, name, float(by_q[part] @ q[part])
 
 
-def _rigid(
-    trajectory: Trajectory, worst: int, by_rigid: np.ndarray
-) -> Iterator[tuple[str, str, float]]:
-    """Yield what gears and errors of the control contribute."""
-    problem, names = trajectory.problem, list(trajectory.scene.rigid_units)
+def _rigid(seen: Trajectory, by_rigid: np.ndarray) -> Iterator[tuple[str, str, float]]:
+    """Yield what gears, rods and errors of the control contribute."""
+    problem, scene, names = seen.problem, seen.scene, list(seen.scene.rigid_units)
     if not isinstance(problem, MachineSystem):
         return
-    drives, error = problem.drives, trajectory.q_r[worst] - trajectory.desired.q[worst]
-    rods = {one.name for one in trajectory.scene.rods}
-    motors, winding = trajectory.motor_columns, np.zeros_like(error)
-    if drives.winding:
-        asked = problem.at(trajectory.t[worst : worst + 1]).winding
-        assert asked is not None
-        winding[drives.free] = asked[0]
-    for k in map(int, drives.free[drives.driven]):
-        if trajectory.scene.control is None:
+    error, gives_way = (seen.q_r - seen.desired.q)[0], _gives_way(seen)
+    rods = {one.name for one in scene.rods}
+    for k in map(int, problem.drives.free[problem.drives.driven]):
+        if scene.control is None or k in seen.motor_columns:
             kind = "rod" if names[k] in rods else "gear"
-            yield kind, names[k], float(by_rigid[k] * error[k])
-            continue
-        left = 0.0
-        if k in motors:
-            assert trajectory.motors is not None
-            twist = trajectory.q_r[worst, k] - trajectory.motors[worst, motors.index(k)]
-            left = twist + winding[k]
-            yield "gear", names[k], float(by_rigid[k] * left)
-        yield "control", names[k], float(by_rigid[k] * (error[k] - left))
+            yield kind, names[k], float(by_rigid[k] * gives_way[k])
+        if scene.control is not None:
+            yield "control", names[k], float(by_rigid[k] * (error[k] - gives_way[k]))
+
+
+def _gives_way(seen: Trajectory) -> np.ndarray:
+    """Return by how much every gear and rod gives way (R,), rad or m."""
+    problem, columns = seen.problem, list(seen.motor_columns)
+    assert isinstance(problem, MachineSystem)
+    if seen.scene.control is None:  # motors are where they are asked to be
+        return np.asarray((seen.q_r - seen.desired.q)[0])
+    found = np.zeros(seen.q_r.shape[1])
+    if seen.motors is not None:
+        found[columns] = seen.q_r[0, columns] - seen.motors[0]
+    winding = problem.at(seen.t).winding
+    if winding is not None:
+        found[problem.drives.free] += winding[0]
+    return found

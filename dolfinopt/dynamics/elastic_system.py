@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import prod
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -21,10 +22,12 @@ from dolfinopt.dynamics.measured import (
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_error
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.loads import is_loaded_at_rest
+from dolfinopt.multibody.newton_euler import elastic_residual
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.tangent import linearise
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +43,7 @@ class ElasticInstants:
 
     def __getitem__(self, part: slice | np.ndarray) -> ElasticInstants:
         """Return it at some of the instants."""
-        return ElasticInstants(self.mechanism[part], self.motion[part])
+        return ElasticInstants(self.mechanism, self.motion[part])
 
     def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the elastic residual (n, N)."""
@@ -108,7 +111,10 @@ class ElasticSystem:
         return self.mechanism.norm(q)
 
     def slowest_frequency(self) -> float:
-        """Return that of the slowest vibration of the undeformed mechanism at t = 0, rad/s."""
+        """Return that of the slowest vibration of the undeformed mechanism at t = 0, rad/s.
+
+        0 of rigid arms.
+        """
         size = self.num_coordinates
         if size == 0:
             return 0.0
@@ -240,7 +246,7 @@ class Modes(Generic[Own]):
         return self._each(by_z, [inverse.T for inverse in self.inverses])
 
     def _each(self, x: np.ndarray, maps: tuple[np.ndarray, ...] | list[np.ndarray]) -> np.ndarray:
-        parts, rows = self.system.mechanism.slices, x.reshape(-1, x.shape[-1])
+        parts, rows = self.system.mechanism.slices, x.reshape(prod(x.shape[:-1]), x.shape[-1])
         pieces = [rows[:, part] @ T.T for part, T in zip(parts, maps, strict=True)]
         return np.concatenate(pieces, axis=1).reshape(x.shape)
 

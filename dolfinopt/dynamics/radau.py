@@ -64,6 +64,8 @@ def integrate(
         ConvergenceError: neither Newton's method over the whole horizon nor a march converges,
             finer steps do not find the same motion, or the tolerance is beyond rounding.
     """
+    if system.num_coordinates == 0:
+        return _prescribed(system, stages)
     preconditioner = system.preconditioner()
     grid = None
     if guess is not None and guess.a.shape[2] == system.num_coordinates:
@@ -244,6 +246,13 @@ class _Integration:
             method = radau_iia(self._stages)
             self._kept = self.time_grid, stages_of(self._preconditioner, method, self.time_grid)
         return self._kept[1]
+
+
+def _prescribed(system: System, stages: int) -> Solution:
+    """Return the solution of a system without coordinates: rigid arms on a prescribed motion."""
+    time_grid, nodes = np.array(system.breakpoints), radau_iia(stages).c
+    a = np.zeros((len(time_grid) - 1, stages, 0))
+    return Solution(time_grid, nodes, a[:, 0], a[:, 0], a, 0.0, 0)
 
 
 def _changed(solution: Solution, change: Callable[[np.ndarray], np.ndarray]) -> Solution:

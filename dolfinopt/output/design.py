@@ -471,8 +471,11 @@ def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
     """Write design.vtu and design.xdmf: density, arm and, if known, stress by cell, see `_Sheet`.
 
     One grid, because few programs read collections. ParaView and PyVista read both, meshio the
-    former: it takes no XDMF with the instant without which PyVista takes none.
+    former: it takes no XDMF with the instant without which PyVista takes none. Without a designed
+    arm neither is written.
     """
+    if not designed(views):
+        return
     sheet = _sheet(views)
     _write_vtu(folder / "design.vtu", sheet)
     _write_xdmf(folder / "design.xdmf", sheet)

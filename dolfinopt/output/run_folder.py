@@ -233,12 +233,13 @@ def optimize(
 
     Raises:
         InputError: `resume` without a matching checkpoint; the folder holds results, and neither
-            `resume` nor `overwrite` is set; another run works there.
+            `resume` nor `overwrite` is set; another run works there; no arm has a design.
         ConvergenceError: a simulation failed; the checkpoint keeps what was reached.
     """
     world = MPI.COMM_WORLD if world is None else world
     if resume and overwrite:
         raise InputError("resume, overwrite: expected only one of them")
+    scene.check_designed()
     if folder is None:
         return _optimize(scene, None, False, False, world, report, built)
     on_root(world, check_sources, folder, RUN_FILES, scene)

@@ -63,6 +63,15 @@ BUCKLING_WEIGHT_SHARE = 1e-8
 VOID_STRESS_SHARE = 1e-3
 LARGEST_FACTOR = 1e3  # above, nothing buckles: it tells nothing of a machine
 
+# -- linearised_machine ----------------------------------------------------------------------
+
+POLE_ERROR = 0.01  # of a pole, over its size, that an exported machine may have
+# Of it, that the poles may differ from those with twice as many coordinates. Demos: poles that do
+# hold it against four to sixteen times as many; with 1 one of spatial_arm.toml did not.
+POLE_ERROR_SHARE = 0.5
+POLE_COORDINATES_GROWTH = 1.25
+POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tries
+
 # -- poles -----------------------------------------------------------------------------------
 
 # k of the smooth least damping ratio: poles that are damped by 0.0025 more count e times less, and

@@ -73,13 +73,13 @@ def choose_coordinates(
         reserve: how many times less than the tolerance the estimate must be.
 
     Returns:
-        The choice; None where the scene states a number.
+        The choice; None where the scene states a number, or no arm is flexible.
 
     Raises:
         ConvergenceError: no number up to `TRIED_COORDINATES_LIMIT` meets the tolerance; on all
             ranks alike.
     """
-    if scene.reduction.coordinates != "auto":
+    if scene.reduction.coordinates != "auto" or not scene.cell_counts:
         return None
     comparison = _Comparison(scene, partition, arms, x_phys, profile)
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)

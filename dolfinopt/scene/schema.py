@@ -119,6 +119,14 @@ class Scene(Table):
         """Indices of the arms with design variables of their own."""
         return tuple(i for i, arm in enumerate(self.arms) if arm.designed)
 
+    def check_designed(self) -> None:
+        """Raise `InputError` where no arm has a design: there is nothing to optimise."""
+        if not self.cell_counts:
+            raise InputError(
+                f"{self.source}: arms.rigid: nothing to design, as no arm is flexible or all come "
+                "from files; simulate, sweep, plot and export run such a machine"
+            )
+
     @property
     def has_walls(self) -> bool:
         """Whether arms with a design are hollow."""

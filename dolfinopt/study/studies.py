@@ -108,6 +108,8 @@ def study(
         InputError: something asked for is not possible; nothing was computed.
     """
     plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize, kinds)
+    if any(case.action == "optimize" for _, case in plan.rows):
+        scene.check_designed()
     return carry_out(plan, folder, world, shown=shown)
 
 
@@ -186,7 +188,8 @@ def _plan(
 def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
     """Return the files' designs by label, or else the initial and the optimised one.
 
-    Where the scene leaves nothing to optimise, as that of parts does, the solid arms alone.
+    Where the scene leaves nothing to optimise, as that of parts does or one of rigid arms, these
+    alone.
     InputError where a design cannot be read, or does not fit the scene's arms.
     """
     if designs:
@@ -201,6 +204,8 @@ def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
         return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
     if scene.design.is_solid:
         return {"solid arms": None}
+    if not scene.designed:
+        return {"rigid arms": None}
     optimised = Case(scene, "optimize", label="optimised design")
     return {"initial design": None, optimised.label: optimised}
 

@@ -527,9 +527,11 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scen
     if WORLD.rank == 0:
         told = capsys.readouterr().out
         assert "with its control, at 3 s: 22 states, 6 inputs, 7 outputs" in told
+        assert f"poles below {float(first['accurate_below']):.4g} Hz hold 1 %" in told
     for words, expected in (
         ([path, "--state-space", 5.0], "motion.horizon = 3"),
         ([path, "--state-space", 1.0, "--urdf"], "--urdf"),
+        ([path, "--below", 100.0], "--state-space"),
         ([out, "--state-space", 1.0, "--set", "payload.mass=2"], "--set"),
         ([out], "--state-space T"),
     ):

@@ -7,19 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
-from runs import refusal
+from runs import ROOT, refusal
 
 import dolfinopt as do
+from dolfinopt.dynamics.linearised import Linearised
+from dolfinopt.dynamics.poles import poles_of
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.dynamics.state_space import (
-    Linearised,
-    StateSpace,
-    free_machine,
-    null_space,
-    poles_of,
-    state_space,
-)
-from dolfinopt.scene.load import scene_from_dict
+from dolfinopt.dynamics.state_space import StateSpace, free_machine, state_space
+from dolfinopt.responses.linearised_machine import accurate_below
+from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
 MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
@@ -80,7 +76,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     every = np.concatenate([np.arange(moving), np.arange(last, system.num_coordinates)])
     dependent = np.flatnonzero(~system.drives.driven) if system.loops else np.zeros(0, dtype=int)
     independent = np.setdiff1d(every, dependent)
-    y, yd, rest = one.rates[0].copy(), one.rates[1].copy(), np.zeros_like(one.rates[0])
+    y, yd, rest = (x * one.rates[k, None] for k, x in enumerate((1.0, 1.0, 0.0)))
     n = len(independent)
     y[0, independent], yd[0, independent] = x[:n], x[n:]
 
@@ -88,7 +84,9 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
         motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
         here = system.loops.at(system.mechanism, motion.q, q)
         speeds = np.hstack([motion.qd, instants.split(yd)[1]])[0]
-        bias = [speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(system.loops.count)]
+        bias = [
+            speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(len(here.jacobian[0]))
+        ]
         return here.jacobian[0][:, system.columns], np.array(bias)
 
     if system.loops is not None:
@@ -103,13 +101,13 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
         yd[0, dependent] = -np.linalg.solve(J[:, dependent], swept)
     # The residual is linear in y''; multipliers stand there, too. What the simulation leaves at
     # the instant itself, forces of free drives above all, is an input that is held.
-    r = instants.residual(y, yd, rest)[0] - instants.residual(*one.rates)[0]
+    r = instants.residual(y, yd, rest)[0] - instants.residual(*one.rates[:, None])[0]
     units = np.eye(system.num_coordinates)
     matrix = np.stack([instants.residual(y, yd, u[None])[0] for u in units], axis=1)
     matrix -= instants.residual(y, yd, rest)[0][:, None]
     if system.loops is not None:
-        (J, bias), ydd = jacobian(y, yd), one.rates[2][0, :moving]
-        J0, bias0 = jacobian(*one.rates[:2])
+        (J, bias), ydd = jacobian(y, yd), one.rates[2, :moving]
+        J0, bias0 = jacobian(*one.rates[:2, None])
         desired = instants.desired.qdd[0, system.drives.free]
         size = len(desired)
         matrix[moving:last, :moving] = J
@@ -161,9 +159,8 @@ def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
     make, t = MACHINES[kind]
     trajectory = make()
     found, one = state_space(trajectory, t), free_machine(trajectory, t)
-    N = null_space(one)[0]
-    independent = [int(np.flatnonzero(column == 1.0)[0]) for column in N.T]
-    x = np.concatenate([one.rates[k][0, independent] for k in (0, 1)])
+    independent = one.independent
+    x = one.rates[:2, independent].ravel()
     n = len(independent)
     # By the coordinates' own masses, so that a step, and what it does, is J^(1/2).
     scale = np.sqrt(np.abs(np.diag(one.M)[independent]))
@@ -211,6 +208,149 @@ def test_least_damping_follows_the_control() -> None:
         assert (result.evaluation.constraints[-1] <= 0.0) == (measured >= 0.05)
         ratios.append(measured)
     assert ratios[1] > 1.2 * ratios[0]
+
+
+# -- closed loops of rigid arms, linearised by hand ------------------------------------------------
+
+
+def of_second_order(M: np.ndarray, D: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return the poles (2 n,) of M z'' + D z' + K z = 0, sorted."""
+    n = len(M)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
+    return np.sort_complex(np.linalg.eigvals(A))
+
+
+def bar(name: str, length: float) -> dict:
+    """Return a rigid arm in space that weighs nothing."""
+    return {"name": name, "rigid": True, "length": length, "mass": 0.0, "inertia": [0.0] * 6}
+
+
+def parallelogram(folder: Path, **tables) -> Scene:
+    """Return four bars on two motors about one axis that carry a payload, controlled.
+
+    Its closure is a pin about z: two of its five equations keep the bars together, those across
+    the plane are redundant.
+    """
+    (folder / "turn.csv").write_text("t,first,second\n0,2.0,0.6\n0.3,1.2,1.0\n")
+    chain = (("first", "ground", "a"), ("elbow", "a", "ab"),
+             ("second", "ground", "b"), ("wrist", "b", "ba"))  # fmt: skip
+    joints = [
+        {"name": name, "type": "revolute", "parent": parent, "child": child, "axis": [0, 0, 1],
+         "passive": name in ("elbow", "wrist")}
+        for name, parent, child in chain
+    ]  # fmt: skip
+    tree = {
+        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.3, "density": DENSITY},
+        "arms": [bar("a", 0.3), bar("ab", 0.4), bar("b", 0.4), bar("ba", 0.3)],
+        "joints": joints,
+        "closures": [{"name": "pin", "kind": "pin", "between": ["ba", "ab"], "axis": [0, 0, 1]}],
+        "motion": {"path": "joints", "file": "turn.csv", "horizon": 0.4, "gravity": [0, 0, -9.81],
+                   "initial_joints": [2.0, -1.4, 0.6, 1.4]},
+        "payload": {"arm": "ab", "mass": 0.5},
+        "control": {"stiffness": [500.0, 400.0], "damping": [5.0, 4.0]},
+    }  # fmt: skip
+    return scene_from_dict(with_keys(tree, tables), str(folder / "parallelogram.toml"))
+
+
+def test_poles_of_a_loop_in_space(tmp_path) -> None:
+    """Two coordinates, in motion: T = m |a e(alpha) + b e(beta)|'^2 / 2; the response is theirs."""
+    limits = {"damping_ratio": 0.1, "poles_at": [0.0, 0.1, 0.2]}
+    result = do.Model(parallelogram(tmp_path, constraints=limits)).simulate()
+    trajectory, ratios = result.trajectory, []
+    m, a, b = 0.5, 0.3, 0.4
+    for t in limits["poles_at"]:
+        motion = trajectory.at(np.array([t])).motion
+        (q, second), (w, v), (wd, vd) = (x[0, [0, 2]] for x in (motion.q, motion.qd, motion.qdd))
+        c, s = np.cos(q - second), np.sin(q - second)
+        M = m * np.array([[a * a, a * b * c], [a * b * c, b * b]])
+        D = np.diag([5.0, 4.0]) + 2.0 * m * a * b * s * np.array([[0.0, v], [-w, 0.0]])
+        turned = m * a * b * np.array([[c * v * v - s * vd], [-c * w * w - s * wd]])
+        exact = of_second_order(M, D, np.diag([500.0, 400.0]) + turned * [1.0, -1.0])
+        found = np.sort_complex(state_space(trajectory, t).poles)
+        assert np.abs(found - exact).max() < 1e-8 * np.abs(exact).max()
+        ratios.append((-exact.real / np.abs(exact)).min())
+    assert result.evaluation.values_of("damping_ratio")[0] == pytest.approx(min(ratios), rel=1e-8)
+
+
+def test_poles_of_a_loop_in_the_plane() -> None:
+    """A slider-crank in motion: (J + m x'^2) of its angle, with the slider's place x."""
+    J, m, r, rod = 0.01, 0.5, 0.15, 0.3
+    tree = loop_tree(control={"stiffness": [2e3], "damping": [20.0]}, payload={"mass": m})
+    tree["arms"] = [
+        {**tree["arms"][0], "inertia": J},
+        {**tree["arms"][1], "rigid": True, "mass": 0.0, "inertia": 0.0},
+    ]
+    trajectory = trajectory_of(scene_from_dict(tree))
+    motion = trajectory.at(np.array([0.03])).motion
+    angle, speed, rate = (float(x[0, 1]) for x in (motion.q, motion.qd, motion.qdd))
+
+    def inertia(z: np.ndarray) -> np.ndarray:
+        slope = -r * np.sin(z) - r * r * np.sin(z) * np.cos(z) / np.sqrt(
+            rod * rod - r * r * np.sin(z) ** 2
+        )
+        return J + m * slope**2
+
+    h = 1e-3
+    before, here, after = (float(inertia(angle + k * h)) for k in (-1.0, 0.0, 1.0))
+    slope, curvature = (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h)
+    exact = of_second_order(
+        np.array([[here]]),
+        np.array([[20.0 + slope * speed]]),
+        np.array([[2e3 + slope * rate + 0.5 * curvature * speed**2]]),
+    )
+    found = np.sort_complex(state_space(trajectory, 0.03).poles)
+    assert np.abs(found - exact).max() < 1e-5 * np.abs(exact).max()  # of the differences
+
+
+# -- how many coordinates the poles need -----------------------------------------------------------
+
+
+def largest_error(poles: np.ndarray, exact: np.ndarray, below: float, slowest: float) -> float:
+    """Return the largest relative distance of a pole below a frequency, Hz, from its partner."""
+    found = [0.0]
+    for one, other in ((poles, exact), (exact, poles)):
+        for pole in one[np.abs(one) < 2.0 * np.pi * below]:
+            found.append(np.abs(pole - other).min() / max(abs(pole), slowest))
+    return max(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "t", "below", "many"),
+    [("two_arm", 1.0, 500.0, 60), ("controlled_two_arm", 1.0, 500.0, 60),
+     ("spatial_arm", 0.3, 100.0, 40), ("four_bar", 0.1, 1000.0, 40)],
+)  # fmt: skip
+def test_poles_hold_what_is_said(name: str, t: float, below: float, many: int) -> None:
+    """Of the demos, one a loop, against far more coordinates: as they are, and as asked for."""
+    model = do.Model(ROOT / "demos" / f"{name}.toml")
+    exact = do.Model(model.scene, f"reduction.coordinates={many}").simulate().state_space(t).poles
+    slowest = 1.0 / model.scene.motion.horizon
+    few, enough = model.state_space(t), model.state_space(t, below=below)
+    assert few.accurate_below < below <= enough.accurate_below
+    for found in (few, enough):
+        assert largest_error(found.poles, exact, found.accurate_below, slowest) < 0.01
+        # Some pole is no better above.
+        assert largest_error(found.poles, exact, np.inf, slowest) > 0.01
+    assert len(few.poles) < len(enough.poles) < len(exact)
+
+
+def test_as_many_coordinates_as_there_are() -> None:
+    """Of few cells all poles are those of the finite elements; far too many are not tried."""
+    few = two_arm("arms.cells=[8,2]", "arms.passive=0", "design.filter_radius=0")
+    assert do.Model(scene_from_dict(few)).state_space(1.0, below=1e9).accurate_below == np.inf
+    with pytest.raises(do.ConvergenceError, match="--below 1e.09: with 100 coordinates"):
+        do.Model(scene_from_dict(two_arm())).state_space(0.0, below=1e9)
+
+
+def test_frequency_below_which_poles_are_pairs() -> None:
+    """The first one that is 0.5 % off, in either set; near zero they are measured by a rate."""
+    exact = np.array([1e-4, -1.0 + 99.0j, -200.0, 300.0j])
+    assert accurate_below(exact, exact, 1.0) == np.inf
+    for changed, first in (
+        ([-1e-3, *exact[1:]], np.inf), ([1e-4, -1.0 + 98.0j, *exact[2:]], 98.0051),
+        ([*exact[:2], -201.5, 300j], 200.0), (exact[:3], 300.0), ([*exact, 150.0], 150.0),
+    ):  # fmt: skip
+        found = accurate_below(np.array(changed), exact, 1.0)
+        assert found == pytest.approx(0.99 * first / (2.0 * np.pi), rel=1e-5)
 
 
 def test_instant_within_the_motion() -> None:

@@ -12,7 +12,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from loops import BOOM_TABLE, SOFT, boom, closed, four_bar
+from loops import BOOM_TABLE, SOFT, bennett, boom, closed, four_bar
 from machines import demo_machine
 from moved_nodes import built_with, node_test, noise
 from remainders import built_of, hold_instants, limit_rates, rates, taylor, wave
@@ -74,6 +74,7 @@ TURNED = SOFT | {"motion": {"horizon": 0.35, "gravity": [0, -9.81, 3.0]}}
 CLOSED = {
     "boom": (BOOM_TABLE, boom(), {}),
     "loop": ("t,turn\n0,0.5\n0.3,2.5\n", four_bar(), TURNED),
+    "bennett": ("t,j1\n0,0.5\n0.3,1.5\n", bennett(), TURNED | {"simulation": {"tolerance": 1e-4}}),
 }
 
 
@@ -279,6 +280,8 @@ CASES = [
     case("boom", "", *SPRUNG, BENT),
     case("boom", "", *YIELDING_BOOM, BOOM_HELD, slow=True),
     case("loop", "", BENT, "control={stiffness=[100.0], damping=[2.0]}"),
+    case("bennett", ""),
+    case("bennett", "peak_force", slow=True),
     # Settling in every rest.
     case("two_arm", "settling", *IN_STROKES, "constraints.settling_after=0.05"),
     case("two_arm", "settling", "motion.dwells=[[0.5,0.7],[1.0,1.2]]"),
@@ -320,7 +323,12 @@ CASES = [
     case("controlled", "pole_frequency", UNFORESEEN, slow=True),
     case("controlled", "damping_ratio", GRAVITY, "control.limits=[150.0,200.0,150.0]", *SPRINGY,
          "arms.joint_damping=3.0", "constraints.damping_below=60.0", *FINER, slow=True),
-    case("space", "damping_ratio", HELD, BENT, slow=True),
+    case("space", "damping_ratio", HELD, BENT, "simulation.tolerance=1e-5", slow=True),
+    # In closed loops: of the motions that the constraints leave, too, and of their rates.
+    case("slider", "pole_frequency", CRANK.replace("2e3", "2e5"), BENT, GRAVITY),
+    case("pin", "damping_ratio", CRANK, "constraints.poles_at=[0.03,0.08]"),
+    case("boom", "damping_ratio", BOOM_HELD),
+    case("loop", "damping_ratio", BENT, "control={stiffness=[100.0], damping=[0.1]}"),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", kind, "design.filter_radius=0.05", *FINER)
       for kind in get_args(ObjectiveKind) if kind not in POLES),

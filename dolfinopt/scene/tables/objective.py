@@ -487,6 +487,13 @@ class Constraints(Table):
             one.check_in_scene(scene, (*at, "stiffness", index))
         self._check_delay(scene.motion, (*at, "settling_after"))
         self._check_poles(scene, at)
+        self._check_arms(scene, at)
+
+    def _check_arms(self, scene: Scene, at: Loc) -> None:
+        """Refuse responses of flexible arms where there are none."""
+        for name in OF_ARMS.intersection(asked(scene)) if not scene.cell_counts else ():
+            where = (*at, name) if name in self.limits else ("objective", "kind")
+            raise Refusal("expected another response: no arm is flexible", where)
 
     def _check_poles(self, scene: Scene, at: Loc) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
@@ -503,13 +510,6 @@ class Constraints(Table):
                 "expected another response without [control]: poles are those of the closed loop; "
                 "add the table, or take first_frequency",
                 where,
-            )
-        if scene.closure is not None:
-            raise Refusal(
-                "expected another response with [closure]: poles of kinematic loops have no "
-                "gradient; look at them with dolfinopt export DIR --state-space T",
-                where,
-                ("closure", "kind"),
             )
         instants = self.pole_instants(scene.motion)
         horizon = scene.motion.horizon
@@ -570,6 +570,11 @@ NEEDS: Mapping[str, frozenset[Need]] = {
     "peak_force": MOTION,
     "damping_ratio": MOTION,
     "pole_frequency": MOTION,
+}
+# Those of flexible arms, without which there is nothing to measure.
+OF_ARMS = frozenset(k for k, need in NEEDS.items() if need in (STATICS, VIBRATION)) | {
+    "stress",
+    "buckling",
 }
 # Forces of drives, of which no equivalent static load tells anything: their gradient is always the
 # exact one, and so is that of buckling and of poles.
