@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dolfinopt.dynamics.collocation import lagrange_integrals
+from dolfinopt.dynamics.measured import GAUSS_POINTS
 from dolfinopt.multibody.motion import RigidMotion
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -112,9 +113,6 @@ def motion_at_stages(
 def stage_instants(time_grid: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the instants (n s,) of the nodes (s,) of the steps of a grid (n + 1,), s."""
     return (time_grid[:-1, None] + np.diff(time_grid)[:, None] * nodes).ravel()
-
-
-GAUSS_POINTS = 5  # between two rows: exact for splines of degree 5 and methods of five stages
 
 
 def stage_values_of(
