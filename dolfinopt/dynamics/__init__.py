@@ -1,8 +1,7 @@
-"""Time integration to a tolerance: what is solved, by which method, and the gradient through it.
+"""Time integration to a tolerance, the machine's equations, and gradients through the motion.
 
-What: `system` (the interface), `elastic_system` (prescribed rigid coordinates), `batch_system`
-(several of them), `modal_coordinates` (its preconditioner). How: `radau` refines time grids,
-`batch` those of many, `march` solves by `newton` with `newton_matrix` or `simplified_newton` on
-`collocation` stages, `error_estimate` and `unresolved` judge; `generalized_alpha` for comparison.
-Results: `solution`, `simulation` (of a scene); gradient: `adjoint`.
+What is solved: `system` (the interface), `elastic_system` (prescribed joints), `machine_system`
+(drives, closed loops); `build` makes them of a scene, `tables` gives what files hold. How:
+`radau` (one strategy) over `collocation`, `newton_matrix`, `newton`, `march`, `estimate`,
+`time_grid`; `adjoint` back. Results: `simulation`, `budget`, `state_space`.
 """

@@ -32,7 +32,6 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
     ADJOINT_CORRECTION_SHARE,
     ADJOINT_CORRECTIONS_LIMIT,
-    KEPT_MATRICES_BYTES,
 )
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, slow_coordinates
 from dolfinopt.dynamics.system import Linearisation
@@ -108,8 +107,7 @@ class Adjoint:
         q, qd, a = (x[part] for x in self._at)
         matrix = factorise(window, q, qd, a, slow)
         exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
-        size = matrix.transfer.nbytes + matrix.inverse.nbytes
-        if len(window.h) == len(self._stages.h) and size <= KEPT_MATRICES_BYTES:
+        if len(window.h) == len(self._stages.h):
             self._kept = {key: (matrix, exact)}
         return matrix, exact
 

@@ -9,16 +9,15 @@ from math import prod
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, eigh, solve_triangular
+from scipy.linalg import LinAlgError, eigh
 
 from dolfinopt.dynamics.measured import (
     EQUILIBRIUM_ITERATIONS,
     EQUILIBRIUM_KEPT_CONTRACTION,
     EQUILIBRIUM_ROUNDING_ERROR,
     EQUILIBRIUM_STALLED_ERROR,
-    IDENTITY_ROUNDING_ERROR,
     MEAN_MASS_INSTANTS,
-    PROPORTION_ROUNDING_ERROR,
+    ROUNDING,
 )
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_error
 from dolfinopt.dynamics.tables import motion_at_stages
@@ -281,15 +280,12 @@ def _vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     if len(K) == 0:  # a rigid body
         return K, K, np.zeros(0)
     try:
-        L = cholesky(K, lower=True)
+        m, T = eigh(0.5 * (M + M.T), K)
     except LinAlgError:  # indefinite by rounding: its own coordinates do, if not as well
         scale = np.sqrt(np.abs(np.diag(K)))
         scale[scale == 0.0] = 1.0
         return np.diag(1.0 / scale), np.diag(scale), np.abs(np.diag(M)) / scale**2
-    half = solve_triangular(L, M, lower=True)
-    scaled = solve_triangular(L, half.T, lower=True)
-    m, Y = eigh(0.5 * (scaled + scaled.T))
-    return solve_triangular(L, Y, trans="T", lower=True), (L @ Y).T, np.maximum(m, 0.0)
+    return T, T.T @ K, np.maximum(m, 0.0)
 
 
 def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
@@ -298,7 +294,7 @@ def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     # uses them sees that the coordinates are uncoupled by them.
     changed = body.in_basis(T)
     one = np.eye(len(changed.K))
-    if np.abs(changed.K - one).max(initial=0.0) > IDENTITY_ROUNDING_ERROR:
+    if np.abs(changed.K - one).max(initial=0.0) > ROUNDING:
         return changed
     share = proportion([body.K], [body.D])
     return replace(changed, K=one, D=changed.D if share is None else share * one)
@@ -313,6 +309,6 @@ def proportion(here: Sequence[np.ndarray], there: Sequence[np.ndarray]) -> float
     place = np.unravel_index(np.abs(here[k]).argmax(), here[k].shape)
     factor = float(there[k][place] / here[k][place])
     for a, b, size in zip(here, there, largest, strict=True):
-        if np.abs(b - factor * a).max(initial=0.0) > PROPORTION_ROUNDING_ERROR * abs(factor) * size:
+        if np.abs(b - factor * a).max(initial=0.0) > ROUNDING * abs(factor) * size:
             return None
     return factor

@@ -17,7 +17,7 @@ from dolfinopt.dynamics.measured import (
     DEFLECTION_LIMIT,
     FAILED_STEP_RATIO,
     LEAST_STEP_SHARE,
-    MARCH_STEPS_LIMIT,
+    STEPS_LIMIT,
     WINDOW_STEPS,
 )
 from dolfinopt.dynamics.newton import Limits, newton
@@ -127,7 +127,7 @@ class March:
         horizon = self._system.breakpoints[-1]
         for end in self._system.breakpoints[1:]:
             while self.t < end:
-                if self._h < LEAST_STEP_SHARE * horizon or len(self._ends) > MARCH_STEPS_LIMIT:
+                if self._h < LEAST_STEP_SHARE * horizon or len(self._ends) > STEPS_LIMIT:
                     raise GivenUp(
                         f"the simulation gets no further than t = {self.t:.4g} s with "
                         f"{len(self._ends) - 1} time steps: the motion changes too fast for arms "

@@ -16,14 +16,9 @@ ACCEPTED_SHARE = 0.6
 AIM = 0.4
 # Growth of the number of steps: least, least while vibrations are not resolved, and most.
 FINER_GRID_RATIOS = (1.15, 2.5, 6.0)
-COARSER_GRID_RATIO = 0.8  # of the number of steps: below it a nearby motion's are too many
 NEIGHBOURS_RATIO = 3.0  # of the lengths of two steps in succession, at most
 GRIDS_LIMIT = 12
-STEPS_LIMIT = 30_000
-# Grids in turn whose error is above this part of the one before until a motion is given up: as long
-# as a vibration is not resolved its error does not fall.
-STALLED_GRIDS_LIMIT = 3
-STALLED_RATIO = 0.9
+STEPS_LIMIT = 30_000  # over the horizon
 # An error above this is no estimate: it tells that the steps find another motion than finer ones.
 LOST_MOTION_ERROR = 0.5
 
@@ -33,11 +28,9 @@ LOST_MOTION_ERROR = 0.5
 # with 20, in an optimisation of the paper's example.
 SLOW_ANGLES = (40.0, 120.0)
 DENSE_COORDINATES = 32  # up to so many all are treated densely: 12 to 64 take as long, 10 %
-MATRIX_BYTES = 300e6  # of the matrices of steps that are solved together
+MATRIX_BYTES = 300e6  # of the matrices of steps that are solved together, and of what is kept
 KEPT_CONTRACTION = 0.3  # that keeps a matrix: half of it, or twice, take as long
-LEAST_CONTRACTION = 0.01  # that is believed when the error left is foretold
 SETTLED_SHARE = 1e-2  # step, of the tolerance, that no matrix shortens: rounding
-ROUNDING_STEP = 1e-13  # relative step below which nothing changes
 
 # -- march -----------------------------------------------------------------------------------
 
@@ -45,7 +38,6 @@ MARCH_ERROR_SHARE = 0.1  # of the tolerance, that a step may add; with 0.3 one g
 WINDOW_STEPS = (4, 32)  # solved together, fewest and most
 FAILED_STEP_RATIO = 0.4  # of the steps after a failure
 LEAST_STEP_SHARE = 1e-7  # of the horizon: where shorter ones fail the motion has no continuation
-MARCH_STEPS_LIMIT = 20_000
 # Deflection over a body's length beyond which its motion is refused. A cantilever that linear
 # elasticity bends by 0.5 of its length bends by 0.41, and comes 0.11 closer, which a floating frame
 # with linear elasticity leaves out (elastica under a load across its end; 0.1: 1 % and 0.006,
@@ -70,7 +62,6 @@ ADJOINT_CORRECTION_SHARE = 1e-9
 # Steps after which more coordinates are treated densely: of eight arms in space 10, and a matrix
 # that is dense in all of their 48 coordinates costs as much as 50.
 ADJOINT_CORRECTIONS_LIMIT = 20
-KEPT_MATRICES_BYTES = 64e6  # of what is kept for further functions of the same trajectory
 
 # -- systems ---------------------------------------------------------------------------------
 
@@ -85,17 +76,20 @@ CLOSURE_COMPLIANCE_SHARE = 1e-6
 # A relative step below it that is not half of the one before is rounding of an ill-conditioned
 # stiffness.
 EQUILIBRIUM_STALLED_ERROR = 1e-8
+# Relative errors and steps below it that do not fall are rounding; so are T'KT beside the identity
+# and damping beside what is in proportion to the stiffness.
+ROUNDING = 1e-9
 # rad, or lengths over the reach, of free coordinates: a thousand times their own rounding.
 DEVIATION_ROUNDING = 1e-12
-IDENTITY_ROUNDING_ERROR = 1e-9  # of T'KT that is still taken for the identity
-PROPORTION_ROUNDING_ERROR = 1e-12  # relative, of integrals that are a factor times others
 MEAN_MASS_INSTANTS = 3  # whose mass is averaged: 1 to 9 cost the same iterations
+
+# Between two rows of a table: exact for splines of degree 5 and methods of five stages.
+GAUSS_POINTS = 5
 
 # -- build, trajectory -----------------------------------------------------------------------
 
 RESPONSE_INTERVAL = 1e-3  # s, the longest from one instant of the responses to the next
 RESPONSE_INSTANTS_LIMIT = 1_000_000  # at `RESPONSE_INTERVAL`: they take 1 GB and 3 s
-LONG_MOTION_INSTANTS = 100_000  # of a motion beyond that limit, unless it bends faster
 # Of the largest elastic deflection, by which an extreme may exceed its neighbouring instants: the
 # default simulation.tolerance.
 EXTREME_EXCESS_SHARE = 1e-4

@@ -12,12 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Stages, at_stages, residual_at, step_ends
-from dolfinopt.dynamics.measured import (
-    KEPT_CONTRACTION,
-    LEAST_CONTRACTION,
-    ROUNDING_STEP,
-    SETTLED_SHARE,
-)
+from dolfinopt.dynamics.measured import KEPT_CONTRACTION, ROUNDING, SETTLED_SHARE
 from dolfinopt.dynamics.newton_matrix import (
     NewtonMatrix,
     chunks,
@@ -103,14 +98,13 @@ def newton(
         share, there, following = _damped(matrix, state, at, step, tolerance, limits)
         if share == 0.0:
             if fresh and len(slow) == a.shape[2]:
-                settled = step.length <= SETTLED_SHARE * tolerance  # nothing is left but rounding
-                return Iterate(at.a, settled, iteration)
+                settled = max(SETTLED_SHARE * tolerance, ROUNDING)  # nothing is left but that
+                return Iterate(at.a, step.length <= settled, iteration)
             slow = slow_coordinates(stages, len(slow)) if fresh else slow
             step = None
             continue
         at, rate = there, following.length / step.length if step.length > 0.0 else 0.0
-        left = max(rate, LEAST_CONTRACTION) / (1.0 - min(rate, 0.5)) * following.length
-        if share == 1.0 and (left <= limits.goal * tolerance or following.length <= ROUNDING_STEP):
+        if share == 1.0 and rate * following.length <= limits.goal * tolerance:
             return Iterate(at.a + following.change, True, iteration)
         if share == 1.0 and rate <= KEPT_CONTRACTION:
             step = following

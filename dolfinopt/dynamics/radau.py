@@ -29,8 +29,7 @@ from dolfinopt.dynamics.measured import (
     GRIDS_LIMIT,
     LOST_MOTION_ERROR,
     MARCH_ERROR_SHARE,
-    STALLED_GRIDS_LIMIT,
-    STALLED_RATIO,
+    ROUNDING,
     STEPS_LIMIT,
 )
 from dolfinopt.dynamics.newton import Limits, newton_in_chunks
@@ -154,7 +153,8 @@ class _Integration:
             if solution.error <= ACCEPTED_SHARE * self._tolerance:
                 return _changed(solution, self._preconditioner.from_modes)
             grid = self._finer(errors, before, marched)
-            if len(grid) > STEPS_LIMIT or self._stalled > STALLED_GRIDS_LIMIT:
+            lost = solution.error < ROUNDING and self._stalled
+            if lost or len(grid) > STEPS_LIMIT or self._stalled > 3:
                 break
             self.time_grid = grid
         return self._best()
@@ -170,9 +170,9 @@ class _Integration:
         over = error / (AIM * self._tolerance)
         if marched:
             self._step_error = min(self._step_error, errors.max()) / over
-        stalls = before is not None and error > STALLED_RATIO * before.error
-        self._stalled += stalls
         # Vibrations that are not resolved hardly get smaller with more steps, until they are.
+        stalls = before is not None and error > 0.9 * before.error
+        self._stalled += stalls
         unresolved = stalls or self._unresolved > 0.5 * error
         least = FINER_GRID_RATIOS[1] if unresolved else FINER_GRID_RATIOS[0]
         return finer(self._system, self.time_grid, errors, 1.0 / over, self._stages, least)

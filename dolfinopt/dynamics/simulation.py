@@ -20,7 +20,7 @@ from dolfinopt.dynamics.measured import (
     DEFLECTION_LIMIT,
     DRIVES_CHUNK,
     JOINT_LIMIT_ROUNDING,
-    KEPT_MATRICES_BYTES,
+    MATRIX_BYTES,
 )
 from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.dynamics.system import Linearisation
@@ -561,7 +561,7 @@ class DriveForces:
     def _chunks(self, parts: list[slice]) -> Iterable[_Prescribed | _Machine]:
         """Return the parts' own; the same ones every time unless they take too much memory."""
         bodies, columns = len(self.system.mechanism.bodies), 3 * self.rates[0].shape[1]
-        if 8 * len(self.t) * (1 + 8 * bodies) * columns > KEPT_MATRICES_BYTES:
+        if 8 * len(self.t) * (1 + 8 * bodies) * columns > MATRIX_BYTES:
             return map(self._chunk, parts)
         self._kept = self._kept or [self._chunk(part) for part in parts]
         return self._kept

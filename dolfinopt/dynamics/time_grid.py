@@ -9,7 +9,6 @@ import numpy as np
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.measured import (
     AIM,
-    COARSER_GRID_RATIO,
     FINER_GRID_RATIOS,
     FIRST_GRID_STEPS,
     NEIGHBOURS_RATIO,
@@ -40,11 +39,11 @@ def first_grid(system: System, tolerance: float, stages: int) -> np.ndarray:
 
 
 def known_grid(system: System, guess: Solution, tolerance: float, stages: int) -> np.ndarray | None:
-    """Return the steps of a nearby motion, or fewer where a fifth can be saved; None: no such."""
+    """Return the steps of a nearby motion, or fewer if they are too many; None: they do not fit."""
     if not np.isin(system.breakpoints, guess.time_grid).all():
         return None
     share = (guess.error / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
-    if share > COARSER_GRID_RATIO:
+    if share * FINER_GRID_RATIOS[0] > 1.0:
         return guess.time_grid
     return spread(np.full(len(guess.a), max(share, 0.5)), guess.time_grid, system)
 
