@@ -67,11 +67,13 @@ class Tangent:
         blocks: no two have an entry in common.
         own: (S,) ascending, the coordinates' own rows.
         order: (S,) places of the coordinates among the blocks' columns, or all as they stand.
+        count: n, also where there is no block, of rigid arms.
     """
 
     blocks: tuple[Block, ...]
     own: np.ndarray
     order: np.ndarray | slice
+    count: int
 
     @classmethod
     def of_matrix(cls, matrix: np.ndarray, keep: np.ndarray | None = None) -> Tangent:
@@ -88,12 +90,12 @@ class Tangent:
         for one in self.blocks:
             left = None if one.left is None else one.left[part]
             blocks.append(replace(one, left=left, right=one.right[part]))
-        return replace(self, blocks=tuple(blocks))
+        return replace(self, blocks=tuple(blocks), count=last - first)
 
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
         size = len(self.own)
-        found = np.zeros((len(self.blocks[0].right), size, 3, size))
+        found = np.zeros((self.count, size, 3, size))
         coordinates = np.arange(size)
         coordinates[self.order] = np.arange(size)  # of every column
         for one in self.blocks:
@@ -104,13 +106,13 @@ class Tangent:
             if len(places) and (np.diff(places) == 1).all():
                 places = slice(places[0], places[-1] + 1)
             found[:, slice(*ends), :, places] = part
-        return found.reshape(len(found), size, 3 * size)
+        return found.reshape(self.count, size, 3 * size)
 
     def times(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
     ) -> np.ndarray:
         """Return the change of the wanted rows (m, .), ascending, by a change (m, S) each."""
-        count, size = len(self.blocks[0].right), len(self.own)
+        count, size = self.count, len(self.own)
         change = np.empty((len(q), size, 3))
         change[:, self.order] = np.stack([q, qd, qdd], axis=2)
         change = change.reshape(count, -1, 3 * size).swapaxes(1, 2)
@@ -126,7 +128,7 @@ class Tangent:
 
     def transposed(self, rows: np.ndarray) -> Rates:
         """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
-        count, size = len(self.blocks[0].right), len(self.own)
+        count, size = self.count, len(self.own)
         weights = rows.reshape(count, -1, rows.shape[1])
         gradient = np.zeros((count, weights.shape[1], 3 * size))
         for one in self.blocks:
@@ -244,7 +246,8 @@ def linearise(
     own = np.concatenate([np.arange(first), *(first + rows for rows in kept)]).astype(int)
     order = columns.order
     as_they_stand = bool((order == np.arange(len(order))).all())
-    return Tangent((*blocks, *walk.blocks), own, slice(None) if as_they_stand else order)
+    order = slice(None) if as_they_stand else order
+    return Tangent((*blocks, *walk.blocks), own, order, len(motion.q))
 
 
 @dataclass(frozen=True, eq=False)
