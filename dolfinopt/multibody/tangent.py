@@ -80,9 +80,10 @@ class Tangent:
         """Return that of W rows by W coordinates and their rates (n, W, W, 3), by some or all."""
         count, size = matrix.shape[:2]
         own = np.arange(size) if keep is None else keep
-        right = (matrix if keep is None else matrix[:, :, keep]).reshape(count, size, -1)
+        right = matrix if keep is None else matrix[:, :, keep]
+        right = right.reshape(count, size, 3 * len(own))
         block = Block(slice(0, size), slice(0, right.shape[2]), None, right)
-        return cls((block,), own, slice(None))
+        return cls((block,), own, slice(None), count)
 
     def window(self, first: int, last: int) -> Tangent:
         """Return the instants first..last - 1."""
