@@ -73,16 +73,11 @@ MACHINE_EQUILIBRIUM_ROUNDING_ERROR = 1e-13  # the same of machines, beside the c
 # A relative step below it that is not half of the one before is rounding of an ill-conditioned
 # stiffness.
 EQUILIBRIUM_STALLED_ERROR = 1e-8
-<<<<<<< HEAD
-# rad, or lengths over the reach, of free coordinates: a thousand times their own rounding.
-DEVIATION_ROUNDING = 1e-12
-IDENTITY_ROUNDING_ERROR = 1e-9  # of T'KT that is still taken for the identity
-PROPORTION_ROUNDING_ERROR = 1e-12  # relative, of integrals that are a factor times others
-=======
 # Relative errors and steps below it that do not fall are rounding; so are T'KT beside the identity
 # and damping beside what is in proportion to the stiffness.
 ROUNDING = 1e-9
->>>>>>> main
+# rad, or lengths over the reach, of free coordinates: a thousand times their own rounding.
+DEVIATION_ROUNDING = 1e-12
 MEAN_MASS_INSTANTS = 3  # whose mass is averaged: 1 to 9 cost the same iterations
 
 # Between two rows of a table: exact for splines of degree 5 and methods of five stages.
