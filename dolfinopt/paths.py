@@ -331,106 +331,95 @@ def moves(rows: np.ndarray) -> list[tuple[int, int]]:
     return found
 
 
-def curve_in_time(table: Table) -> Curve:
-    """Return the quintic spline through a table with times, at rest at both ends and in stops.
+Piece = tuple[float, float, tuple[Callable[[np.ndarray], np.ndarray], ...]]
+
+
+def curve_in_time(table: Table, moving: bool = False) -> Curve:
+    """Return the quintic spline through a table with times, at rest in stops and at its ends.
 
     Four times continuously differentiable between stops; speed and acceleration vanish at the
     first and the last instant of each move, which makes the interpolation of n rows by degree 5
     definite. Rows in succession that are equal are a stop: exactly there, without speed.
+
+    Args:
+        table: its rows.
+        moving: whether speed and acceleration at the table's two ends are its own, those of the
+            spline without conditions there (of lower degree through fewer than six rows).
     """
+    assert table.t is not None
+    pieces: list[Piece] = []
+    for i, j in moves(table.rows):
+        free = moving and i == 0, moving and j == len(table.t) - 1
+        pieces.append((table.t[i], table.t[j], _spline(table, slice(i, j + 1), free)))
+    if len(pieces) == 1 and pieces[0][:2] == (table.t[0], table.t[-1]):
+        return Curve(float(table.t[-1]), pieces[0][2], rests=not moving)
+    functions = piecewise(table, pieces, ends_move=moving)
+    end = float(table.t[-1])
+    return Curve(end, functions, move_ends(table), rests=not moving, stops=stops_of(table))
+
+
+def _spline(
+    table: Table, part: slice, free: tuple[bool, bool]
+) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
+    """Return the spline through some rows and its derivatives, at rest at ends not free."""
     from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
 
     assert table.t is not None
+    t, rows = table.t[part], table.rows[part]
+    none = np.zeros(rows.shape[1])
+    ends = [[(1, none), (2, none)], [(1, none), (2, none)]]
+    if any(free):
+        plain = make_interp_spline(t, rows, k=5 if len(t) > 5 else 3 if len(t) > 3 else 1)
+        for side, instant in enumerate((t[0], t[-1])):
+            if free[side]:
+                own = [plain(instant, k) if k <= plain.k else none for k in (1, 2)]
+                ends[side] = [(1, own[0]), (2, own[1])]
+    spline = make_interp_spline(t, rows, k=5, bc_type=tuple(ends))
+    return spline, spline.derivative(1), spline.derivative(2)
+
+
+def piecewise(
+    table: Table, pieces: Sequence[Piece], ends_move: bool
+) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
+    """Return a table's curve and two derivatives of moves between instants, at rest between.
+
+    Args:
+        table: its rows.
+        pieces: first and last instant of every move, and its functions.
+        ends_move: whether the last instant belongs to a move: there an acceleration may jump.
+    """
+    assert table.t is not None
     t, rows = table.t, table.rows
-    rest = [(1, np.zeros(rows.shape[1])), (2, np.zeros(rows.shape[1]))]
-    pieces = []
-    for i, j in moves(rows):
-        part = slice(i, j + 1)
-        spline = make_interp_spline(t[part], rows[part], k=5, bc_type=(rest, rest))
-        pieces.append((t[i], t[j], (spline, spline.derivative(1), spline.derivative(2))))
-    if len(pieces) == 1 and len(moves(rows)) == 1 and moves(rows)[0] == (0, len(t) - 1):
-        return Curve(float(t[-1]), pieces[0][2])
+    beyond = SAME * t[-1] if ends_move else 0.0
 
     def derivative(order: int) -> Callable[[np.ndarray], np.ndarray]:
         def value(u: np.ndarray) -> np.ndarray:
             here = rows[np.clip(np.searchsorted(t, u, side="right") - 1, 0, len(t) - 1)]
             found = here if order == 0 else np.zeros_like(here)
             for first, last, functions in pieces:
-                inside = (first < u) & (u < last)
-                found[inside] = functions[order](u[inside])
+                inside = (first < u) & (u < last + beyond)
+                found[inside] = functions[order](np.minimum(u[inside], last))
             return found
 
         return value
 
-    functions = tuple(map(derivative, range(3)))
-    return Curve(float(t[-1]), functions, _ends(table), stops=_stops(table))
+    return derivative(0), derivative(1), derivative(2)
 
 
-def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
-    """Return straight moves from row i to row j of a table with times, each by its law."""
-    assert table.t is not None
-    t, rows = table.t, table.rows
-
-    def derivative(order: int) -> Callable[[np.ndarray], np.ndarray]:
-        def value(u: np.ndarray) -> np.ndarray:
-            here = rows[np.clip(np.searchsorted(t, u, side="right") - 1, 0, len(t) - 1)]
-            found = here if order == 0 else np.zeros_like(here)
-            for i, j, law in laws:
-                # The end of a move belongs to it: there the acceleration may jump.
-                inside = (t[i] < u) & (u <= t[j] + SAME * t[-1])
-                s = law(np.minimum(u[inside], t[j]) - t[i], t[j] - t[i])[order][:, None]
-                found[inside] = s * (rows[j] - rows[i]) + (rows[i] if order == 0 else 0.0)
-            return found
-
-        return value
-
-    knots = [t[i] + law.knots * (t[j] - t[i]) for i, j, law in laws]
-    kinks = np.unique(np.concatenate([_ends(table), *knots]))
-    functions, corners = tuple(map(derivative, range(3))), tuple(kinks.tolist())
-    return Curve(float(t[-1]), functions, corners, rests=False, stops=_stops(table))
-
-
-def _ends(table: Table) -> tuple[float, ...]:
+def move_ends(table: Table) -> tuple[float, ...]:
     """Return the instants inside at which moves begin or end."""
     assert table.t is not None
     ends = {float(table.t[k]) for move in moves(table.rows) for k in move}
     return tuple(sorted(ends - {float(table.t[0]), float(table.t[-1])}))
 
 
-def _stops(table: Table) -> tuple[tuple[float, float], ...]:
+def stops_of(table: Table) -> tuple[tuple[float, float], ...]:
     """Return the instants between which a table with times rests behind a move."""
     assert table.t is not None
     found = moves(table.rows)
     begins, ends = [j for _, j in found], [*(i for i, _ in found[1:]), len(table.t) - 1]
     pairs = zip(begins, ends, strict=False)  # without a move there is no rest behind one
     return tuple((float(table.t[j]), float(table.t[i])) for j, i in pairs if i > j)
-
-
-def curve_by_chord(table: Table, measured: int | None = None) -> Curve:
-    """Return the natural cubic spline through the rows, over their distance from row to row.
-
-    The parameter is the length of the chords up to a point, from 0 to 1 at the last row.
-
-    Args:
-        table: its rows.
-        measured: number of columns, the first ones, in which the distance is taken; default: all.
-
-    Raises:
-        InputError: two rows in succession are the same; names file and line.
-    """
-    chords = np.linalg.norm(np.diff(table.rows[:, :measured], axis=0), axis=1)
-    same = np.flatnonzero(chords == 0.0)
-    if same.size:
-        raise InputError(
-            f"{table.file}: line {table.lines[same[0] + 1]}: the same values as in the row before; "
-            f"leave the row out, or add a column {TIME} to stay there for a while"
-        )
-    from scipy.interpolate import CubicSpline  # takes as long to import as NumPy
-
-    length = np.append(0.0, np.cumsum(chords))
-    spline = CubicSpline(length / length[-1], table.rows, bc_type="natural")
-    derivatives = (spline, spline.derivative(1), spline.derivative(2))
-    return Curve(1.0, derivatives, tuple(spline.x[1:-1].tolist()), rests=False)
 
 
 def _text(file: str) -> str:

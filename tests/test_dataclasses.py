@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import dolfinopt as do
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 

@@ -234,7 +234,7 @@ def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
 def test_model_imports_nothing_of_studies_pictures_and_space() -> None:
     """And the package nothing at all."""
     assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
-    others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.multibody.inverse_kinematics"}
+    others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.motion.follower"}
     assert loaded(others | {"dolfinx"}, "from dolfinopt import Model") == {"dolfinx"}
 
 
@@ -270,7 +270,7 @@ def test_words_and_completion_need_no_solver(monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.serial
 def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
     """Nor anything of other commands: statistics, studies, exports."""
-    others = {"plots.design", "plots.curves", "study.studies", "multibody.standard_input"}
+    others = {"plots.design", "plots.curves", "study.studies", "exchange.standard_input"}
     others = {"scipy.stats", *(f"dolfinopt.{name}" for name in others)}
     line = ["optimize", TWO_ARM, "--no-plots", "--out", tmp_path / "out"]
     line += set_keys(*QUICK, "optimizer.max_iterations=1")

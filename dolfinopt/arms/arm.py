@@ -31,8 +31,8 @@ from dolfinopt.fem.interior import Guesses
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.inverse_dynamics import Stiffening
-from dolfinopt.multibody.machine import RIGID_ARMS
+from dolfinopt.multibody.build import RIGID_ARMS
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
@@ -529,7 +529,7 @@ def _read_body(
     interfaces: tuple[tuple[str, tuple[float, float, float]], ...],
 ) -> ShapeIntegrals:
     """Read a body once for every state of its file."""
-    from dolfinopt.multibody.standard_input import load_body  # what few scenes need
+    from dolfinopt.exchange.standard_input import load_body  # what few scenes need
 
     return load_body(Path(sid), dimension, length, dict(interfaces))
 
@@ -546,7 +546,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
         body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body
-        from dolfinopt.multibody.standard_input import without_stiffening
+        from dolfinopt.exchange.standard_input import without_stiffening
 
         return without_stiffening(body, arm.sid)
     return RIGID_ARMS[scene.dimension](arm, scene.material_of(index).density)

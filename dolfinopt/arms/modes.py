@@ -25,15 +25,11 @@ from scipy.linalg import eigh
 
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.stress import Prestress
-from dolfinopt.multibody.inverse_dynamics import outward_pass
-from dolfinopt.multibody.machine import (
-    ONE,
-    rigid_spatial_body,
-    skew,
-)
-from dolfinopt.multibody.mechanism import Mechanism
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.newton_euler import outward_pass
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.rotations import ONE, skew
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_spatial_body
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.reduction.basis import FreeArm, FreeOperators
 from dolfinopt.reduction.eigenproblem import largest_eigenpairs, lowest_eigenpairs
 
@@ -340,13 +336,24 @@ class FrozenTree:
         self, body: int, interface: int
     ) -> Iterator[tuple[ShapeIntegrals, np.ndarray]]:
         """Yield what is carried at an interface and outboard of it, and its motion likewise."""
-        loads = self.mechanism.loads
-        if (body, interface) in loads:
-            yield loads[body, interface].body, np.eye(6)
+        sites = [((body, interface), np.eye(6))]
         for i, T in self._beyond(body, interface):
-            for s in self.mechanism.sites[i]:
-                if (i, s) in loads:
-                    yield loads[i, s].body, self._shift(i, s) @ T
+            sites += [((i, s), self._shift(i, s) @ T) for s in self.mechanism.sites[i]]
+        for site, T in sites:
+            if site in self.mechanism.loads:
+                yield self.mechanism.loads[site].body, T
+            for k in self.mechanism.hanging[site]:
+                if (rotor := self._rotor(k)) is not None:
+                    yield rotor, T
+
+    def _rotor(self, body: int) -> ShapeIntegrals | None:
+        """Return the rotor of a body's joint in the frame of the interface that carries it."""
+        joint = self.mechanism.joints[body]
+        if joint.rotor is None:
+            return None
+        n = joint.rotation @ joint.axis
+        x, y, z = np.outer(n, n) * joint.rotor.inertia
+        return rigid_spatial_body(0.0, np.zeros(3), (x[0], y[1], z[2], x[1], x[2], y[2]))
 
     def carried(self) -> list[CarriedInertia]:
         """Return what every body carries, about its interfaces' points, in its own frame."""

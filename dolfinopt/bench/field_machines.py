@@ -15,13 +15,24 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
-from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.closures import Loops, Tie
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.machine import rigid_spatial_body, spatial_mechanism
-from dolfinopt.multibody.mechanism import GROUND, Closure, Drives, Joint, Mechanism, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body, rigid_bar
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    plane_body,
+    rigid_bar,
+    rigid_spatial_body,
+)
+from dolfinopt.multibody.tree import (
+    GROUND,
+    Drives,
+    Joint,
+    Mechanism,
+    plane_chain,
+    spatial_mechanism,
+)
 
 # -- the flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices
 #
@@ -104,13 +115,13 @@ def crank(body: ShapeIntegrals) -> Crank:
     arms = rigid_bar(CRANK, HEIGHT, CRANK_MASS, CRANK_INERTIA - 0.25 * CRANK_MASS * CRANK**2), body
     none = np.zeros(1)
     drives = Drives(np.array([2]), none, none, np.full(1, np.inf), np.array([False]))
-    loops = Loops.of_plane(Closure.slider(0j, 1.0 + 0j), (1, 0))
+    across = np.array([[0.0, 1.0]])
+    loops = Loops((Tie.in_plane("slider", (1, 0), np.zeros(2), across),))
     return Crank(
         plane_chain(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
         desired,
         (0.0, END),
         drives,
-        loops,
         loops,
         start=(np.array([[0.0, *q, 0.0]]), np.array([[slower, *qd, 0.0]])),
     )

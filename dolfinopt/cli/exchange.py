@@ -120,13 +120,13 @@ def export(
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.exchange.mbdyn import write_fem
-    from dolfinopt.exchange.sid import write_sid, write_sid_npz
     from dolfinopt.output.design import arms_with_design
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import decide_stiffening
     from dolfinopt.responses.order_selection import choose_coordinates
     from dolfinopt.scene.load import pose_scenarios
+    from dolfinopt.scene.sid import write_sid, write_sid_npz
 
     names = [f"{arm.name}{kind}" for arm in loaded.arms for kind in KINDS]
     claim(world, folder, overwrite, names, scene=loaded)
@@ -251,7 +251,7 @@ def _why(scene: Scene, index: int) -> str:
     if not scene.arms[index].rigid:
         return "it comes from a file"
     from dolfinopt.arms.arm import fixed_body
-    from dolfinopt.multibody.shape_integrals import in_space
+    from dolfinopt.exchange.in_space import in_space
 
     body = in_space(fixed_body(scene, index))
     centre, tensor = body.inertia_about_centre()
@@ -266,8 +266,8 @@ def _why(scene: Scene, index: int) -> str:
 
 def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
-    from dolfinopt.multibody.shape_integrals import in_space, plate_moments
-    from dolfinopt.multibody.standard_input import lumped_nodes, modal_element, to_sid
+    from dolfinopt.exchange.in_space import in_space, plate_moments
+    from dolfinopt.exchange.standard_input import lumped_nodes, modal_element, to_sid
 
     body = arm.reduce(x_phys)
     title = f"{arm.mesh.name} of {arm.scene.name}"

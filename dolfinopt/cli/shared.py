@@ -209,7 +209,7 @@ def draw(
     save(machine_figure(views, trajectory, title), folder / "machine.png")
     if history:
         save(history_of(scene, history), folder / "history.png")
-    if closure is None or closure.count == 1:  # a pinned end stays where it is
+    if closure is None or len(closure.equations) == 1:  # a pinned end stays where it is
         save(deviation_of(trajectory, initial), folder / "deviation.png")
     if trajectory.is_machine:
         save(drives_figure(trajectory), folder / "drives.png")
@@ -250,6 +250,9 @@ def conclude(summary: Mapping[str, Any], folder: Path) -> None:
         for line in [_deflection_sentence(parts), *([] if optimised else _deflection_table(parts))]:
             click.echo(line)
     warn(summary["warnings"])
+    if start := summary["loop_start"]:
+        joints = ", ".join(f"{name} = {value:.4g}" for name, value in start.items())
+        click.echo(f"closures: loops start with {joints}; motion.initial_joints chooses the branch")
     found = summary["reduction"]
     if found["error_estimate"] is not None:
         click.echo(_chosen(found["coordinates"], found["error_estimate"]))

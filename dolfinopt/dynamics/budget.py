@@ -10,6 +10,7 @@ import numpy as np
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.multibody.kinematics import end_effector_gradient
+from dolfinopt.multibody.ranks import least_norm
 
 # Kinds of parts, and the words for all of a kind.
 KINDS = {
@@ -76,8 +77,8 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     """
     worst = int(np.argmax(trajectory.distance))
     size = float(trajectory.distance[worst])
-    closure = trajectory.closure
-    if size == 0.0 or (closure is not None and closure.count > 1):  # a pin holds the end
+    closure = trajectory.scene.closure
+    if size == 0.0 or (closure is not None and closure.kind == "pin"):  # it holds the end
         return None
     seen = trajectory.at(trajectory.t[worst : worst + 1])
     by_rigid, by_q = _derivatives(seen, seen.deviation / size)
@@ -97,10 +98,11 @@ def _derivatives(seen: Trajectory, direction: np.ndarray) -> tuple[np.ndarray, n
     none = np.zeros((1, mechanism.num_coordinates))
     by_q, by_rigid, _ = end_effector_gradient(mechanism, desired, none, direction)
     every = np.concatenate([by_rigid[0], by_q[0]])
-    if isinstance(problem, MachineSystem) and problem.rigid_loops is not None:
-        G = problem.rigid_loops.at(mechanism, desired.q, none).jacobian[0]
-        dependent = problem.drives.free[~problem.drives.driven]
-        every -= every[dependent] @ np.linalg.pinv(G[:, dependent]) @ G
+    if isinstance(problem, MachineSystem) and problem.loops is not None:
+        G = problem.loops.at(mechanism, desired.q, none).jacobian
+        dependent = problem.drives.dependent
+        weights = least_norm(G[:, :, dependent].swapaxes(1, 2), every[None, dependent])
+        every -= (weights @ G[0])[0]
     return every[: by_rigid.shape[1]], every[by_rigid.shape[1] :]
 
 

@@ -18,41 +18,17 @@ from dolfinopt.dynamics.measured import (
 )
 from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.inverse_dynamics import largest_change
-from dolfinopt.multibody.machine import family_of, friction_of, loops_of
-from dolfinopt.multibody.mechanism import (
-    AppliedForce,
-    Closure,
-    Drives,
-    Mechanism,
-    Springs,
-)
-from dolfinopt.multibody.motion import (
-    RigidMotion,
-    breakpoints,
-    rests,
-)
+from dolfinopt.motion.build import breakpoints, check_path, passive_coordinates, rests, rigid_motion
+from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
+from dolfinopt.multibody.loads import largest_change
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tree import AppliedForce, Drives, Springs
 from dolfinopt.paths import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
+from dolfinopt.scene.tables.joints import interface_number, joint_parts
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
-
-
-def soft_joints(scene: Scene) -> dict[int, JointParts]:
-    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
-    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
-    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
-    return dict(sorted(found.items()))
-
-
-def dependent_coordinates(scene: Scene) -> list[int]:
-    """Return the rigid coordinates that follow from the others in closed loops."""
-    if scene.joints:
-        return [k for k, joint in enumerate(scene.movable) if joint.passive]
-    return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
 
 
 def is_machine(scene: Scene) -> bool:
@@ -63,13 +39,8 @@ def is_machine(scene: Scene) -> bool:
 
 def check_motion(scene: Scene) -> None:
     """Raise `InputError` when the scene's path cannot be followed, or a stop is too short."""
-    family_of(scene).check(scene)
-    rests_of(scene)
-
-
-def rests_of(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """Return the intervals in which settling counts, see `motion.rests`, s."""
-    return rests(scene, family_of(scene).curve)
+    check_path(scene)
+    rests(scene)
 
 
 def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
@@ -83,13 +54,13 @@ def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
 
 def _motion_at(scene: Scene, stamp: int, t: np.ndarray) -> RigidMotion:
     if len(t) > KEPT_INSTANTS_LIMIT:
-        return family_of(scene).motion(t, scene)
+        return rigid_motion(t, scene)
     return _kept_motion(scene, stamp, np.asarray(t, dtype=float).tobytes())
 
 
 @lru_cache(maxsize=MOTIONS_KEPT)
 def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
-    return family_of(scene).motion(np.frombuffer(instants), scene)
+    return rigid_motion(np.frombuffer(instants), scene)
 
 
 def build_system(
@@ -102,13 +73,10 @@ def build_system(
         bodies: from the base outwards.
         motion: the desired rigid motion, shared with other scenes; None: the scene's.
     """
-    family = family_of(scene)
     if motion is None:
         motion = desired_motion(scene)
-    mechanism: Mechanism = family.build(scene, bodies)
-    instants = breakpoints(scene, family.curve)
-    if scene.forces:
-        loads = loads_of(scene)
+    mechanism, instants = build_mechanism(scene, bodies), breakpoints(scene)
+    if loads := loads_of(scene):
         mechanism = replace(mechanism, forces=forces_of(scene))
         motion = LoadedMotion(motion, loads)
         tables = [load.table for load in loads if load.table is not None]
@@ -118,8 +86,7 @@ def build_system(
     drives = _drives(scene)
     if drives.table is not None:
         instants = with_ends(instants, [drives.table], scene.motion.horizon)
-    loops = _loops(scene, mechanism, motion, drives)
-    return MachineSystem(mechanism, motion, instants, drives, *loops)
+    return MachineSystem(mechanism, motion, instants, drives, loops_of(scene))
 
 
 def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
@@ -127,49 +94,12 @@ def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.n
 
     The loads p are those of the machine with rigid arms on the desired motion.
     """
-    family = family_of(scene)
-    mechanism, motion = family.build(scene, bodies), family.motion(t, scene)
-    if scene.forces:
+    mechanism, motion = build_mechanism(scene, bodies), rigid_motion(t, scene)
+    if forces_of(scene):
         mechanism = replace(mechanism, forces=forces_of(scene))
         motion = LoadedMotion(lambda _: motion, loads_of(scene))(t)
-    if scene.closure is None:
-        return largest_change(mechanism, motion)
-    drives = _drives(scene)
-    loops = _loops(scene, mechanism, desired_motion(scene), drives)[1]
-    return largest_change(mechanism, motion, loops, drives.dependent)
-
-
-def closure_of(scene: Scene) -> Closure | None:
-    """Return what holds the last interface, or None."""
-    closure = scene.closure
-    if closure is None:
-        return None
-    point = complex(*closure.point)
-    if closure.kind == "pin":
-        return Closure.pin(point)
-    return Closure.slider(point, complex(*closure.direction), closure.force)
-
-
-def _loops(
-    scene: Scene,
-    mechanism: Mechanism,
-    motion: Callable[[np.ndarray], RigidMotion],
-    drives: Drives,
-) -> tuple[Loops | None, Loops | None]:
-    """Return the closures with those equations that are independent: of the arms, of rigid ones."""
-    if (closure := closure_of(scene)) is not None:
-        loops = Loops.of_plane(closure, mechanism.end)
-        return loops, loops
-    every = loops_of(scene)
-    if every is None:
-        return None, None
-    q_r, rigid = motion(np.zeros(1)).q, mechanism.num_rigid
-    rows = every.at(mechanism, q_r, np.zeros((1, mechanism.num_coordinates))).every_row[0]
-    by_rigid, by_elastic = rows[:, :rigid], rows[:, rigid:]
-    # Of like size: modes are normalised by their energy.
-    by_elastic = by_elastic / (np.abs(by_elastic).max(initial=0.0) or 1.0)
-    free = by_rigid[:, drives.free] / np.abs(by_rigid).max()
-    return every.independent(np.hstack([free, by_elastic])), every.independent(by_rigid)
+    passive = np.array(passive_coordinates(scene), dtype=int)
+    return largest_change(mechanism, motion, loops_of(scene), passive)
 
 
 def _drives(scene: Scene) -> Drives:
@@ -180,12 +110,10 @@ def _drives(scene: Scene) -> Drives:
     stiffness, damping = np.zeros((2, count))
     limits = np.full(count, np.inf)
     free, dependent = np.zeros((2, count), dtype=bool)
-    dependent[dependent_coordinates(scene)] = free[dependent_coordinates(scene)] = True
-    rotors, soft = np.zeros(count), soft_joints(scene)
+    dependent[passive_coordinates(scene)] = free[passive_coordinates(scene)] = True
+    soft = soft_joints(scene)
     for k, one in soft.items():
-        rotors[k] = one.rotor
-        if not dependent[k]:
-            free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
+        free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
     for k, rod in enumerate(scene.rods, len(scene.movable)):
         if rod.is_spring:
             free[k], stiffness[k], damping[k] = True, rod.stiffness, rod.damping
@@ -203,7 +131,6 @@ def _drives(scene: Scene) -> Drives:
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
         stiffness=np.array([soft[k].stiffness for k in motors]),
         damping=np.array([soft[k].damping for k in motors]),
-        rotor=rotors[motors],
         friction=friction.of(np.array(motors, dtype=int)),
     )
     table = _table_of_forces(scene)
@@ -217,7 +144,6 @@ def _drives(scene: Scene) -> Drives:
         winding=control is not None and control.feed_forward == "elastic",
         table=None if table is None else Table(table.t, table.values[:, rows]),
         springs=springs,
-        rotors=None if control else rotors[rows],
         friction=friction.of(rows) if friction.acts and not control else None,
     )
 
@@ -253,6 +179,17 @@ def with_ends(
 # -- forces on interfaces, [[forces]] ------------------------------------------------------------
 
 
+def forces_on(scene: Scene) -> tuple[Force, ...]:
+    """Return the scene's forces on interfaces, that of [closure] on the slider among them."""
+    closure = scene.closure
+    if closure is None or closure.force == 0.0:
+        return scene.forces
+    x, y = closure.direction
+    size = closure.force / np.hypot(x, y)
+    own = Force(arm=scene.arms[-1].name, force=(size * x, size * y))
+    return (*scene.forces, own)
+
+
 def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
     """Return where the scene's forces act; their values: `loads_of`."""
     names = [arm.name for arm in scene.arms]
@@ -263,14 +200,14 @@ def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
             in_world=force.frame == "world",
             known=force.feed_forward,
         )
-        for column, force in enumerate(scene.forces)
+        for column, force in enumerate(forces_on(scene))
         for k in [names.index(force.arm)]
     )
 
 
 def loads_of(scene: Scene) -> tuple[LoadHistory, ...]:
     """Return the scene's forces and moments over time, N and N m."""
-    return tuple(_load(force, scene.dimension) for force in scene.forces)
+    return tuple(_load(force, scene.dimension) for force in forces_on(scene))
 
 
 def _load(force: Force, dimension: int) -> LoadHistory:

@@ -22,10 +22,12 @@ from dolfinopt.dynamics.measured import (
 from dolfinopt.dynamics.system import Linearisation, State, System, relative_error
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, is_loaded_at_rest
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.loads import is_loaded_at_rest
+from dolfinopt.multibody.newton_euler import elastic_residual
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.tangent import linearise
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ class ElasticInstants:
 
     def __getitem__(self, part: slice | np.ndarray) -> ElasticInstants:
         """Return it at some of the instants."""
-        return ElasticInstants(self.mechanism[part], self.motion[part])
+        return ElasticInstants(self.mechanism, self.motion[part])
 
     def residual(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
         """Return the elastic residual (n, N)."""

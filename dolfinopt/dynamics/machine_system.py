@@ -4,7 +4,15 @@ Unknowns are y = (e, q, mu, s): the deviation e of the free rigid coordinates fr
 motion, the elastic coordinates q, for every constraint a coordinate whose second derivative is its
 multiplier, and the deviation s of motors that drive their arms through springs. Equations are those
 of the free rigid coordinates, forces of inverse dynamics less drives less what the closure does; of
-the elastic coordinates; the constraints themselves at every stage; and of the motors. With
+the elastic coordinates; the constraints themselves at every stage; and of the motors.
+
+Closures may hold rigid arms by more equations than joints that follow. P projects on combinations
+of equations that none of these joints moves, at the desired pose of every instant; constraints are
+
+    scale (g - g_0) + rho P mu'' = 0
+
+with the gap g_0 that rigid arms leave. What no arm resists then carries no force, as joints that
+give way by rho of the softest arm would have it; what arms resist is determined by them. With
 constraints this is Radau IIA of index 3, of which positions have order 2 s - 1, velocities s and
 multipliers s - 1. Source: Hairer, Lubich & Roche (1989), doi:10.1007/BFb0093947.
 """
@@ -20,6 +28,7 @@ import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.measured import (
+    CLOSURE_COMPLIANCE_SHARE,
     DEVIATION_ROUNDING,
     EQUILIBRIUM_ITERATIONS,
     MACHINE_EQUILIBRIUM_ROUNDING_ERROR,
@@ -28,11 +37,13 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import Drives, Mechanism, repeated
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.ranks import complement, least_norm
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import Drives, Mechanism
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +96,15 @@ class MachineInstants:
         desired: motion (n) of the rigid coordinates.
         ahead: (n, R) feed-forward forces.
         winding: (n, R) how far drives are asked to be ahead of their joints, rad; or None.
+        redundant: P (n, k, k) and g_0 (n, k), m, of closures that hold rigid arms more often than
+            needed; or None.
     """
 
     machine: MachineSystem
     desired: RigidMotion
     ahead: np.ndarray
     winding: np.ndarray | None = None
+    redundant: tuple[np.ndarray, np.ndarray] | None = None
 
     def __len__(self) -> int:
         """Return n."""
@@ -99,7 +113,11 @@ class MachineInstants:
     def __getitem__(self, part: slice | np.ndarray) -> MachineInstants:
         """Return it at some of the instants."""
         winding = None if self.winding is None else self.winding[part]
-        return MachineInstants(self.machine, self.desired[part], self.ahead[part], winding)
+        redundant = self.redundant
+        if redundant is not None:
+            redundant = redundant[0][part], redundant[1][part]
+        desired, ahead = self.desired[part], self.ahead[part]
+        return MachineInstants(self.machine, desired, ahead, winding, redundant)
 
     def split(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parts (n, R), (n, N), (n, m) of coordinates or their derivatives (n, S)."""
@@ -119,10 +137,13 @@ class MachineInstants:
             here[:, joints] = self.motors(y)
         return here
 
-    def motor_speeds(self, yd: np.ndarray) -> np.ndarray:
-        """Return those of motors behind springs (n, M), as their joints would have them."""
-        springs = self.machine.drives.springs
-        return self.desired.qd[:, self.machine.drives.free[springs.joints]] + self.motors(yd)
+    def motor_rates(self, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
+        """Return speeds and accelerations of motors behind springs, see `RigidMotion.motors`."""
+        joints = self.machine.mechanism.motor_joints
+        rates = np.stack([self.desired.qd[:, joints], self.desired.qdd[:, joints]])
+        if len(self.machine.drives.springs.joints):  # else they are on the desired motion
+            rates += np.stack([self.motors(yd), self.motors(ydd)])
+        return rates
 
     def spring_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return the moments (n, M) with which arms pull on their motors' springs, N m."""
@@ -140,7 +161,8 @@ class MachineInstants:
             actual = desired.copy()
             actual[:, free] += change[:, :R]
             parts.append(actual)
-        return replace(self.desired, q=parts[0], qd=parts[1], qdd=parts[2])
+        q, qd, qdd = parts
+        return replace(self.desired, q=q, qd=qd, qdd=qdd, motors=self.motor_rates(yd, ydd))
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
@@ -162,27 +184,24 @@ class MachineInstants:
 
         Those of free coordinates by their law; of prescribed ones, what moves them as they move.
         """
-        if (every := repeated(len(y))) is not None:
-            return self[every].forces(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        forces = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
+        every = inverse_dynamics(machine.mechanism, motion, q, qd, qdd)[1]
+        forces, motors = np.split(every, [machine.mechanism.num_rigid], axis=1)
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
-            forces -= here.work(multipliers)[:, : forces.shape[1]]
-        free, rotors = machine.drives.free, machine.drives.rotors
+            forces -= here.generalised_force(multipliers)[:, : forces.shape[1]]
+        free = machine.drives.free
         forces[:, free] = self.drive_forces(y, yd)
-        if rotors is not None:
-            forces[:, free] += rotors * self.desired.qdd[:, free]
+        if not len(machine.drives.springs.joints):
+            forces[:, machine.mechanism.motor_joints] += motors
         if (friction := machine.drives.friction) is not None:
             forces[:, free] += friction.force(self.desired.qd[:, free])
         return forces
 
     def residual(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return r (n, S); N m of joints, N of the cart, of modes as they are scaled, m."""
-        if (every := repeated(len(y))) is not None:
-            return self[every].residual(y[every], yd[every], ydd[every])[: len(y)]
         machine = self.machine
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
@@ -191,44 +210,52 @@ class MachineInstants:
         rigid = forces[:, machine.drives.free] - drives
         pulled = self.spring_forces(y, yd)
         rigid[:, springs.joints] += drives[:, springs.joints] + pulled
-        wanted = self.desired.qdd[:, machine.drives.free[springs.joints]]
-        motors = springs.rotor * (wanted + self.motors(ydd)) - pulled - drives[:, springs.joints]
+        motors = -pulled - drives[:, springs.joints]
+        if len(springs.joints):
+            motors += forces[:, machine.mechanism.num_rigid :]
         if springs.friction.acts:
-            motors += springs.friction.force(self.motor_speeds(yd))
+            motors += springs.friction.force(self.motor_rates(yd, ydd)[0])
         out = np.concatenate([rigid, rows, np.zeros_like(multipliers), motors], axis=1)
         if machine.loops is None:
             return out
         here = machine.loops.at(machine.mechanism, motion.q, q)
-        out[:, : machine.ends[1]] -= here.work(multipliers)[:, machine.columns]
-        out[:, slice(*machine.ends[1:])] = machine.gap_scale * here.gap
+        out[:, : machine.ends[1]] -= here.generalised_force(multipliers)[:, machine.columns]
+        out[:, slice(*machine.ends[1:])] = self._constraints(here.gap, multipliers)
         return out
+
+    def _constraints(self, gap: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        """Return the constraints' rows (n, k), N."""
+        if self.redundant is None:
+            return self.machine.gap_scale * gap
+        P, left = self.redundant
+        given = CLOSURE_COMPLIANCE_SHARE * np.einsum("nij,nj->ni", P, multipliers)
+        return self.machine.gap_scale * (gap - left) + given
 
     def linearise(
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
     ) -> DenseLinearisation:
         """Return its derivative by the coordinates `keep`, or all."""
-        if (every := repeated(len(y))) is not None:
-            return self[every].linearise(y[every], yd[every], ydd[every], keep).window(0, len(y))
         machine = self.machine
-        (_, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
+        (R, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
         matrix = np.zeros((count, S, 3, S))
-        free = machine.drives.free
-        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, free)
-        matrix[:, :moving, :, :moving] = tangent.dense().reshape(count, moving, 3, moving)
         passing = self.passing(y, yd)
         springs, every = machine.drives.springs, machine.drive_columns
         motors = every[springs.joints]
+        rigid = np.concatenate([machine.drives.free, machine.motor_coordinates])
+        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, rigid).dense()
+        places = np.concatenate([np.arange(R), motors, np.arange(R, moving)])
+        parts = tangent.reshape(count, len(places), 3, len(places))
+        matrix[:, places[:, None, None], np.arange(3)[:, None], places] = parts
         matrix[:, every, 0, every] += passing * machine.drives.stiffness
         matrix[:, every, 1, every] += passing * machine.drives.damping
         for order, value in enumerate((springs.stiffness, springs.damping)):
             for rows, sign in ((springs.joints, 1.0), (motors, -1.0)):
                 matrix[:, rows, order, springs.joints] += sign * value
                 matrix[:, rows, order, motors] -= sign * value
-        matrix[:, motors, 2, motors] += springs.rotor
         if springs.friction.acts:
-            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_speeds(yd))
+            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_rates(yd, ydd)[0])
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
             J = here.jacobian[:, :, machine.columns]  # (n, m, R + N)
@@ -236,6 +263,9 @@ class MachineInstants:
             matrix[:, :moving, 0, :moving] -= H
             matrix[:, :moving, 2, moving:last] -= J.swapaxes(1, 2)
             matrix[:, moving:last, 0, :moving] += machine.gap_scale * J
+            if self.redundant is not None:
+                given = CLOSURE_COMPLIANCE_SHARE * self.redundant[0]
+                matrix[:, moving:last, 2, moving:last] += given
         return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
 
 
@@ -248,8 +278,7 @@ class MachineSystem:
         motion: desired rigid coordinates at given instants (n,) s.
         breakpoints: as of `System`.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
-        loops: closures, of whose equations m are independent for flexible arms; or None.
-        rigid_loops: the same with those that are for rigid arms: as many as joints that follow.
+        loops: closures, m equations; or None.
     """
 
     mechanism: Any
@@ -257,7 +286,6 @@ class MachineSystem:
     breakpoints: tuple[float, ...]
     drives: Drives
     loops: Loops | None = None
-    rigid_loops: Loops | None = None
 
     @cached_property
     def ends(self) -> tuple[int, int, int]:
@@ -278,6 +306,11 @@ class MachineSystem:
         places, joints = np.arange(self.ends[0]), self.drives.springs.joints
         places[joints] = self.ends[2] + np.arange(len(joints))
         return places
+
+    @cached_property
+    def motor_coordinates(self) -> np.ndarray:
+        """The mechanism's coordinates (M,) of motors behind springs that are controlled."""
+        return self.mechanism.num_rigid + np.arange(len(self.drives.springs.joints))
 
     @property
     def num_coordinates(self) -> int:
@@ -339,22 +372,54 @@ class MachineSystem:
         ahead = np.zeros((len(desired.q), self.ends[0]))
         winding = None
         if self.drives.rigid_feed_forward:
-            ahead += self.feed_forward(desired)
+            every = feed_forward(self.rigid, desired, self.drives, self.loops)
+            forces, motors = np.split(every, [self.ends[0]], axis=1)
+            ahead += forces
             springs = self.drives.springs
             if self.drives.winding:
                 winding = np.zeros_like(ahead)
                 winding[:, springs.joints] = ahead[:, springs.joints] / springs.stiffness
-            columns = self.drives.free[springs.joints]
-            ahead[:, springs.joints] += springs.rotor * desired.qdd[:, columns]
+            ahead[:, springs.joints] += motors
             if springs.friction.acts:
-                ahead[:, springs.joints] += springs.friction.force(desired.qd[:, columns])
+                speeds = desired.qd[:, self.drives.free[springs.joints]]
+                ahead[:, springs.joints] += springs.friction.force(speeds)
         if pushes is not None:
             ahead += pushes
-        return MachineInstants(self, desired, ahead, winding)
+        return MachineInstants(self, desired, ahead, winding, self._redundant(desired))
+
+    @property
+    def num_redundant(self) -> int:
+        """Number of equations that follow from the others for rigid arms."""
+        _, moving, last = self.ends
+        return last - moving - len(self.drives.dependent)
+
+    def _redundant(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return P (n, k, k) and g_0 = P g (n, k), m, of rigid arms on a desired motion."""
+        if self.loops is None or self.num_redundant == 0:
+            return None
+        dependent, none = self.drives.dependent, np.zeros((len(desired.q), 0))
+        here = self.loops.at(self.rigid, desired.q, none)
+        P = complement(here.jacobian[:, :, dependent] / self.mechanism.levers[dependent])
+        return P, np.einsum("nij,nj->ni", P, here.gap)
+
+    def left_stress(self) -> float:
+        """Return the largest force that closing what rigid arms leave open would add at t = 0, N.
+
+        (N' G_e K^-1 G_e' N)^-1 N' g_0, N spanning P: it is told, not summed in.
+        """
+        found = self._redundant(self.motion(np.zeros(1)))
+        if self.loops is None or found is None:
+            return 0.0
+        P, left = (x[0] for x in found)
+        q_r, q = self.motion(np.zeros(1)).q, np.zeros((1, self.mechanism.num_coordinates))
+        elastic = self.loops.at(self.mechanism, q_r, q).jacobian[0][:, self.mechanism.num_rigid :]
+        softness = P @ elastic @ np.linalg.solve(self.mechanism.stiffness(), elastic.T @ P)
+        forces = np.linalg.pinv(softness, rcond=1e-9, hermitian=True) @ left
+        return float(np.abs(forces).max(initial=0.0))
 
     def feed_forward(self, desired: RigidMotion) -> np.ndarray:
         """Return the forces (n, R) that move the machine with rigid arms on the desired motion."""
-        return feed_forward(self.rigid, desired, self.drives, self.rigid_loops)
+        return feed_forward(self.rigid, desired, self.drives, self.loops)[:, : self.ends[0]]
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -386,21 +451,34 @@ class MachineSystem:
     def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
         instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
-        rest, ydd, step = (np.zeros_like(y) for _ in range(3))
-        step, some = step[0], self._at_start
+        rest, ydd, some = np.zeros_like(y), np.zeros_like(y), self._at_start
+        load = None
         for _ in range(EQUILIBRIUM_ITERATIONS):
             residual = instants.residual(y, rest, ydd)[0, some]
             if not residual.any():
                 return y, ydd[0, ground]
-            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])
+            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])[np.ix_(some, some)]
+            size, x = np.abs(matrix).max(axis=1), np.abs(y + ydd)[0, some]
+            if not size.all():
+                break
+            # Rows of like size; the backward error judges what rounding leaves of each.
+            matrix, residual = matrix / size[:, None], residual / size
+            load = np.abs(residual) if load is None else load
+            rounding = (np.abs(matrix) @ x + load).max()
             try:
-                step[some] = np.linalg.solve(matrix[np.ix_(some, some)], -residual)
+                step = np.linalg.solve(matrix, -residual)
             except np.linalg.LinAlgError:
                 break
-            ydd[0, ground] += step[ground]
-            step[ground] = 0.0
-            y = y + step
-            if np.abs(step).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(1.0, np.abs(y).max()):
+            if np.abs(residual).max() <= 10.0 * MACHINE_EQUILIBRIUM_ROUNDING_ERROR * rounding:
+                return y, ydd[0, ground]
+            change = np.zeros(y.shape[1])
+            change[some] = step
+            ydd[0, ground] += change[ground]
+            change[ground] = 0.0
+            y = y + change
+            if np.abs(change).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(
+                1.0, np.abs(y).max()
+            ):
                 return y, ydd[0, ground]
         limited = bool(self.drives.limited.any())
         raise ConvergenceError(
@@ -432,8 +510,9 @@ class MachineSystem:
         motion = instants.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, ground) = (instants.split(x) for x in (y, yd, ydd))
         of_rigid, of_elastic, of_gap = instants.split(multipliers)
-        of_forces = np.zeros_like(motion.q)
+        of_forces = np.zeros((len(y), motion.q.shape[1] + len(self.mechanism.motor_joints)))
         of_forces[:, self.drives.free] = of_rigid
+        of_forces[:, self.motor_coordinates] = instants.motors(multipliers)
         total = body_gradient(self.mechanism, motion, q, qd, qdd, of_elastic, of_forces)
         pushed = -instants.passing(y, yd) * instants.at_drives(multipliers)
         total = self.with_feed_forward(total, instants, pushed)
@@ -458,15 +537,15 @@ class MachineSystem:
         """
         if not self.drives.rigid_feed_forward:
             return total
+        springs = self.drives.springs
+        motors = weights[:, springs.joints]
         if self.drives.winding:
-            springs = self.drives.springs
             turned = self.drives.stiffness[springs.joints] / springs.stiffness
             weights = weights.copy()
             weights[:, springs.joints] *= 1.0 + turned
         desired = instants.desired
-        of_forces = feed_forward_weights(
-            self.rigid, desired, self.drives, self.rigid_loops, weights
-        )
+        of_forces = feed_forward_weights(self.rigid, desired, self.drives, self.loops, weights)
+        of_forces = np.hstack([of_forces, motors])
         none = np.zeros((len(weights), 0))
         rigid = body_gradient(self.rigid, desired, none, none, none, none, of_forces)
         return [a + b.padded(a) for a, b in zip(total, rigid, strict=True)]
@@ -578,17 +657,20 @@ def feed_forward(
     drives: Drives,
     loops: Loops | None,
 ) -> np.ndarray:
-    """Return the forces (n, R) that move the machine with rigid arms on the desired motion.
+    """Return the forces (n, R + M) that move the machine with rigid arms on the desired motion.
 
+    Those of the free coordinates, and of motors behind springs, which move their rotors.
     In a closed loop the joints that follow from others have no drive: what they would need, the
-    closures give.
+    closures give, by multipliers of least norm.
     """
     none = np.zeros((len(desired.q), 0))
-    forces = inverse_dynamics(rigid, desired, none, none, none)[1]
+    every = inverse_dynamics(rigid, desired, none, none, none)[1]
+    forces, motors = np.split(every, [rigid.num_rigid], axis=1)
     if loops is not None:
         here = loops.at(rigid, desired.q, none)
-        forces = forces - here.work(here.closing(forces, drives.dependent))
-    return forces[:, drives.free] * drives.driven
+        forces = forces - here.generalised_force(here.closing(forces, drives.dependent))
+    motors = motors[:, : len(drives.springs.joints)]
+    return np.hstack([forces[:, drives.free] * drives.driven, motors])
 
 
 def feed_forward_weights(
@@ -606,7 +688,6 @@ def feed_forward_weights(
     out[:, drives.free] = weights * drives.driven
     if loops is not None:
         J = loops.at(rigid, desired.q, np.zeros((len(desired.q), 0))).jacobian
-        dependent = drives.dependent
-        pulled = np.linalg.solve(J[:, :, dependent], (J @ out[:, :, None]))[:, :, 0]
-        out[:, dependent] -= pulled
+        dependent, moved = drives.dependent, np.einsum("nkr,nr->nk", J, out)
+        out[:, dependent] -= least_norm(J[:, :, dependent], moved)
     return out

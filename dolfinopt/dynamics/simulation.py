@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.adjoint import Adjoint
-from dolfinopt.dynamics.build import build_system, closure_of, desired_motion, rests_of
+from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem
@@ -26,9 +26,9 @@ from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.closures import Loops
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
+from dolfinopt.motion.build import rests
+from dolfinopt.multibody.closures import Loops, Tie
+from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
     deviation,
     end_effector,
@@ -36,15 +36,13 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.mechanism import Closure, Mechanism
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import (
-    SPACE,
-    Rates,
-    ShapeIntegrals,
-    add_integrals,
-)
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.loads import load_coefficients as coefficients_of
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import SPACE, Rates, ShapeIntegrals, add_integrals
+from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.closures import PARTS
@@ -218,9 +216,9 @@ class Trajectory:
         return self.problem.loops if isinstance(self.problem, MachineSystem) else None
 
     @property
-    def closure(self) -> Closure | None:
+    def closure(self) -> Tie | None:
         """What holds the last interface of a closed loop in the plane, or None."""
-        return closure_of(self.scene)
+        return self.loops.ties[0] if self.scene.closure and self.loops else None
 
     @cached_property
     def closure_force(self) -> np.ndarray | None:
@@ -233,7 +231,7 @@ class Trajectory:
         if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
         multipliers = self.unknowns[2][:, slice(*self.problem.ends[1:])]
-        return multipliers if self.closure else self.loops.reactions(multipliers)
+        return self.loops.reactions(multipliers)
 
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
@@ -260,11 +258,11 @@ class Trajectory:
     @cached_property
     def slider_position(self) -> np.ndarray | None:
         """Place of a slider on its line, from the closure's point along its direction (n,), m."""
-        if self.closure is None or self.closure.count != 1:
+        closure = self.scene.closure
+        if closure is None or closure.kind != "slider":
             return None
-        x, y = self.end.T
-        along = self.closure.normals[0] / 1j
-        return (np.conj(along) * (x + 1j * y - self.closure.point)).real
+        along = np.array(closure.direction) / np.linalg.norm(closure.direction)
+        return (self.end - np.array(closure.point)) @ along
 
     @property
     def motor_columns(self) -> tuple[int, ...]:
@@ -325,8 +323,8 @@ class Trajectory:
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
 
-        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' g_d'^-1 by_d; of
-        flexible arms that closures hold by more equations than that, the further forces are held.
+        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' x, g_d' x = by_d;
+        of arms that closures hold by more equations than that, x is of least norm.
 
         Args:
             indices: (n,) of the instants.
@@ -334,14 +332,14 @@ class Trajectory:
         """
         problem = self.problem
         by_q = by[:, problem.elastic_columns]
-        if not isinstance(problem, MachineSystem) or problem.rigid_loops is None:
+        if not isinstance(problem, MachineSystem) or problem.loops is None:
             return by_q
         q_r, q = self.motion.q[indices], self.q_e[indices]
-        here = problem.rigid_loops.at(self.mechanism, q_r, q)
+        here = problem.loops.at(self.mechanism, q_r, q)
         J = here.jacobian[:, :, problem.columns]
         dependent = np.flatnonzero(~problem.drives.driven)
-        by_g = np.linalg.solve(J[:, :, dependent].swapaxes(1, 2), by[:, dependent, None])
-        return by_q - np.einsum("nm,nmk->nk", by_g[..., 0], J[:, :, problem.elastic_columns])
+        by_g = least_norm(J[:, :, dependent].swapaxes(1, 2), by[:, dependent])
+        return by_q - np.einsum("nm,nmk->nk", by_g, J[:, :, problem.elastic_columns])
 
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
@@ -387,7 +385,7 @@ class Trajectory:
         """Which instants are in a rest (n,); the last one is in any case."""
         rounding = 1e-9 * self.scene.motion.horizon
         found = np.zeros(len(self.t), dtype=bool)
-        for begin, end in rests_of(self.scene):
+        for begin, end in rests(self.scene):
             found |= (self.t >= begin - rounding) & (self.t <= end + rounding)
         found[-1] = True
         return found
@@ -587,11 +585,12 @@ class _Prescribed:
     @cached_property
     def tangent(self) -> Linearisation:
         """By rigid and elastic coordinates."""
-        every = np.arange(self.motion.q.shape[1])
+        mechanism = self.mechanism
+        every = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))
         return linearise(self.mechanism, self.motion, *self.rates, None, every)
 
     def by_all(self, weights: np.ndarray) -> np.ndarray:
-        """Return the derivatives (3, n, 1 + arms + N) by rigid and elastic coordinates."""
+        """Return the derivatives (3, n, R + M + N) by rigid, motors' and elastic coordinates."""
         rows = np.concatenate([weights, np.zeros_like(self.rates[0])], axis=1)
         return np.stack(self.tangent.transposed(rows))
 
@@ -626,8 +625,11 @@ class _Machine:
         instants, (y, yd, _) = self.instants, self.rates
         system = instants.machine
         drives = system.drives
-        given = weights.copy()
+        joints = system.mechanism.motor_joints
+        given = np.hstack([weights, np.zeros((len(weights), len(joints)))])
         given[:, drives.free] = 0.0
+        if not len(drives.springs.joints):
+            given[:, weights.shape[1] :] = weights[:, joints]
         by, bodies = self._of_prescribed(given)
         passed = instants.passing(y, yd) * weights[:, drives.free]
         by[0][:, system.drive_columns] -= passed * drives.stiffness
@@ -640,11 +642,15 @@ class _Machine:
         bodies = self.prescribed.by_bodies(weights)
         if not weights.any():
             return by, bodies
-        _, moving, last = system.ends
-        by[:, :, :moving] = self.prescribed.by_all(weights)[:, :, system.columns]
+        (_, moving, last), rigid = system.ends, system.mechanism.num_rigid
+        every = self.prescribed.by_all(weights)
+        by[:, :, last:] = every[:, :, system.motor_coordinates]
+        every = np.delete(every, np.s_[rigid : weights.shape[1]], axis=2)
+        by[:, :, :moving] = every[:, :, system.columns]
+        weights = weights[:, :rigid]
         if system.loops is None:
             return by, bodies
-        motion, q, rigid = self.prescribed.motion, self.prescribed.rates[0], weights.shape[1]
+        motion, q = self.prescribed.motion, self.prescribed.rates[0]
         here = system.loops.at(system.mechanism, motion.q, q)
         multipliers = self.instants.split(self.rates[2])[2]
         H = here.hessian(multipliers)[:, :rigid, system.columns]

@@ -17,7 +17,7 @@ import numpy as np
 
 from dolfinopt.dynamics.collocation import lagrange_integrals
 from dolfinopt.dynamics.measured import GAUSS_POINTS
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 
 Function = Callable[[np.ndarray], np.ndarray]
 

@@ -1,8 +1,8 @@
-"""Flexible bodies, the mechanism they make, and its prescribed motion; plain NumPy over instants.
+"""Flexible bodies, the mechanism they make, and its dynamics; plain NumPy over instants.
 
-`shape_integrals` (inertia of one body) -> `mechanism` (bodies on a cart, payload) -> `motion`
-(rigid coordinates that follow a path) -> `inverse_dynamics` (forces and elastic residual).
-The recursion, by the dimension of the world (`dimension`): `body_motion` (one body), `kinematics`
-(from body to body). Derivatives: `tangent` by coordinates and by the bodies' integrals;
-`end_effector`, its place and theirs. Other programs: `standard_input`.
+One file a thing, imports one way: `dimension` (what differs between plane and space, rotations),
+`shape_integrals` (inertia of one body), `body` (its forces, their tangent and gradient), `tree`
+(joints, mechanism), `frames` (from a body to those that hang on it), `kinematics` (poses),
+`newton_euler` (forces and elastic residual), `tangent`, `gradient`, `closures`, `loads`. A scene
+becomes a machine in `build` alone.
 """

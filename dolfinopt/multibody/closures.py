@@ -25,199 +25,16 @@ ch. 2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import Load
-from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, compose, product
-from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.measured import INDEPENDENT_SHARE
-from dolfinopt.multibody.mechanism import Closure, Mechanism, Site
-
-
-class SiteMotion:
-    """An interface of a body, or a point of the ground, at n poses, and how coordinates move it.
-
-    Attributes:
-        place: (d, n) of the joint's frame, m.
-        R: (d, d, n) or (d, d), its rotation.
-        by_place, by_spin: (d, C, n), (r, C, n) displacement and rotation by every coordinate, in
-            the ground's frame.
-        order: (C,) how far out a coordinate acts; -1: not on the way to the site.
-    """
-
-    def __init__(self, posed: Posed, site: Site | None, point: np.ndarray, R: np.ndarray) -> None:
-        """Take the poses, the interface, None for the ground, and the joint's frame on it."""
-        self.posed, mechanism = posed, posed.mechanism
-        self.dim = dim = mechanism.dim
-        count = len(posed.q)
-        size = mechanism.num_rigid + mechanism.num_coordinates
-        self.by_place, self.by_spin = np.zeros((dim.d, size, count)), np.zeros((dim.r, size, count))
-        self.order = np.full(size, -1)
-        self.way = () if site is None else mechanism.way_to(site)
-        if site is None:
-            self.place, self.R = np.repeat(point[:, None], count, axis=1), R
-            return
-        place, turned = posed.interface(*site)
-        self.place = place + product(turned, point[:, None])
-        self.R = compose(turned, R)
-        if (cart := mechanism.cart_coordinate) is not None:
-            self.by_place[0, cart], self.order[cart] = 1.0, 0
-        for step, (i, number) in enumerate(self.way):
-            self._add_joint(i, 1 + 2 * step)
-            self._add_modes(i, number, 2 + 2 * step)
-
-    def _add_joint(self, i: int, order: int) -> None:
-        moving, origin, R = self.posed.body(i)
-        if (k := moving.joint.coordinate) is None:
-            return
-        axis, dim = moving.joint.axis[:, None], self.dim
-        self.order[k] = order
-        if moving.slides:
-            self.by_place[:, k] = product(R, axis)
-            return
-        self.by_spin[:, k] = dim.rotated(R, axis)
-        self.by_place[:, k] = dim.velocity(self.by_spin[:, k], self.place - origin)
-
-    def _add_modes(self, i: int, number: int, order: int) -> None:
-        dim = self.dim
-        section = self.posed.section(i, number)
-        if section.turning is None:
-            return
-        columns = self.columns(i)
-        self.order[columns] = order
-        R, V = self.posed.body(i)[2], self.modes(i, number)
-        lever = self.place - self.posed.interface(i, number)[0]
-        spin = dim.rotated(R, section.turning.pushed(V[dim.d :]))
-        self.by_spin[:, columns] = spin
-        self.by_place[:, columns] = product(R, V[: dim.d]) + dim.velocity(spin, lever[:, None])
-
-    def columns(self, i: int) -> slice:
-        """Return the places of body i's elastic coordinates among all C."""
-        part, first = self.posed.mechanism.slices[i], self.posed.mechanism.num_rigid
-        return slice(first + part.start, first + part.stop)
-
-    def modes(self, i: int, number: int) -> np.ndarray:
-        """Return the derivative (b, q, n) of an interface's (u, theta) by the coordinates."""
-        constants, section = self.posed.mechanism.constants[i], self.posed.section(i, number)
-        T = constants.T[constants.outboard(number)]
-        count = len(self.posed.q)
-        if section.bent is None:
-            return np.broadcast_to(T[..., None], (*T.shape, count))
-        return T[..., None] - section.bent
-
-    def turned(self, v: np.ndarray) -> np.ndarray:
-        """Return a vector (d,) that is fixed to the frame in the ground's components (d, n)."""
-        found = product(self.R, v[:, None])
-        return np.broadcast_to(found, (self.dim.d, len(self.posed.q)))
-
-    def work(self, load: Load) -> np.ndarray:
-        """Return what a force and a moment (., n), the ground's components, do on every coordinate.
-
-        (n, C).
-        """
-        force, moment = load
-        found = np.einsum("dn,dcn->nc", force, self.by_place)
-        return found + np.einsum("rn,rcn->nc", moment, self.by_spin)
-
-    def along(self, virtual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return displacement (d, n) and rotation (r, n) by virtual coordinates (n, C)."""
-        place = np.einsum("dcn,nc->dn", self.by_place, virtual)
-        return place, np.einsum("rcn,nc->rn", self.by_spin, virtual)
-
-    def hessian(self, load: Load) -> np.ndarray:
-        """Return the derivative (n, C, C) of `work` by the coordinates, the load held.
-
-        Rows are the coordinates on which it works.
-        """
-        (force, moment), dim = load, self.dim
-        s, order = self.by_spin, self.order
-        on_way = order >= 0
-        inboard = on_way & (order[None] < order[:, None])  # [j, i]: i is inboard of j
-        pulled = dim.moment(self.by_place, force[:, None])
-        by_force = np.einsum("rjn,rin->nji", pulled, s)
-        found = np.where(inboard, by_force, 0.0)
-        found = found + found.swapaxes(1, 2)
-        joints = np.flatnonzero(on_way & (np.arange(len(order)) < self.posed.mechanism.num_rigid))
-        found[:, joints, joints] += by_force[:, joints, joints]
-        if dim.r > 1:
-            turned = dim.commutator(s, moment[:, None])
-            found += np.where(inboard, np.einsum("rjn,rin->nji", turned, s), 0.0)
-        for i, number in self.way:
-            if self.posed.section(i, number).turning is not None:
-                columns = self.columns(i)
-                found[:, columns, columns] += self._own_hessian(i, number, load)
-        return found
-
-    def _own_hessian(self, i: int, number: int, load: Load) -> np.ndarray:
-        """Return the part (n, q, q) of one body's own deformation."""
-        (force, _), dim = load, self.dim
-        constants, section = self.posed.mechanism.constants[i], self.posed.section(i, number)
-        assert section.turning is not None
-        d, spin = dim.d, self.by_spin[:, self.columns(i)]
-        lever = self.place - self.posed.interface(i, number)[0]
-        swung = dim.velocity(spin, lever[:, None])
-        found = np.einsum("rkn,rln->nkl", spin, dim.moment(swung, force[:, None]))
-        pull = self.pull(i, number, load)
-        own = self._in_body(i, number, load)
-        by_theta = section.turning.by_theta(own[1], -1.0)
-        if by_theta is not None:
-            theta = self.modes(i, number)[d:]
-            found += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
-        if constants.K0 is not None:
-            K0 = constants.K0[constants.outboard(number)]
-            found -= np.einsum("pn,pkl->nkl", pull, K0)
-        return found
-
-    def _in_body(self, i: int, number: int, load: Load) -> Load:
-        """Return force and moment about the interface of body i in its components."""
-        force, moment = load
-        back = self.posed.body(i)[2].swapaxes(0, 1)
-        lever = self.place - self.posed.interface(i, number)[0]
-        moment = moment + self.dim.moment(lever, force)
-        return product(back, force), self.dim.rotated(back, moment)
-
-    def pull(self, i: int, number: int, load: Load) -> np.ndarray:
-        """Return what works on (u, theta) (b, n) of body i's interface on the way."""
-        turning = self.posed.section(i, number).turning
-        assert turning is not None
-        force, moment = self._in_body(i, number, load)
-        return np.concatenate([force, turning.pulled(moment)])
-
-    def pull_along(
-        self, i: int, number: int, load: Load, change: Load, virtual: np.ndarray
-    ) -> np.ndarray:
-        """Return the derivative of `pull` (b, n) along virtual coordinates (n, C).
-
-        Args:
-            i, number: as there.
-            load: (., n).
-            change: its derivative along them.
-            virtual: of all coordinates.
-        """
-        dim, (force, moment) = self.dim, load
-        section, columns = self.posed.section(i, number), self.columns(i)
-        assert section.turning is not None
-        outer = self.order[columns][0] if columns.stop > columns.start else 0
-        lever = self.place - self.posed.interface(i, number)[0]
-        inner, own = ((self.order >= 0) & (self.order < k) for k in (outer, outer + 1))
-        spin = self.along(virtual * inner)[1]
-        shift, swing = self.along(virtual * own)
-        moved = self.along(virtual)[0] - (shift - dim.velocity(swing, lever))
-        about = moment + dim.moment(lever, force)
-        changed = change[1] + dim.moment(moved, force) + dim.moment(lever, change[0])
-        back = self.posed.body(i)[2].swapaxes(0, 1)
-        by_force = product(back, change[0] - dim.velocity(spin, force))
-        by_moment = dim.rotated(back, changed - dim.commutator(spin, about))
-        by = section.turning.pulled(by_moment)
-        by_theta = section.turning.by_theta(dim.rotated(back, about), -1.0)
-        if by_theta is not None:
-            theta = np.einsum("rkn,nk->rn", self.modes(i, number)[dim.d :], virtual[:, columns])
-            by = by + np.einsum("abn,bn->an", by_theta, theta)
-        return np.concatenate([by_force, by])
-
+from dolfinopt.multibody.body import Load
+from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, product
+from dolfinopt.multibody.kinematics import Posed, SiteMotion
+from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.multibody.tree import Mechanism, Site
 
 # -- equations: value, force on both frames, and how the force changes as these move -------------
 #
@@ -341,6 +158,20 @@ class Tie:
     rotation: np.ndarray
     equations: tuple[Equation, ...]
 
+    @classmethod
+    def in_plane(cls, name: str, site: Site, point: np.ndarray, normals: np.ndarray) -> Tie:
+        """Return what holds an interface of a plane machine to the ground's point (2,), m.
+
+        Args:
+            name: of it.
+            site: the interface.
+            point: a pin, or a point of a line.
+            normals: (m, 2) directions of its forces: across a line, or two of a pin.
+        """
+        return cls(
+            name, site, None, np.asarray(point, float), np.eye(2), tuple(map(Along, normals))
+        )
+
     @property
     def is_rod(self) -> bool:
         """Whether its frames are apart."""
@@ -349,73 +180,42 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """All closures of a machine: m equations, combinations of their own k.
+    """All closures of a machine, k equations; every one has its multiplier.
 
     Attributes:
         ties: the closures.
-        weights: (m, k) of the combinations that are independent; the identity where all are.
-        given: (k,) multipliers that are known, of constant forces; N.
     """
 
-    ties: tuple[Tie, ...]
-    weights: np.ndarray
-    given: np.ndarray
-
-    @classmethod
-    def of(cls, ties: Sequence[Tie]) -> Loops:
-        """Return closures of which all equations count."""
-        count = sum(len(tie.equations) for tie in ties)
-        return cls(tuple(ties), np.eye(count), np.zeros(count))
+    ties: tuple[Tie, ...] = ()
 
     @property
     def count(self) -> int:
-        """Number m of equations that count."""
-        return len(self.weights)
+        """Number k of equations."""
+        return sum(len(tie.equations) for tie in self.ties)
 
-    @property
-    def redundant(self) -> int:
-        """Number of equations that follow from the others."""
-        return len(self.given) - int(np.count_nonzero(self.given)) - self.count
+    @cached_property
+    def equations(self) -> tuple[Equation, ...]:
+        """Those of all closures."""
+        return tuple(one for tie in self.ties for one in tie.equations)
 
     @cached_property
     def lengths(self) -> np.ndarray:
         """By what (k,) a multiplier is a moment, m; 1 of forces."""
-        every = [one for tie in self.ties for one in tie.equations]
-        return np.array([one.length if isinstance(one, Facing) else 1.0 for one in every])
+        return np.array([one.length if isinstance(one, Facing) else 1.0 for one in self.equations])
+
+    def by_tie(self, values: np.ndarray) -> list[float]:
+        """Return the norm of every closure's part of values (k,) of the equations."""
+        ends = np.cumsum([len(tie.equations) for tie in self.ties])[:-1]
+        return [float(np.linalg.norm(part)) for part in np.split(values, ends)]
 
     def reactions(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return forces and moments (n, k) on the first frames, N and N m, of (n, m)."""
-        out: np.ndarray = (multipliers @ self.weights) * self.lengths
+        """Return forces and moments on the first frames, N and N m, of multipliers (n, k)."""
+        out: np.ndarray = multipliers * self.lengths
         return out
-
-    @classmethod
-    def of_plane(cls, closure: Closure, site: Site) -> Loops:
-        """Return what holds an interface of a plane machine."""
-        normals = [np.array([n.real, n.imag]) for n in closure.normals]
-        equations, given = [Along(n) for n in normals], np.zeros(len(normals))
-        if closure.force:
-            size = abs(closure.force)
-            along = closure.force / size
-            equations.append(Along(np.array([along.real, along.imag])))
-            given = np.append(given, size)
-        point = np.array([closure.point.real, closure.point.imag])
-        tie = Tie("closure", site, None, point, np.eye(2), tuple(equations))
-        return cls((tie,), np.eye(len(normals), len(equations)), given)
 
     def at(self, mechanism: Mechanism, q_r: np.ndarray, q: np.ndarray) -> ClosedLoops:
         """Return them at n poses, q_r (n, R) and q (n, N)."""
         return ClosedLoops(self, Posed(mechanism, q_r, q))
-
-    def independent(self, jacobian: np.ndarray) -> Loops:
-        """Return those combinations that are independent, by the Jacobian (k, C) of a pose.
-
-        Its columns are of like size. What is left out follows from the others where the loops are
-        closed, as the equations out of a plane mechanism's plane do.
-        """
-        U, sizes, _ = np.linalg.svd(jacobian, full_matrices=False)
-        rank = int((sizes > INDEPENDENT_SHARE * sizes.max(initial=0.0)).sum())
-        weights = np.eye(len(jacobian)) if rank == len(jacobian) else U[:, :rank].T
-        return replace(self, weights=weights)
 
 
 class ClosedLoops:
@@ -446,54 +246,41 @@ class ClosedLoops:
         return [(one, a, b) for tie, (a, b) in pairs for one in tie.equations]
 
     @cached_property
-    def every_gap(self) -> np.ndarray:
-        """All k equations (n, k), m."""
-        return np.stack([one.value(a, b) for one, a, b in self._equations], axis=1)
-
-    @cached_property
-    def every_row(self) -> np.ndarray:
-        """Their derivatives by all coordinates (n, k, C)."""
-        rows = []
-        for one, a, b in self._equations:
-            on_a, on_b = one.loads(a, b)
-            row = a.work(on_a) + b.work(on_b)
-            if isinstance(one, Distance) and one.coordinate is not None:
-                row[:, one.coordinate] -= 1.0
-            rows.append(row)
-        return np.stack(rows, axis=1)
-
-    @property
     def gap(self) -> np.ndarray:
-        """Those m that count (n, m), m."""
-        return self.every_gap @ self.loops.weights.T
+        """The equations (n, k), m."""
+        out = np.empty((len(self.posed.q), self.loops.count))
+        for k, (one, a, b) in enumerate(self._equations):
+            out[:, k] = one.value(a, b)
+        return out
 
     @cached_property
     def jacobian(self) -> np.ndarray:
-        """Their derivatives by all coordinates (n, m, C)."""
-        return self.loops.weights @ self.every_row
+        """Their derivatives by all coordinates (n, k, C)."""
+        size = self.posed.mechanism.num_rigid + self.posed.q.shape[1]
+        out = np.empty((len(self.posed.q), self.loops.count, size))
+        for k, (one, a, b) in enumerate(self._equations):
+            on_a, on_b = one.loads(a, b)
+            out[:, k] = a.generalised_force(on_a) + b.generalised_force(on_b)
+            if isinstance(one, Distance) and one.coordinate is not None:
+                out[:, k, one.coordinate] -= 1.0
+        return out
 
-    def forces(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the multipliers (n, k) of all equations from those (n, m) that count."""
-        return multipliers @ self.loops.weights + self.loops.given
-
-    def work(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return what the closures' forces of multipliers (n, m) do on every coordinate (n, C)."""
-        out: np.ndarray = np.einsum("nk,nkc->nc", self.forces(multipliers), self.every_row)
+    def generalised_force(self, multipliers: np.ndarray) -> np.ndarray:
+        """Return what the closures' forces of multipliers (n, k) do on every coordinate (n, C)."""
+        out: np.ndarray = np.einsum("nk,nkc->nc", multipliers, self.jacobian)
         return out
 
     def closing(self, forces: np.ndarray, dependent: np.ndarray) -> np.ndarray:
-        """Return the multipliers (n, m) that give what joints that follow need.
+        """Return the multipliers (n, k) of least norm that give what joints that follow need.
 
         Args:
             forces: (n, R) of inverse dynamics without closures.
-            dependent: (m,) the joints that follow, rigid coordinates.
+            dependent: the joints that follow, rigid coordinates; at most k.
         """
         J = self.jacobian[:, :, dependent]
-        left = forces[:, dependent] - self.work(np.zeros(J.shape[:2]))[:, dependent]
-        out: np.ndarray = np.linalg.solve(J.swapaxes(1, 2), left[:, :, None])[:, :, 0]
-        return out
+        return least_norm(J.swapaxes(1, 2), forces[:, dependent])
 
-    def pulls(self, multipliers: np.ndarray) -> dict[Site, Load]:
+    def interface_loads(self, multipliers: np.ndarray) -> dict[Site, Load]:
         """Return what interfaces give to the closures, force and moment in their components."""
         found: dict[Site, Load] = {}
         for sites, loads in zip(self._sites, self._loads(multipliers), strict=True):
@@ -509,32 +296,21 @@ class ClosedLoops:
                 found[site.way[-1]] = own
         return found
 
-    def _loads(self, multipliers: np.ndarray) -> list[Loads]:
-        """Return the loads of every closure on its two frames."""
-        every, found, k = self.forces(multipliers).T, [], 0
-        for tie, (a, b) in zip(self.loops.ties, self._sites, strict=True):
-            parts = []
-            for one in tie.equations:
-                parts.append(_scaled(one.loads(a, b), every[k]))
-                k += 1
-            found.append(_sum(parts))
-        return found
-
-    def _changes(self, multipliers: np.ndarray, moved: Sequence[Moved]) -> list[Loads]:
-        """Return how they change by motions of the frames of every closure."""
-        every, found, k = self.forces(multipliers).T, [], 0
-        for tie, (a, b), by in zip(self.loops.ties, self._sites, moved, strict=True):
-            parts = []
-            for one in tie.equations:
-                parts.append(_scaled(one.changes(a, b, by), every[k]))
-                k += 1
-            found.append(_sum(parts))
+    def _loads(self, multipliers: np.ndarray, moved: Sequence[Moved] | None = None) -> list[Loads]:
+        """Return the loads of every closure on its two frames, or their change as frames move."""
+        weights, found = iter(multipliers.T), []
+        for k, (tie, sites) in enumerate(zip(self.loops.ties, self._sites, strict=True)):
+            every = [
+                one.loads(*sites) if moved is None else one.changes(*sites, moved[k])
+                for one in tie.equations
+            ]
+            found.append(_sum([_scaled(loads, next(weights)) for loads in every]))
         return found
 
     def hessian(self, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative of `work` by all coordinates (n, C, C)."""
+        """Return the derivative of `generalised_force` by all coordinates (n, C, C)."""
         moved = [(a.by_place, a.by_spin, b.by_place, b.by_spin) for a, b in self._sites]
-        changes = self._changes(multipliers, moved)
+        changes = self._loads(multipliers, moved)
         size, count = self.posed.mechanism.num_rigid + self.posed.q.shape[1], len(self.posed.q)
         found = np.zeros((count, size, size))
         for sites, loads, changed in zip(
@@ -549,12 +325,17 @@ class ClosedLoops:
         return found
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
-        """Return what rates (n, C) add to the equations' second derivatives (n, m), m/s2."""
-        here, found = self._without_given(), []
-        for unit in np.eye(self.loops.count):
-            H = here.hessian(np.broadcast_to(unit, (len(rates), len(unit))))
-            found.append(np.einsum("ni,nij,nj->n", rates, H, rates, optimize=True))
-        return np.stack(found, axis=1)
+        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, k), m/s2.
+
+        The power g' of unit loads on moving frames, differentiated.
+        """
+        found = []
+        moved = [(*a.along(rates), *b.along(rates)) for a, b in self._sites]
+        bias = [(*a.acceleration(rates), *b.acceleration(rates)) for a, b in self._sites]
+        for tie, sites, v, a in zip(self.loops.ties, self._sites, moved, bias, strict=True):
+            for one in tie.equations:
+                found.append(_power(one.changes(*sites, v), v) + _power(one.loads(*sites), a))
+        return np.stack(found, axis=1) if found else np.zeros((len(rates), 0))
 
     def gradient(
         self, weights: np.ndarray, multipliers: np.ndarray, virtual: np.ndarray
@@ -562,8 +343,7 @@ class ClosedLoops:
         """Return the derivative of sum_n weights_n . gap_n + work_n(multipliers) . virtual_n.
 
         Args:
-            weights: (n, m).
-            multipliers: (n, m) of the forces; those given count as well.
+            weights, multipliers: (n, k).
             virtual: (n, C) displacements of all coordinates.
 
         Returns:
@@ -575,16 +355,12 @@ class ClosedLoops:
             if body.is_stiffened:
                 by["K0_outboard"] = np.zeros_like(body.K0_outboard)
         moved = [(*a.along(virtual), *b.along(virtual)) for a, b in self._sites]
-        values = self._without_given()._loads(weights)
-        forces, changes = self._loads(multipliers), self._changes(multipliers, moved)
+        values = self._loads(weights)
+        forces, changes = self._loads(multipliers), self._loads(multipliers, moved)
         for sites, value, load, change in zip(self._sites, values, forces, changes, strict=True):
             for site, of_gap, of_force, by in zip(sites, value, load, change, strict=True):
                 self._add_gradient(found, site, of_gap, of_force, by, virtual)
         return found
-
-    def _without_given(self) -> ClosedLoops:
-        """Return them without constant forces."""
-        return ClosedLoops(replace(self.loops, given=0.0 * self.loops.given), self.posed)
 
     def _add_gradient(
         self,
@@ -601,14 +377,20 @@ class ClosedLoops:
             if self.posed.section(i, number).turning is None:
                 continue
             e, v = self.posed.q[:, self.posed.mechanism.slices[i]], virtual[:, site.columns(i)]
-            rate = site.pull(i, number, of_force)
-            value = site.pull(i, number, of_gap)
-            value = value + site.pull_along(i, number, of_force, change, virtual)
+            rate = site.interface_load(i, number, of_force)
+            value = site.interface_load(i, number, of_gap)
+            value = value + site.interface_load_along(i, number, of_force, change, virtual)
             own = slice(dim.b * number, dim.b * (number + 1))
             found[i]["outboard"][own] += value @ e + rate @ v
             if "K0_outboard" in found[i]:
                 bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T
                 found[i]["K0_outboard"][own] -= bent @ e
+
+
+def _power(loads: Loads, rate: Moved) -> np.ndarray:
+    """Return that (n,) of loads on frames with these velocities."""
+    parts = zip((*loads[0], *loads[1]), rate, strict=True)
+    return np.sum([(f * v).sum(axis=0) for f, v in parts], axis=0)
 
 
 def _scaled(loads: Loads, factor: np.ndarray) -> Loads:

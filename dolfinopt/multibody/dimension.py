@@ -16,7 +16,7 @@ A rotation vector theta, x = theta . theta, turns by
 and with J = 1 + c_2 theta~ + c_3 theta~^2 the rate theta' is the angular velocity J theta', in the
 components of the frame that theta turns away from. c_k(x) = sum_j (-x)^j / (2 j + k)! have the
 derivatives c_k' = (k c_(k+2) - c_(k+1)) / 2 without a division: nothing is lost at small angles.
-At large ones, where the series cancels, they follow from sine and cosine.
+At large ones they follow from sine and cosine.
 Source: Stumpff (1959); Simo & Vu-Quoc (1988), doi:10.1016/0045-7825(88)90073-4; Sola, Deray &
 Atchuthan (2018), arXiv:1812.01537.
 """
@@ -30,12 +30,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from dolfinopt.multibody.measured import (
-    LONG_SERIES_LIMIT,
-    LONG_SERIES_TERMS,
-    SHORT_SERIES_LIMIT,
-    SHORT_SERIES_TERMS,
-)
+from dolfinopt.multibody.measured import SERIES_LIMIT, SERIES_TERMS
 
 
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
@@ -334,11 +329,11 @@ class PlaneTurning:
         out[1, 1], out[0, 1] = out[0, 0], -out[1, 0]
         return out
 
-    def pushed(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_times(self, x: np.ndarray) -> np.ndarray:
         """Return J x (r, ..., n): the angular velocity of a rate."""
         return x
 
-    pulled = pushed  # J' x
+    jacobian_transposed = jacobian_times
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray | None:
         """Return the derivative of J v by theta; of J' v with `sign` = -1. None: zero."""
@@ -380,18 +375,18 @@ class SpaceTurning:
         """Angular velocity by the rate (3, 3, n)."""
         return rotation(self.theta, self._c, 2)
 
-    def pushed(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_times(self, x: np.ndarray) -> np.ndarray:
         """Return J x (3, ..., n): the angular velocity of a rate."""
         return product(self.J, x)
 
-    def pulled(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x (3, ..., n)."""
         return transposed_product(self.J, x)
 
     @cached_property
     def velocity(self) -> np.ndarray:
         """Angular velocity J theta' (3, n)."""
-        return self.pushed(self.rate)
+        return self.jacobian_times(self.rate)
 
     @cached_property
     def acceleration(self) -> np.ndarray:
@@ -401,7 +396,7 @@ class SpaceTurning:
         first, second = self._first
         turned = Space.velocity(theta, v)
         bent = (along * first) * turned + (along * second) * Space.velocity(theta, turned)
-        return self.pushed(self.second) + bent + self._c[3] * Space.velocity(v, turned)
+        return self.jacobian_times(self.second) + bent + self._c[3] * Space.velocity(v, turned)
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray:
         """Return the derivative of J v by theta (3, 3, n); of J' v with `sign` = -1."""
@@ -456,12 +451,12 @@ def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
 
 
 def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
-    """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of many turns closed."""
-    far = np.abs(x) > LONG_SERIES_LIMIT
+    """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of large angles closed."""
+    far = np.abs(x) > SERIES_LIMIT
     if not far.any():
         return _series(x, orders)
     near = _series(np.where(far, 0.0, x), orders)
-    large = _closed(np.where(far, x, LONG_SERIES_LIMIT), orders)
+    large = _closed(np.where(far, x, SERIES_LIMIT), orders)
     return [np.where(far, b, a) for a, b in zip(near, large, strict=True)]
 
 
@@ -475,11 +470,9 @@ def _closed(x: np.ndarray, orders: int) -> list[np.ndarray]:
 
 
 def _series(x: np.ndarray, orders: int) -> list[np.ndarray]:
-    short = np.abs(x).max(initial=0.0) <= SHORT_SERIES_LIMIT
-    terms = SHORT_SERIES_TERMS if short else LONG_SERIES_TERMS
     last = np.zeros((2, *x.shape), dtype=x.dtype)  # c_(orders-1) and the one before
     column = (2, *(1,) * x.ndim)
-    for j in range(terms - 1, -1, -1):
+    for j in range(SERIES_TERMS - 1, -1, -1):
         first = [1.0 / factorial(2 * j + k) for k in (orders - 1, orders - 2)]
         last = np.reshape(first, column) - x * last
     found = list(last)

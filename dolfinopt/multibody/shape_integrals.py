@@ -90,7 +90,7 @@ class ShapeIntegrals:
             1 for modes in m; (0, q, q) likewise.
         further_points: (i, d) reference positions of the others, m; none in the plane.
         along_modes: (q, q, q) L of the displacement of second order along the modes, M^-1 times
-            the geometric stiffness by the modes' inertia, see `body_motion`; (0, q, q) where
+            the geometric stiffness by the modes' inertia, see `body`; (0, q, q) where
             it is not known, as of bodies from files.
     """
 
@@ -193,15 +193,6 @@ class ShapeIntegrals:
         whole = self.in_basis(np.zeros((0, like.num_modes)))
         zero: dict[str, Any] = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
         return replace(whole, **zero)
-
-    def scaled_by(self, scale: str | None) -> list[np.ndarray]:
-        """Return the integrals that `scale` multiplies, see `Integral`; None: the geometry."""
-        return [np.asarray(getattr(self, one.name)) for one in TABLE if one.scale == scale]
-
-    def is_shaped_like(self, other: ShapeIntegrals) -> bool:
-        """Return whether number of coordinates, outboard modes and point are equal."""
-        pairs = zip(self.scaled_by(None), other.scaled_by(None), strict=True)
-        return self.num_modes == other.num_modes and all(np.array_equal(a, b) for a, b in pairs)
 
     @property
     def first_frequency(self) -> float:
@@ -348,7 +339,7 @@ def shape_integrals(
     """
     q = basis.V.shape[2]
     E = generators(arm.points.shape[1])
-    mass, w, W = _integrated(arm, basis, E)
+    mass, w, W = integrated(arm, basis, E)
     K0 = by_modes = by_outboard = np.zeros((0, q, q))
     if loads is not None:
         ends = [loads.num_frame, loads.num_inertial]
@@ -371,7 +362,7 @@ def shape_integrals(
     )
 
 
-def _integrated(
+def integrated(
     arm: ElasticArm, basis: Basis, E: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return m, w and W of the design by the matrices E (collective on the arm's ranks)."""
@@ -483,6 +474,47 @@ def rigid_body(
     )  # fmt: skip
 
 
+def rigid_spatial_body(
+    mass: float,
+    centre: np.ndarray | tuple[float, ...],
+    inertia: np.ndarray | tuple[float, ...],
+    outboard_point: np.ndarray | tuple[float, ...] = (0.0, 0.0, 0.0),
+    further_points: np.ndarray | tuple[tuple[float, ...], ...] = (),
+) -> ShapeIntegrals:
+    """Return a spatial body without elastic coordinates.
+
+    Args:
+        mass: kg.
+        centre: (3,) of mass, m.
+        inertia: (6,) xx, yy, zz, xy, xz, yz of the inertia tensor about the centre, as in URDF,
+            kg m2.
+        outboard_point: (3,) of its outboard interface, m.
+        further_points: (i, 3) of others, m.
+    """
+    r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
+    # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
+    second = 0.5 * np.trace(tensor) * np.eye(3) - tensor + mass * np.outer(r, r)
+    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
+    return ShapeIntegrals(
+        mass=float(mass),
+        w=(mass * r)[:, None],
+        W=second.reshape(9, 1, 1),
+        K=square,
+        D=square,
+        outboard=np.zeros((6 + 6 * len(further), 0)),
+        outboard_point=np.asarray(outboard_point, dtype=float),
+        K0=np.zeros((0, 0, 0)),
+        K0_outboard=np.zeros((0, 0, 0)),
+        further_points=further,
+    )
+
+
+def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
+    """Return the tensor (3, 3) of xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=float)
+
+
 def rigid_bar(
     length: float, height: float, mass: float, inertia: float | None = None
 ) -> ShapeIntegrals:
@@ -503,79 +535,6 @@ def linear_part(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body without geometric stiffness."""
     linear: Any = np.zeros((0, body.num_modes, body.num_modes))
     return replace(body, **dict.fromkeys(STIFFENING, linear))
-
-
-# -- a plane body in space, as files of spatial codes hold it --------------------------------------
-
-
-def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegrals:
-    """Return a plane body as one in space: the same motion in x-y, none out of it.
-
-    A body in space is returned as it is.
-
-    Geometric stiffness of the seven loads is spread over the eighteen,
-
-        K0_yx = -K0_xy = K0_wd / 2,   K0_xx = K0_yy = -K0_zz = K0_-ww / 2,
-
-    so that no rows feel rotation about x and y, of which a plane body does not know: neither of
-    what a_z, F_z, T_x and T_y do. The moment about x and y does feel K0_wd, by way of Gr.
-
-    Args:
-        body: in the plane.
-        W: (9, 1 + q, 1 + q) of the body, see `plate_moments`. By default a guess from the planar
-            integrals, all mass on the x axis and moving across it: out of the plane a thin bar.
-    """
-    if len(body.w) == 3:
-        return body
-    q = body.num_modes
-    w, point, K0, loads = np.zeros((3, 1 + q)), np.zeros(3), np.zeros((3, 3, q, q)), body.K0
-    w[:2], point[:2] = body.w, body.outboard_point
-    if W is None:
-        bar = np.zeros((3, 3, 1 + q, 1 + q))
-        bar[0, 0, 0], bar[0, 0, 1:, 0] = body.W[0, 0], body.j
-        bar[0, 1, 0, 1:] = bar[1, 0, 1:, 0] = body.r
-        bar[0, 1, 1:, 1:], bar[1, 0, 1:, 1:] = -0.5 * body.G, 0.5 * body.G
-        bar[1, 1, 1:, 1:] = body.M
-        W = bar.reshape(9, 1 + q, 1 + q)
-    if body.is_stiffened:
-        push = np.concatenate([body.K0[:2], np.zeros((1, q, q))])
-        K0[1, 0], K0[0, 1] = 0.5 * body.K0[2], -0.5 * body.K0[2]
-        K0[0, 0] = K0[1, 1] = 0.5 * body.K0[3]
-        K0[2, 2] = -K0[0, 0]
-        loads = np.concatenate([push, K0.reshape(9, q, q)])
-    return replace(
-        body,
-        w=w,
-        W=W,
-        outboard=_with_rows(body.outboard),
-        outboard_point=point,
-        K0=loads,
-        K0_outboard=_with_rows(body.K0_outboard) if body.is_stiffened else body.K0_outboard,
-        further_points=np.zeros((0, 3)),
-    )
-
-
-def _with_rows(plane: np.ndarray) -> np.ndarray:
-    """Return what stands along x, y and about z among all six."""
-    out = np.zeros((6, *plane.shape[1:]))
-    out[[0, 1, 5]] = plane
-    return out
-
-
-def plate_moments(arm: ElasticArm, basis: Basis, thickness: float) -> np.ndarray:
-    """Return W (9, 1 + q, 1 + q) of a plane arm's design (collective on the arm's ranks).
-
-    Args:
-        arm: with its design set.
-        basis: of that design.
-        thickness: t, m; int z^2 = m t^2 / 12.
-    """
-    mass, _, plane = _integrated(arm, basis, np.eye(4).reshape(4, 2, 2))
-    size = plane.shape[1]
-    W = np.zeros((3, 3, size, size))
-    W[:2, :2] = plane.reshape(2, 2, size, size)
-    W[2, 2, 0, 0] = mass * thickness**2 / 12.0
-    return W.reshape(9, size, size)
 
 
 Rates = tuple[np.ndarray, np.ndarray, np.ndarray]  # q, qd, qdd

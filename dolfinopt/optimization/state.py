@@ -10,7 +10,7 @@ import numpy as np
 
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
-from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.optimization.measured import IMPROVED_SHARE
 from dolfinopt.optimization.mma import Search
 from dolfinopt.optimization.problem import Stage

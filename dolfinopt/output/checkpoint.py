@@ -15,7 +15,7 @@ from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.collocation import Solution, Strategy
 from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
-from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.optimization.mma import Search
 from dolfinopt.optimization.problem import Stage
 from dolfinopt.optimization.state import Best, FurtherMemory, HistoryRow, IterateMemory, Memory

@@ -18,9 +18,11 @@ from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.simulation import JointLimit, Trajectory
 from dolfinopt.mesh import compat
-from dolfinopt.multibody.inverse_dynamics import Stiffening
+from dolfinopt.motion.build import forced_rest, loop_start, misfit
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.trajectory import (
     drive_units,
@@ -50,6 +52,7 @@ SUMMARY_UNITS = {
     "max_deviation_time": "s",
     "max_rotation": "rad",
     "settling": "m",
+    "loop_start": "rad, m",
     "deflection_budget": "m, shares -",
     "stress": "Pa",
     "mass": "kg",
@@ -127,6 +130,7 @@ def summarise(
             **_figures(run.evaluation),
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            "loop_start": loop_start(scene),
             "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),
@@ -310,7 +314,8 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
         *_limits_exceeded(run.trajectory),
-        *_redundant(run.trajectory),
+        *_on_closures(run.scene, run.trajectory),
+        *([] if (rest := forced_rest(run.scene)) is None else [rest]),
         *_contact_warnings(run, traits),
         *(one.sentence for one in _too_narrow(run, traits)),
     ]
@@ -400,16 +405,23 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
     return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []
 
 
-def _redundant(trajectory: Trajectory | None) -> list[str]:
-    """Return a sentence that tells how many equations of closures follow from others."""
-    if trajectory is None or trajectory.loops is None or not trajectory.loops.redundant:
+def _on_closures(scene: Scene, trajectory: Trajectory | None) -> list[str]:
+    """Return sentences on closures that hold rigid arms more often than needed."""
+    if trajectory is None or not isinstance(trajectory.problem, MachineSystem):
         return []
-    loops = trajectory.loops
-    return [
-        f"closures: of {loops.count + loops.redundant} equations {loops.redundant} follow from the "
-        "others and are left out; how forces share between them is not determined, the smallest "
-        "ones are told"
-    ]
+    problem, told = trajectory.problem, []
+    if problem.num_redundant:
+        _, first, last = problem.ends
+        told.append(
+            f"closures: of {last - first} equations {problem.num_redundant} follow from the others "
+            "for rigid arms; where no arm resists, the smallest forces are told"
+        )
+    if (left := misfit(scene)) > 0.0:
+        told.append(
+            f"closures: rigid arms leave {left:.3g} m open; closing it would add forces of "
+            f"{problem.left_stress():.3g} N, which are left out"
+        )
+    return told
 
 
 def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | None:

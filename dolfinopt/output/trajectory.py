@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.disk import read_arrays, write_arrays, write_text
-from dolfinopt.multibody.mechanism import moves
+from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.closures import PARTS
 from dolfinopt.scene.tables.joints import joint_parts
@@ -102,6 +102,7 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
         trajectory.compliance,
         trajectory.joint_forces[:, trajectory.scene.driven_columns],
         *arrays.values(),
+        *([arrays["closure_force"]] if trajectory.scene.closure is not None else []),
         trajectory.rotation,
     ]
 
@@ -155,6 +156,7 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
         names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
         units |= {f"closure_force_{name}": "N" for name in names}
         units |= {"slider_position": "m"} if scene.closure.kind == "slider" else {}
+        units |= {f"closure_{scene.closure.name}_{name}": "N" for name in names}
     ends = [""] if trajectory.mechanism.dim.r == 1 else [f"_{axis}" for axis in axes]
     return units | {f"rotation{end}": "rad" for end in ends}
 

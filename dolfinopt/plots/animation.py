@@ -13,7 +13,7 @@ from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 from dolfinopt.disk import write_atomically
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.machine import (
     Cast,

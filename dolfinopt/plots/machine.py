@@ -14,9 +14,10 @@ from matplotlib.colors import to_rgba_array
 from matplotlib.patches import Polygon
 from matplotlib.tri import Triangulation
 
+from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.mechanism import Closure, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.design import boundary, sides
 from dolfinopt.plots.style import (
@@ -63,12 +64,15 @@ def chain(mechanism: Mechanism, q_r: np.ndarray, q_e: np.ndarray) -> tuple[np.nd
         (n, arms) = exp(i angle from +x) of the frames.
     """
     # Interfaces move linearly with the coordinates, as the material does that is drawn.
-    linear = replace(mechanism, bodies=tuple(map(linear_part, mechanism.bodies)))
-    posed = Posed(linear, q_r, q_e)
+    posed = Posed(_linear(mechanism), q_r, q_e)
     frames = [posed.body(k)[1:] for k in range(mechanism.num_arms)]
     places = [place for place, _ in frames] + [posed.interface(*mechanism.end)[0]]
     place = np.stack([x + 1j * y for x, y in places], axis=1)
     return place, np.stack([R[0, 0] + 1j * R[1, 0] for _, R in frames], axis=1)
+
+
+def _linear(mechanism: Mechanism) -> Mechanism:
+    return replace(mechanism, bodies=tuple(map(linear_part, mechanism.bodies)))
 
 
 def plane(points: np.ndarray) -> np.ndarray:
@@ -77,7 +81,7 @@ def plane(points: np.ndarray) -> np.ndarray:
 
 
 def close_loop(
-    mechanism: Mechanism, closure: Closure | None, q_r: np.ndarray, q_e: np.ndarray
+    mechanism: Mechanism, closure: Tie | None, q_r: np.ndarray, q_e: np.ndarray
 ) -> np.ndarray | None:
     """Return rigid coordinates (n, 1 + arms) whose last joints close the loop of drawn arms.
 
@@ -95,15 +99,15 @@ def close_loop(
     """
     if closure is None:
         return q_r
-    q_r, m = q_r.copy(), closure.count
+    q_r, loops, linear = q_r.copy(), Loops((closure,)), _linear(mechanism)
+    R, m = q_r.shape[1], loops.count
     for _ in range(MAX_NEWTON):
-        place = chain(mechanism, q_r, q_e)[0]
-        gap = closure.gap(place[:, -1])
-        if np.abs(gap).max() <= CLOSED * reach(mechanism):
+        here = loops.at(linear, q_r, q_e)
+        if np.abs(here.gap).max() <= CLOSED * reach(mechanism):
             return q_r
-        turned = 1j * (place[:, -1:] - place[:, -1 - m : -1])  # the end, by the last m joints
         try:
-            step = np.linalg.solve(closure.project(turned), -gap[:, :, None])[:, :, 0]
+            by_last = here.jacobian[:, :, R - m : R]
+            step = np.linalg.solve(by_last, -here.gap[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
             return None
         q_r[:, -m:] += np.clip(step, -0.3, 0.3)
@@ -124,7 +128,7 @@ class PlaneMotion:
     """
 
     mechanism: Mechanism
-    closure: Closure | None
+    closure: Tie | None
     views: tuple[ArmView, ...]
     rims: tuple[tuple[np.ndarray, np.ndarray], ...]
     place: np.ndarray
@@ -138,7 +142,7 @@ class PlaneMotion:
     @property
     def slides(self) -> bool:
         """Whether the end is a slider on a line."""
-        return self.closure is not None and self.closure.count == 1
+        return self.closure is not None and len(self.closure.equations) == 1
 
     @property
     def stands(self) -> bool:
@@ -166,16 +170,24 @@ class PlaneMotion:
     def block(self, n: int) -> np.ndarray:
         """Return the corners (4, 2), m, of a slider's block."""
         assert self.closure is not None
-        return block_corners(self.place[n, -1], reach(self.mechanism), self.closure)
+        return block_corners(self.place[n, -1], reach(self.mechanism), self._normal)
+
+    @property
+    def _normal(self) -> complex:
+        """Unit vector across a slider's line."""
+        assert self.closure is not None
+        (across,) = self.closure.equations
+        assert isinstance(across, Along)
+        return complex(*across.e)
 
     def ground(self) -> np.ndarray:
         """Return the lines (2, 2, 2), m, of a slider's guide; of a pin's foot its sides."""
         assert self.closure is not None
-        size, point = reach(self.mechanism), self.closure.point
+        size, point = reach(self.mechanism), complex(*self.closure.point)
         if not self.slides:
             foot = base_corners(point, size, True)
             return np.stack([foot, np.roll(foot, -1, axis=0)], axis=1)
-        along, across = self.closure.normals[0] / 1j, BLOCK[1] * size * self.closure.normals[0]
+        along, across = self._normal / 1j, BLOCK[1] * size * self._normal
         s = (np.conj(along) * (self.place[:, -1] - point)).real
         margin = 1.2 * BLOCK[0] * size
         ends = point + along * np.array([s.min() - margin, s.max() + margin])
@@ -195,7 +207,7 @@ class PlaneMotion:
 def plane_motion(
     views: Sequence[ArmView],
     mechanism: Mechanism,
-    closure: Closure | None,
+    closure: Tie | None,
     q_r: np.ndarray,
     q_e: np.ndarray,
 ) -> PlaneMotion:
@@ -226,10 +238,10 @@ def base_corners(place: complex, size: float, stands: bool) -> np.ndarray:
     return box + np.array([place.real, place.imag])
 
 
-def block_corners(place: complex, size: float, closure: Closure) -> np.ndarray:
-    """Return the corners (4, 2), m, of a slider's block at a place; `size` as above."""
+def block_corners(place: complex, size: float, normal: complex) -> np.ndarray:
+    """Return the corners (4, 2), m, of a slider's block; `normal` of its line, `size` as above."""
     box = BLOCK * size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return plane(place + box @ [1.0, 1j] * closure.normals[0] / 1j)
+    return plane(place + box @ [1.0, 1j] * normal / 1j)
 
 
 def _slender(view: ArmView, size: float) -> ArmView:

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 
 from dolfinopt.multibody.closures import ClosedLoops, Loops, Tie
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.mechanism import GROUND, Mechanism
 from dolfinopt.multibody.shape_integrals import linear_part
+from dolfinopt.multibody.tree import GROUND, Mechanism
 from dolfinopt.output.design import ArmView
 from dolfinopt.part.solid.surface import Surface
 from dolfinopt.plots.animation import FRAMES, frame_numbers, round_magnification

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.build import rests_of
 from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.motion.build import rests
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.response import constraints_of, find_limited, objective_of
@@ -139,7 +139,7 @@ def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
     if limits.deviation is not None:
         found.append((limits.deviation, 0.0, scene.motion.horizon))
     if limits.settling is not None:
-        found += [(limits.settling, begin, end) for begin, end in rests_of(scene)]
+        found += [(limits.settling, begin, end) for begin, end in rests(scene)]
     return found
 
 

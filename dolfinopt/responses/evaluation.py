@@ -17,12 +17,8 @@ from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import Trajectory, simulate, simulate_all
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.multibody.inverse_dynamics import Stiffening
-from dolfinopt.multibody.shape_integrals import (
-    ShapeIntegrals,
-    linear_part,
-    shape_integrals,
-)
+from dolfinopt.multibody.loads import Stiffening
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis

@@ -22,8 +22,8 @@ from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.machine import family_of
-from dolfinopt.multibody.motion import rigid_motion
+from dolfinopt.motion.build import rigid_motion
+from dolfinopt.multibody.build import build_mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
@@ -40,6 +40,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.joints import joint_parts
 from dolfinopt.scene.tables.objective import NEEDS
 
 if TYPE_CHECKING:
@@ -168,7 +169,11 @@ def _chain(analysis: Analysis) -> Chain:
             angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
         else:
             angles = [angle] * len(bodies)
-        loads = [RigidIntegrals(arm.joint_mass, 0j, arm.joint_inertia) for arm in scene.arms]
+        rotors = [*(one.rotor for one in joint_parts(scene)[1:]), 0.0]  # of the next arm's joint
+        loads = [
+            RigidIntegrals(arm.joint_mass, 0j, arm.joint_inertia + rotor)
+            for arm, rotor in zip(scene.arms, rotors, strict=True)
+        ]
         loads[-1] = loads[-1] + RigidIntegrals(scene.payload.mass, 0j, scene.payload.moment)
         return Chain(bodies, outboard_points, angles, loads, scene.objective.attached)
 
@@ -189,8 +194,8 @@ def _tree(analysis: Analysis) -> FrozenTree:
             fixed_body(scene, place) if owner is None else owned[owner]
             for place, owner in enumerate(scene.owners)
         ]
-        motion = family_of(scene).motion(np.array([0.5 * scene.motion.duration]), scene)
-        rigid = family_of(scene).build(scene, bodies).rigid  # its bearings, too
+        motion = rigid_motion(np.array([0.5 * scene.motion.duration]), scene)
+        rigid = build_mechanism(scene, bodies).rigid  # its bearings, too
         return FrozenTree(rigid, motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dolfinopt.dynamics.simulation import Trajectory
-from dolfinopt.multibody.motion import CART
+from dolfinopt.motion.build import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.response import (

@@ -237,7 +237,7 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
     for i, arm in enumerate(arms if isinstance(arms, list) else []):
         if not isinstance(arm, dict) or not isinstance(arm.get("sid"), str):
             continue
-        from dolfinopt.exchange.sid import read_sid  # NumPy, which other scenes do not need
+        from dolfinopt.scene.sid import read_sid  # NumPy, which other scenes do not need
 
         nodes = read_sid(Path(arm["sid"])).nodes
         if not nodes:
@@ -585,7 +585,10 @@ def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> 
             )
     duration = motion.get("duration")
     default = Motion.model_fields["horizon"].default
-    if "horizon" not in motion and isinstance(duration, (int, float)) and duration > default:
+    moving = motion.get("table_ends") == "moving"
+    if "horizon" in motion or not isinstance(duration, (int, float)):
+        return tuple(derived)
+    if duration > default or moving:
         motion["horizon"] = duration
         derived.append(("motion", "horizon"))
     return tuple(derived)

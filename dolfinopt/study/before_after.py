@@ -24,8 +24,8 @@ from dolfinopt.study.variants import differences
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from dolfinopt.multibody.mechanism import Mechanism
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+    from dolfinopt.multibody.tree import Mechanism
     from dolfinopt.output.design import ArmView
 
 Summary = Mapping[str, Any]  # content of summary.json
@@ -122,10 +122,10 @@ def read_side(
     InputError where it has no summary.json or trajectory.npz, or another machine's.
     """
     from dolfinopt.arms.arm import chain_of
-    from dolfinopt.multibody.machine import family_of
+    from dolfinopt.multibody.build import build_mechanism
 
     summary = _summary(folder)
-    mechanism = family_of(scene).build(scene, chain_of(scene, bodies))
+    mechanism = build_mechanism(scene, chain_of(scene, bodies))
     path = folder / "trajectory.npz"
     try:
         with np.load(path, allow_pickle=False) as data:

@@ -26,7 +26,7 @@ from dolfinopt.arms.modes import (
     rigid_integrals,
 )
 from dolfinopt.fem.interface import floats
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient

@@ -18,9 +18,9 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.scene import INERTIA
 from dolfinopt.fem.interior import ITERATIVE
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.machine import rigid_spatial_body
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import rigid_spatial_body
 from dolfinopt.paper.reproduction import load_paper
 
 pytestmark = pytest.mark.serial  # a bench runs on one rank and starts others itself

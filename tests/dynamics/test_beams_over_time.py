@@ -12,9 +12,9 @@ from remainders import substructure
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody.mechanism import plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
+from dolfinopt.multibody.tree import plane_chain
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 

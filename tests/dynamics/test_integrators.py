@@ -32,10 +32,10 @@ from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.mechanism import plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
+from dolfinopt.multibody.tree import plane_chain
 from dolfinopt.paths import Limits, law_for, quintic
 from dolfinopt.profiling import Profile
 

@@ -5,10 +5,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from bodies import beam
 from loops import (
     BOOM_TABLE,
     FOOT,
@@ -19,10 +21,13 @@ from loops import (
     closed,
     double_four_bar,
     five_bar,
+    flexible,
     flexible_slider_crank,
     free,
+    hinge,
     spatial_slider_crank,
     started,
+    weightless,
 )
 from machines import apart, gaps, imbalance, machine, reference
 from mpi4py import MPI
@@ -30,8 +35,11 @@ from scipy.integrate import solve_ivp
 
 import dolfinopt as do
 from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.build import desired_motion, largest_stiffness_change
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.exchange.in_space import in_space
 from dolfinopt.multibody.kinematics import Posed
+from dolfinopt.multibody.shape_integrals import rigid_spatial_body
 from dolfinopt.parallel import on_root
 
 WORLD = MPI.COMM_WORLD
@@ -61,7 +69,7 @@ def free_motion(
     z = solution.sample(grid)
     q = system.at(grid).motion(z, z, z).q
     assert system.loops is not None
-    gap = system.loops.at(system.mechanism, q, np.zeros((len(q), 0))).every_gap
+    gap = system.loops.at(system.mechanism, q, np.zeros((len(q), 0))).gap
     return motion.q, motion.qd, float(np.abs(gap).max())
 
 
@@ -73,7 +81,7 @@ def test_double_four_bar(tmp_path) -> None:
     table = f"t,joint0\n0,{0.5 * np.pi}\n1,1.5\n"
     system = started(free(tmp_path, tree, table, bodies), -1.0)
     assert system.loops is not None
-    assert (system.loops.count, system.loops.redundant) == (4, 6)
+    assert (system.loops.count, system.num_redundant) == (10, 6)
     expected = reference("double_four_bar")
     t = expected["t"]
     q, qd, gap = free_motion(system, 500, t)
@@ -114,8 +122,8 @@ def test_flexible_slider_crank(tmp_path) -> None:
     """Out of the plane, too: the rod is beside the crank, and bends and twists it."""
     expected = reference("flexible_slider_crank_in_space")
     trajectory, system = machine(do.Model(flexible_slider_crank(tmp_path)).simulate())
-    assert system.loops is not None and system.rigid_loops is not None
-    assert (system.loops.count, system.rigid_loops.count) == (5, 2)
+    assert system.loops is not None
+    assert (system.loops.count, system.num_redundant) == (5, 3)
     assert np.allclose(trajectory.t, expected["t"])
     end = Posed(trajectory.mechanism, trajectory.q_r, trajectory.q_e).interface(0, 0)[0]
     assert apart(trajectory.q_r[:, 2], expected["piston_displacement"]) < 1e-4
@@ -144,7 +152,8 @@ def test_flexible_slider_crank(tmp_path) -> None:
 def test_energy_and_gaps(tmp_path, tree: dict, table: str, changes: dict[str, Any]) -> None:
     result = do.Model(closed(tmp_path, table, tree, **changes)).simulate()
     assert imbalance(result) < 1e-8  # measured 3e-10 at most, with a tolerance of 1e-4
-    assert np.abs(gaps(result)).max() < 1e-9  # m; measured 2e-10
+    # Pins give way out of the plane by 1e-6 of the softest arm; measured 2e-10, 3e-12 of others.
+    assert np.abs(gaps(result)).max() < 1e-9  # m
 
 
 @pytest.mark.serial
@@ -188,3 +197,46 @@ def test_same_design_on_any_number_of_ranks(shared_tmp_path) -> None:
     alone = on_root(WORLD, lambda: do.optimize(scene, world=MPI.COMM_SELF).x_phys)
     for k in together.x_phys:
         np.testing.assert_allclose(together.x_phys[k], alone[k], rtol=0, atol=1e-8)
+
+
+@pytest.mark.serial
+def test_stiffening_sees_the_forces_of_closures(tmp_path) -> None:
+    """A weightless bar between a drive and a mass that only a pin holds to it: F / buckling load.
+
+    That of a clamped column whose deflection is cubic, 4/3 (13 - 2 sqrt 31) E I / l^2 = 2.486
+    instead of Euler's 2.467.
+    """
+    pin = {"name": "pull", "kind": "pin", "between": ["bar", "trailer"], "axis": [0, 0, 1]}
+    slide = {"type": "prismatic", "parent": "ground", "axis": [1, 0, 0]}
+    tree = {
+        "name": "pulled bar",
+        "arms": [weightless("driver"), flexible("bar", 0.5), weightless("trailer")],
+        "joints": [
+            {"name": "push", "child": "driver", **slide},
+            hinge("swing", "driver", "bar", passive=True),
+            {"name": "follow", "child": "trailer", "passive": True, **slide},
+        ],
+        "closures": [pin],
+        "motion": {"initial_joints": [0.0, 0.0, 0.5]},
+    }
+    scene = closed(tmp_path, "t,push\n0,0\n1,0.4\n", tree)
+    bending, length, mass = 15.0, 0.5, 3.0  # N m2, m, kg
+    column = beam(length, 0.0, bending)
+    u = (np.arange(240) + 0.5) / 240
+    slopes = np.stack([(6.0 * u - 3.0 * u**2) / (2.0 * length), u])  # of its modes across
+    plane = replace(
+        column.body(), K=column.K[:2, :2], D=0.0 * column.K[:2, :2], w=np.zeros((2, 3)),
+        W=np.zeros((2, 3, 3)), outboard=column.outboard[:, :2], K0=np.zeros((4, 2, 2)),
+        K0_outboard=np.stack([slopes @ slopes.T * length / 240, *np.zeros((2, 2, 2))]),
+    )  # fmt: skip
+    none = np.zeros(3)
+    bodies = [
+        rigid_spatial_body(0.0, none, np.zeros(6)),
+        in_space(plane),
+        rigid_spatial_body(mass, none, np.zeros(6)),
+    ]
+    t = np.linspace(0.0, 1.0, 41)
+    force = mass * np.abs(desired_motion(scene)(t).qdd[:, 0]).max()
+    limit = 4.0 / 3.0 * (13.0 - 2.0 * np.sqrt(31.0)) * bending / length**2
+    assert force > 1.0
+    assert largest_stiffness_change(scene, bodies, t) == pytest.approx(force / limit, rel=1e-4)

@@ -25,7 +25,7 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import floats, rounding_error
 from dolfinopt.fem.measured import STIFFNESS_ROUNDING_LIMIT
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
+from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.reduction.eigenproblem import interior_pencil, lowest_eigenpairs
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

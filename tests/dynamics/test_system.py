@@ -16,8 +16,8 @@ from dolfinopt.dynamics.estimate import _free_vibrations, _lost
 from dolfinopt.dynamics.machine_system import DenseLinearisation, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
-from dolfinopt.multibody.mechanism import Drives, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.tree import Drives, plane_chain
 from dolfinopt.paths import quintic
 from dolfinopt.profiling import Profile
 

@@ -17,7 +17,10 @@ from runs import ROOT, overrides, refusal, run, tomllib
 import dolfinopt as do
 from dolfinopt.cli.shared import doubts_of_files
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.sid import (
+from dolfinopt.exchange.in_space import in_space
+from dolfinopt.exchange.standard_input import load_body, to_sid
+from dolfinopt.multibody.shape_integrals import rigid_bar
+from dolfinopt.scene.sid import (
     Node,
     StandardInputData,
     Taylor,
@@ -25,8 +28,6 @@ from dolfinopt.exchange.sid import (
     write_sid,
     write_sid_npz,
 )
-from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
-from dolfinopt.multibody.standard_input import load_body, to_sid
 
 # A bar of 3 kg and 2 m that swings about its end by v = (x / 2)^2 q in the manner of FEMBS, by
 # hand: Fortran's exponents, ragged columns, zeros left out, half of a symmetric matrix.

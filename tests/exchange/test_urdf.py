@@ -19,10 +19,10 @@ from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
 from dolfinopt.mesh.solid_cells import TENSOR
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.machine import roll_pitch_yaw
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.rotations import roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile

@@ -11,7 +11,7 @@ from runs import refused, run
 
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.scene import scene_of_robot
-from dolfinopt.multibody.machine import joint_motion
+from dolfinopt.motion.build import rigid_motion
 from dolfinopt.scene.load import load_scene
 
 pytestmark = pytest.mark.serial
@@ -79,7 +79,7 @@ def test_a_linkage_is_closed(tmp_path) -> None:
     assert [one["name"] for one in tree["joints"] if one.get("passive")] == ["knee", "rock"]
     assert scene.closures[0].between == ("rocker.ankle", "ground")
     assert (tmp_path / "scene" / "trajectory.csv").read_text().startswith("t,turn\n")
-    q = joint_motion(np.linspace(0.0, 1.0, 5), scene).q
+    q = rigid_motion(np.linspace(0.0, 1.0, 5), scene).q
     a, b, c = np.cumsum(q, axis=1).T
     end = 0.1 * np.exp(1j * a) + 0.28 * np.exp(1j * b) + 0.25 * np.exp(1j * c)
     assert np.abs(end - 0.25).max() < 1e-10

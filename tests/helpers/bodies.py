@@ -10,18 +10,16 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.multibody.machine import (
+from dolfinopt.multibody.rotations import skew
+from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
+from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
-    skew,
+    JointHardware,
+    Mechanism,
+    Rotor,
+    plane_chain,
     spatial_mechanism,
-)
-from dolfinopt.multibody.mechanism import JointHardware, Mechanism, plane_chain
-from dolfinopt.multibody.shape_integrals import (
-    STIFFENING,
-    TABLE,
-    ShapeIntegrals,
-    plane_body,
 )
 
 # By which integrals a function of a body is differentiated.
@@ -209,7 +207,13 @@ class Chain:
         masses, inertias = self.carried
         total = self.cart_mass * u[0] * v[0]
         total += masses @ (p[1:] * r[1:]).sum(axis=1) + inertias @ (b * d)
-        total += sum(j.rotor * u[1 + k] * v[1 + k] for k, j in enumerate(self.joints))
+        for k, joint in enumerate(self.joints):
+            assert joint.rotor is not None
+            spins = [
+                (behind[k - 1] if k else 0.0) + joint.rotor.ratio * x[1 + k]
+                for behind, x in ((b, u), (d, v))
+            ]
+            total += joint.rotor.inertia * spins[0] * spins[1]
         if not self.K0:
             m = np.concatenate([cloud.masses for cloud in self.clouds])
             return total + np.einsum("n,ni,ni->", m, along(self.points, u), along(self.points, v))
@@ -264,7 +268,7 @@ class Chain:
 
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
 # Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
-HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, 0.2 / k) for k in (1, 2, 3))
+HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, Rotor(0.2 / k, 0.5 * k)) for k in (1, 2, 3))
 
 
 def random_chain(
@@ -290,7 +294,11 @@ def rotation(angle: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CloudTree:
-    """Clouds joined as a tree, by Newton's law for every point; y = (joints, elastic)."""
+    """Clouds joined as a tree, by Newton's law for every point; y = (joints, motors, elastic).
+
+    Rotors are rings of points that turn about the joint's axis on what the joint sits on. The
+    mechanism carries their masses along the axis, which has all but the moment of inertia about it.
+    """
 
     clouds: tuple[Cloud, ...]
     joints: tuple[Joint, ...]
@@ -300,9 +308,37 @@ class CloudTree:
 
     def mechanism(self) -> Mechanism:
         """Return the same tree of shape integrals."""
-        carried = {site: one.body() for site, one in self.carried.items()}
+        every = dict(self.carried)
+        for site, axial in self._axial:
+            other = every.get(site)
+            every[site] = axial if other is None else _together(axial, other)
+        carried = {site: one.body() for site, one in every.items()}
         bodies = [cloud.body() for cloud in self.clouds]
         return spatial_mechanism(bodies, self.joints, carried, self.gravity, (self.end, 0))
+
+    @property
+    def _motors(self) -> int:
+        """Number of motors with coordinates of their own."""
+        return sum(j.rotor is not None and j.rotor.motor is not None for j in self.joints)
+
+    @property
+    def rigid(self) -> int:
+        """Number of coordinates of joints and motors."""
+        return sum(joint.coordinate is not None for joint in self.joints) + self._motors
+
+    @property
+    def _axial(self) -> list[tuple[tuple[int, int], Cloud]]:
+        """Masses along the rotors' axes on what carries them."""
+        found = []
+        for joint in self.joints:
+            if joint.rotor is not None and joint.parent != GROUND:
+                masses = _ring(joint.rotor.inertia)[1]
+                size = np.sqrt(0.5 * joint.rotor.inertia / masses.sum())
+                along = size * np.outer([1.0, -1.0, 1.0, -1.0], joint.rotation @ joint.axis)
+                found.append(
+                    ((joint.parent, joint.interface), _rigid(joint.origin + along, masses))
+                )
+        return found
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
         """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
@@ -311,10 +347,7 @@ class CloudTree:
         steps = 1j * STEP * np.eye(len(y))
         J = [self._points(y + step, none, none)[1].imag / STEP for step in steps]
         out = np.einsum("n,kni,ni->k", masses, J, second - self.gravity)
-        for joint in self.joints:
-            if joint.coordinate is not None:
-                out[joint.coordinate] += joint.rotor * ydd[joint.coordinate]
-        first = sum(joint.coordinate is not None for joint in self.joints)
+        first = self.rigid
         for cloud in self.clouds:
             part = slice(first, first + len(cloud.K))
             out[part] += cloud.K @ y[part] + cloud.D @ yd[part]
@@ -331,13 +364,22 @@ class CloudTree:
         """
         series = (y, yd, 0.5 * ydd)
         ends: dict[tuple[int, int], np.ndarray] = {(GROUND, 0): _polynomial(np.eye(4))}
-        first = sum(joint.coordinate is not None for joint in self.joints)
+        first, joints = self.rigid, self.rigid - self._motors
         masses, places, second = [], [], []
         for i, (joint, cloud) in enumerate(zip(self.joints, self.clouds, strict=True)):
             part = slice(first, first + len(cloud.K))
             first = part.stop
             frame = ends[joint.parent, joint.interface]
             frame = frame @ _polynomial(_place(joint.rotation, joint.origin))
+            bodies = []
+            if (rotor := joint.rotor) is not None and joint.parent != GROUND:
+                k = joint.coordinate if rotor.motor is None else joints + rotor.motor
+                turns = _place(skew(joint.axis), np.zeros(3))
+                turns[3, 3] = 0.0
+                spun = frame @ expm(_polynomial(*(rotor.ratio * turns * c[k] for c in series)))
+                ring, mass = _ring(rotor.inertia)
+                across = np.linalg.svd(joint.axis[None])[2][1:]  # normal to the axis
+                bodies.append((spun, mass, [ring @ across, *(0.0 * ring @ across,) * 2]))
             if (k := joint.coordinate) is not None:
                 generator = _place(0.0 * np.eye(3), joint.axis)
                 if joint.kind == "revolute":
@@ -354,7 +396,7 @@ class CloudTree:
                 turn = [np.pad(x, (0, 1)) for x in theta]
                 ends[i, s] = frame @ shift @ expm(_polynomial(*turn))
             X = [cloud.points + cloud.modes @ moved[0], *(cloud.modes @ e for e in moved[1:])]
-            bodies = [(frame, cloud.masses, X)]
+            bodies.append((frame, cloud.masses, X))
             for (k, s), load in self.carried.items():
                 if k == i:
                     still = [load.points, *(0.0 * load.points,) * 2]
@@ -367,6 +409,25 @@ class CloudTree:
                 acceleration = points[0] @ R2.T + points[1] @ R1.T + points[2] @ R0.T + c2[:3, 3]
                 second.append(2.0 * acceleration)
         return np.concatenate(masses), np.concatenate(places), np.concatenate(second)
+
+
+def _ring(inertia: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (4, 2) about an axis and their masses, of a moment of inertia, kg m2."""
+    points = 0.7 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    return points, np.full(4, inertia / (4 * 0.7**2))
+
+
+def _rigid(points: np.ndarray, masses: np.ndarray) -> Cloud:
+    """Return a rigid body in space without further interfaces."""
+    none = np.zeros((0, 0))
+    modes, outboard = np.zeros((len(points), 3, 0)), np.zeros((6, 0))
+    return Cloud(points, masses, modes, none, none, outboard, np.zeros((1, 3)))
+
+
+def _together(one: Cloud, other: Cloud) -> Cloud:
+    """Return two rigid bodies in one frame as one."""
+    points = np.concatenate([one.points, other.points])
+    return _rigid(points, np.concatenate([one.masses, other.masses]))
 
 
 def _place(R: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -392,8 +453,9 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     rigid, fork = (random_cloud(rng, q, 3, interfaces) for q in (0, 3))
     outer = random_cloud(rng, 2, 3), random_cloud(rng, 3, 3, interfaces)
     kinds = (
-        ("revolute", GROUND, 0, 0.0), ("revolute", 0, 3, 0.3, last), ("prismatic", 1, 1, 0.4),
-        ("fixed", 1, None, 0.0, last), ("revolute", 3, 2, 0.0, last),
+        ("revolute", GROUND, 0, None), ("revolute", 0, 3, Rotor(0.3, 1.5), last),
+        ("prismatic", 1, 1, Rotor(0.2, 2.0)), ("fixed", 1, None, None, last),
+        ("revolute", 3, 2, Rotor(0.4, 0.8, motor=0), last),
     )  # fmt: skip
     joints = []
     for kind, parent, coordinate, rotor, *interface in kinds:

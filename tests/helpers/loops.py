@@ -13,9 +13,9 @@ from runs import by_root
 
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.multibody.machine import rigid_spatial_body, roll_pitch_yaw
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.rotations import roll_pitch_yaw
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_spatial_body
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 Tree = dict[str, Any]
@@ -271,7 +271,7 @@ def started(system: MachineSystem, rate: float) -> MachineSystem:
     q = system.motion(np.zeros(1)).q
     assert system.loops is not None
     J = system.loops.at(system.mechanism, q, np.zeros((1, 0))).jacobian[0]
-    rates = np.append(rate, np.linalg.solve(J[:, 1:], -rate * J[:, 0]))
+    rates = np.append(rate, np.linalg.lstsq(J[:, 1:], -rate * J[:, 0], rcond=None)[0])
 
     def motion(t: np.ndarray) -> RigidMotion:
         still = np.zeros((len(t), len(rates)))
@@ -333,3 +333,103 @@ def spatial_slider_crank() -> tuple[Tree, list[ShapeIntegrals]]:
         rigid_spatial_body(0.5, (0.15, 0, 0), (4e-4, 4e-3, 4e-3, *none), (0.3, 0, 0)),
     ]
     return tree, bodies
+
+
+# -- loops with more equations than rigid arms need ----------------------------------------------
+
+WIDE = {"height": 0.03, "thickness": 0.03, "joint_mass": 0.0, "joint_inertia": 0.0}  # m, kg
+FLEXED = {
+    "material": {"young_modulus": 210e9, "poisson_ratio": 0.3, "density": 2700.0},
+    "motion": {"gravity": [0, 0, -9.81]},
+    "damping": {"stiffness_proportional": 1e-4},
+    "design": {"initial": 1.0, "volume_fraction": 1.0},
+    "simulation": {"tolerance": 1e-3, "stiffening": False},
+}
+
+
+def stiff(name: str, length: float, mass: float, **keys: Any) -> Tree:
+    """Return a rigid arm of a uniform bar's inertia."""
+    small, large = 1e-4 * mass, mass * (length**2 / 12.0 + 1e-4)
+    return {"name": name, "rigid": True, "length": length, "mass": mass, **WIDE, **keys,
+            "centre": [0.5 * length, 0, 0], "inertia": [small, large, large, 0, 0, 0]}  # fmt: skip
+
+
+def steel(name: str, length: float) -> Tree:
+    """Return a flexible arm of few cells."""
+    return {"name": name, "length": length, "cells": [16, 2, 2], "density": 5000.0, **WIDE}
+
+
+def bennett(longer: float = 0.0) -> Tree:
+    """Return Bennett's linkage, its rocker of steel: four bars that only their twists let move."""
+    a, b = np.radians(40.0), np.radians(70.0)
+    long = 0.2 * float(np.sin(b) / np.sin(a))
+    twisted = {"rpy": [float(-a - b), 0, 0], "axis": [0, float(-np.sin(a)), float(np.cos(a))]}
+    pin = {"name": "pin", "kind": "pin", "between": ["rocker", "ground"], "point": [-long, 0, 0]}
+    return FLEXED | {
+        "name": "Bennett",
+        "arms": [stiff("crank", 0.2, 1.0), stiff("coupler", long, 1.2),
+                 steel("rocker", 0.2 + longer)],
+        "joints": [
+            hinge("j1", "ground", "crank"),
+            hinge("j2", "crank", "coupler", passive=True, rpy=[float(a), 0, 0]),
+            hinge("j3", "coupler", "rocker", passive=True, rpy=[float(b), 0, 0]),
+        ],
+        "closures": [pin | twisted],
+        "motion": FLEXED["motion"] | {"initial_joints": [0.5, 2.9, -0.4]},
+        "payload": {"arm": "rocker", "mass": 0.3},
+    }  # fmt: skip
+
+
+def cranks(longer: float = 0.0, apart: float = 0.0, start: float = 1.0) -> Tree:
+    """Return a parallelogram with three cranks, the middle one of steel, pins `apart` of a line."""
+    between = [{"name": "mid", "point": [0.2, apart, 0]}]
+    return FLEXED | {
+        "name": "three cranks",
+        "arms": [stiff("one", 0.2, 1.0), stiff("coupler", 0.4, 1.2, interfaces=between),
+                 steel("two", 0.2 + longer), stiff("three", 0.2, 1.0)],
+        "joints": [
+            hinge("j1", "ground", "one"),
+            hinge("j2", "one", "coupler", passive=True),
+            hinge("j3", "ground", "two", passive=True, origin=[0.2, apart, 0]),
+            hinge("j4", "ground", "three", passive=True, origin=[0.4, 0, 0]),
+        ],
+        "closures": [
+            {"name": f"pin {name}", "kind": "pin", "between": [name, end], "axis": UP}
+            for name, end in (("two", "coupler.mid"), ("three", "coupler"))
+        ],
+        "motion": FLEXED["motion"] | {"initial_joints": [start, -start, start, start]},
+        "payload": {"arm": "coupler", "mass": 0.3},
+    }  # fmt: skip
+
+
+def rhombus(crank: float = 0.2, start: float = 0.5) -> Tree:
+    """Return crank, coupler of 0.4 m and a rocker of 0.2 m to a pin 0.4 m from the crank's."""
+    pin = {"name": "pin", "kind": "pin", "between": ["rocker", "ground"], "point": [0.4, 0, 0]}
+    return FLEXED | {
+        "name": "rhombus",
+        "arms": [stiff("crank", crank, 1.0), stiff("coupler", 0.4, 1.2), steel("rocker", 0.2)],
+        "joints": [
+            hinge("j1", "ground", "crank"),
+            hinge("j2", "crank", "coupler", passive=True),
+            hinge("j3", "coupler", "rocker", passive=True),
+        ],
+        "closures": [pin | {"axis": UP}],
+        "motion": FLEXED["motion"] | {"initial_joints": [start, -start, np.pi + start]},
+        "payload": {"arm": "rocker", "mass": 0.3},
+    }  # fmt: skip
+
+
+def driven_slider() -> Tree:
+    """Return a slider that drives a crank by a rod, both in line at the start."""
+    slide = {"name": "slide", "type": "prismatic", "parent": "ground", "child": "slider",
+             "axis": [1, 0, 0]}  # fmt: skip
+    return FLEXED | {
+        "name": "driven slider",
+        "arms": [weightless("slider") | {"mass": 0.5}, steel("rod", 0.25),
+                 stiff("crank", 0.1, 0.3)],
+        "joints": [slide, hinge("wrist", "slider", "rod", passive=True),
+                   hinge("shaft", "ground", "crank", passive=True)],
+        "closures": [{"name": "pin", "kind": "pin", "between": ["rod", "crank"], "axis": UP}],
+        "motion": FLEXED["motion"] | {"initial_joints": [0.35, np.pi, 0.0]},
+        "payload": {"arm": "rod", "mass": 0.1},
+    }  # fmt: skip

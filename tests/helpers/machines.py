@@ -16,9 +16,9 @@ from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.dimension import product
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.scene.load import Scene, scene_from_dict
 
@@ -256,12 +256,11 @@ def _power(trajectory: Trajectory, t: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class DriveTrains:
-    """Gears and motors: rigid coordinates, motors' speeds (n, M), power lost and energies (n,)."""
+    """Gears and motors: rigid coordinates, motors' speeds (n, M), power lost and energy (n,)."""
 
     columns: np.ndarray
     speeds: np.ndarray
     dissipated: np.ndarray
-    kinetic: np.ndarray
     strain: np.ndarray
 
 
@@ -270,35 +269,36 @@ def drive_trains(trajectory: Trajectory, t: np.ndarray) -> DriveTrains:
     none = np.zeros(len(t))
     system = trajectory.problem
     if not isinstance(system, MachineSystem):
-        return DriveTrains(np.zeros(0, dtype=int), np.zeros((len(t), 0)), none, none, none)
+        return DriveTrains(np.zeros(0, dtype=int), np.zeros((len(t), 0)), none, none)
     drives, springs, instants = system.drives, system.drives.springs, system.at(t)
     y, yd = (trajectory.solution.sample(t, k) for k in range(2))
-    if drives.rotors is None:  # under control
-        own, k, c = springs.joints, springs.stiffness, springs.damping
-        rotor, friction = springs.rotor, springs.friction
-        speeds = instants.motor_speeds(yd)
+    if len(springs.joints):  # under control
+        own, k, c, friction = springs.joints, springs.stiffness, springs.damping, springs.friction
+        speeds = instants.motor_rates(yd, yd)[0]
         twist, rate = (x[:, own] - instants.motors(x) for x in (y, yd))
     else:
-        own = np.flatnonzero(drives.driven)
-        k, c, rotor = drives.stiffness[own], drives.damping[own], drives.rotors[own]
+        own = np.flatnonzero(drives.driven & (drives.stiffness > 0.0))
+        if trajectory.scene.control is not None:
+            own = own[:0]
+        k, c = drives.stiffness[own], drives.damping[own]
         friction = None if drives.friction is None else drives.friction.of(own)
         speeds = instants.desired.qd[:, drives.free[own]]
         twist, rate = y[:, own], yd[:, own]
     lost = rate**2 @ c
     if friction is not None:
         lost = lost + (friction.force(speeds) * speeds).sum(axis=1)
-    kinetic, strain = 0.5 * speeds**2 @ rotor, 0.5 * twist**2 @ k
-    return DriveTrains(drives.free[own], speeds, lost, kinetic, strain)
+    return DriveTrains(drives.free[own], speeds, lost, 0.5 * twist**2 @ k)
 
 
 def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return kinetic energy by the mass matrix, strain energy, gravity's potential, (n,) J."""
     motion, q, qd, qdd, _ = states(trajectory, t)
     mechanism = trajectory.mechanism
-    rigid = np.arange(mechanism.num_rigid)
+    rigid = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))
     tangent = linearise(mechanism, motion, q, qd, qdd, None, rigid).dense()
     size = tangent.shape[1]
-    speeds = np.concatenate([motion.qd, qd], axis=1)
+    motors = [] if motion.motors is None else [motion.motors[0]]
+    speeds = np.concatenate([motion.qd, *motors, qd], axis=1)
     kinetic = 0.5 * np.einsum("ni,nij,nj->n", speeds, tangent[:, :, 2 * size :], speeds)
     strain, moment = np.zeros(len(t)), np.zeros((mechanism.dim.d, len(t)))  # first of all masses
     posed, d = Posed(mechanism, motion.q, q), mechanism.dim.d
@@ -315,7 +315,7 @@ def energies(trajectory: Trajectory, t: np.ndarray) -> tuple[np.ndarray, np.ndar
         moment += load.mass * place + product(R, load.c)
     potential = -(mechanism.gravity * moment).sum(axis=0)
     parts = drive_trains(trajectory, t)
-    return kinetic + parts.kinetic, strain + parts.strain, potential
+    return kinetic, strain + parts.strain, potential
 
 
 def plane_frames(

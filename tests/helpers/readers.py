@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.exchange.sid import StandardInputData
+from dolfinopt.scene.sid import StandardInputData
 
 Forces = tuple[np.ndarray, np.ndarray, np.ndarray]
 

@@ -6,15 +6,11 @@ from typing import Any
 
 import numpy as np
 from runs import ROOT, run, tomllib
+from scipy.spatial.transform import Rotation
 
-from dolfinopt.multibody.machine import (
-    GROUND,
-    about,
-    build_spatial_mechanism,
-    rigid_link,
-    rigid_spatial_body,
-)
-from dolfinopt.multibody.mechanism import Mechanism
+from dolfinopt.multibody.build import build_mechanism, rigid_link
+from dolfinopt.multibody.shape_integrals import rigid_spatial_body
+from dolfinopt.multibody.tree import GROUND, Mechanism
 from dolfinopt.scene.load import load_scene
 
 DEMO = ROOT / "demos" / "robot.urdf"
@@ -122,7 +118,7 @@ def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> Mechanism:
         else rigid_spatial_body(*solids[arm.name], (arm.length, 0.0, 0.0))
         for arm in scene.arms
     ]  # fmt: skip
-    return build_spatial_mechanism(scene, bodies)
+    return build_mechanism(scene, bodies)
 
 
 def frames_of(mechanism: Mechanism, q: np.ndarray) -> list[np.ndarray]:
@@ -142,6 +138,6 @@ def frames_of(mechanism: Mechanism, q: np.ndarray) -> list[np.ndarray]:
             if joint.kind == "prismatic":
                 moved[:3, 3] = value * joint.axis
             else:
-                moved[:3, :3] = about(joint.axis, np.array([value]))[0]
+                moved[:3, :3] = Rotation.from_rotvec(value * joint.axis).as_matrix()
         found[i] = outer @ own @ moved
     return [found[i] for i in range(len(found))]

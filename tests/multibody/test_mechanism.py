@@ -24,10 +24,9 @@ from remainders import substructure
 from runs import ROOT
 from scipy.linalg import expm
 
-from dolfinopt.multibody import measured
-from dolfinopt.multibody import tangent as tangents
+from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.multibody.inverse_dynamics import elastic_residual, inverse_dynamics
+from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
     Posed,
     deviation,
@@ -35,11 +34,21 @@ from dolfinopt.multibody.kinematics import (
     end_effector_gradient,
     end_rotation,
 )
-from dolfinopt.multibody.machine import roll_pitch_yaw, skew
-from dolfinopt.multibody.mechanism import AppliedForce, Mechanism
-from dolfinopt.multibody.motion import RigidMotion, rigid_motion
-from dolfinopt.multibody.shape_integrals import shape_integrals
-from dolfinopt.multibody.tangent import body_gradient, linearise
+from dolfinopt.multibody.newton_euler import elastic_residual, inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.rotations import roll_pitch_yaw, skew
+from dolfinopt.multibody.shape_integrals import rigid_bar, rigid_spatial_body, shape_integrals
+from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tree import (
+    GROUND,
+    AppliedForce,
+    Joint,
+    JointHardware,
+    Mechanism,
+    Rotor,
+    plane_chain,
+    spatial_mechanism,
+)
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
 
@@ -58,12 +67,14 @@ class Machine:
 
     @property
     def rigid(self) -> int:
-        return self.mechanism.num_rigid
+        return self.mechanism.num_rigid + len(self.mechanism.motor_joints)
 
     def split(self, states: np.ndarray) -> tuple[RigidMotion, list[np.ndarray]]:
         """Return rigid motion and elastic coordinates with rates."""
         forces, (count, b) = self.mechanism.forces, (states.shape[1], self.mechanism.dim.b)
-        motion = RigidMotion(*states[:, :, : self.rigid])
+        motion = RigidMotion(*states[:, :, : self.mechanism.num_rigid])
+        motors = states[1:, :, self.mechanism.num_rigid : self.rigid]
+        motion = replace(motion, motors=motors)
         if forces:
             values = np.random.default_rng(11).normal(size=(count, len(forces), b))
             motion = replace(motion, applied=values)
@@ -103,7 +114,7 @@ def machine_of(kind: str, count: int = 4) -> Machine:
         more = {"coordinates": MANY} if arms.endswith("many") else {}
         model = random_chain(rng, int(arms[0]), bent, **more)
         mechanism = model.mechanism()
-    size = mechanism.num_rigid + mechanism.num_coordinates
+    size = mechanism.num_rigid + len(mechanism.motor_joints) + mechanism.num_coordinates
     states = rng.normal(scale=0.6, size=(3, count, size))
     return Machine(model, mechanism, states)
 
@@ -152,7 +163,8 @@ def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
     force = np.einsum("ijn,nj->ni", np.broadcast_to(R, (d, d, len(q))), values[:, :d])
     moment = one.mechanism.dim.rotated(R * np.ones(len(q)), values[:, d:].T).T
     of_q, of_rigid, _ = end_effector_gradient(one.mechanism, motion, q, force, moment)
-    expected = one.forces(one.states) - np.hstack([of_rigid, of_q])
+    of_motors = np.zeros((len(q), one.rigid - one.mechanism.num_rigid))
+    expected = one.forces(one.states) - np.hstack([of_rigid, of_motors, of_q])
     assert_close(np.hstack([drives, rows]), expected, ROUNDING)
 
 
@@ -196,28 +208,13 @@ def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
 @pytest.mark.serial
 def test_bodies_have_columns_of_what_is_inboard_and_outboard() -> None:
     """By a motion and by a load of few numbers; nothing moves the first, or loads the last."""
-    found = []
-    for body in machine_of(FACTORED).tangent().bodies:
-        sizes = {"own": 0, "load": 0, "motion": 0}
-        for part in body.parts:
-            kind = "own" if part.left is None else {3: "load", 4: "motion"}[part.right.shape[1]]
-            sizes[kind] += part.right.shape[2] // 3
-        found.append(tuple(sizes.values()))
+    found: dict[int, dict[str, int]] = {}
+    for one in machine_of(FACTORED).tangent().blocks:
+        kind = "own" if one.left is None else {3: "load", 4: "motion"}[one.right.shape[1]]
+        found.setdefault(one.rows.start, {})[kind] = one.right.shape[2] // 3
     a, b, c = MANY
-    assert found == [(a, b + c, 0), (b, c, a), (c, 0, a + b)]
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("kind", [*KINDS, FACTORED])
-def test_tangent_of_some_instants_at_a_time(monkeypatch, kind: str) -> None:
-    """The same as of all at once."""
-    one = machine_of(kind, 3 * measured.LEAST_INSTANTS)
-    rigid = np.arange(one.rigid)
-    whole = one.tangent(None, rigid)
-    monkeypatch.setattr(tangents, "DERIVATIVES_BYTES", 1.0)
-    parts = one.tangent(None, rigid)
-    assert_close(parts.dense(), whole.dense(), ROUNDING)
-    assert_close(parts.drives, whole.drives, ROUNDING)
+    first, second = {"own": a, "load": b + c}, {"own": b, "load": c, "motion": a}
+    assert list(found.values()) == [first, second, {"own": c, "motion": a + b}]
 
 
 @pytest.mark.serial
@@ -334,6 +331,51 @@ def test_few_instants_do_not_depend_on_memory() -> None:
         assert len(found) == 1
 
 
+# -- rotors that turn with what carries them, in closed form ---------------------------------------
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("ratio", [1.0, 100.0])
+def test_geared_double_pendulum(ratio: float) -> None:
+    """T = J (n q1')^2 / 2 + J (q1' + n q2')^2 / 2 beside the links' own."""
+    J, rng = 0.3, np.random.default_rng(4)
+    links = [rigid_bar(1.0, 0.1, 2.0), rigid_bar(0.8, 0.1, 1.5)]
+    with_rotors, without = (
+        plane_chain(links, 0.5, 0.0, (0.0, -9.81), 0.0, hardware=[JointHardware(rotor=one)] * 2)
+        for one in (Rotor(J, ratio), None)
+    )
+    q, qd, qdd = rng.normal(size=(3, 5, 3))
+    none = np.zeros((5, 0))
+    found, bare = (
+        inverse_dynamics(one, RigidMotion(q, qd, qdd), none, none, none)[1]
+        for one in (with_rotors, without)
+    )
+    spins = ratio * qdd[:, 1], qdd[:, 1] + ratio * qdd[:, 2]
+    expected = J * np.column_stack([0.0 * spins[0], ratio * spins[0] + spins[1], ratio * spins[1]])
+    assert_close(found - bare, expected, ROUNDING, float(np.abs(found).max()))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("motor", [None, 0])
+def test_gyroscopic_moment_of_a_rotor(motor: int | None) -> None:
+    """A frame that turns about z by W and holds a rotor about y feels -W h about x."""
+    none = np.zeros(3)
+    body = rigid_spatial_body(0.0, none, np.zeros(6))
+    x, y, z = np.eye(3)
+    joints = [
+        Joint("yaw", "revolute", GROUND, 0, z),
+        Joint("roll", "revolute", 0, 1, x),
+        Joint("spun", "revolute", 1, 2, y, rotor=Rotor(2e-3, 50.0, motor)),
+    ]
+    machine = spatial_mechanism([body] * 3, joints, {}, none, (2, 0))
+    q, qdd, W, spin = np.zeros((1, 3)), np.zeros((1, 3)), 3.0, 8.0
+    motion = RigidMotion(q, np.array([[W, 0.0, spin]]), qdd)
+    forces = inverse_dynamics(machine, motion, *np.zeros((3, 1, 0)))[1]
+    h = 2e-3 * 50.0 * spin
+    expected = [0.0, -W * h, 0.0, *[0.0] * (motor is not None)]
+    assert_close(forces[0], np.array(expected), 1e-15)
+
+
 # -- inertia shape integrals: rigid figures in closed form, modes by brute-force quadrature  ------
 
 
@@ -445,7 +487,7 @@ def test_rotation_vector(size):
         (lambda e: SpaceTurning(theta + e, v, a).acceleration, one.acceleration_by_theta),
         (lambda e: SpaceTurning(theta, v + e, a).acceleration, one.acceleration_by_rate),
         (lambda e: SpaceTurning(theta, v, a + e).acceleration, one.J),
-        (lambda e: SpaceTurning(theta + e, v, a).pulled(M), one.by_theta(M, -1.0)),
+        (lambda e: SpaceTurning(theta + e, v, a).jacobian_transposed(M), one.by_theta(M, -1.0)),
     )
     for function, expected in pairs:
         assert np.abs(columns(function) - expected).max() < ROUNDING

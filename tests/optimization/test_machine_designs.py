@@ -9,6 +9,7 @@ from runs import ROOT, assert_same_bits, overrides, run, summary_of
 
 import dolfinopt as do
 from dolfinopt import parallel
+from dolfinopt.dynamics import radau
 from dolfinopt.fem import interior
 from dolfinopt.parallel import on_root
 
@@ -59,6 +60,20 @@ def test_resumes_in_the_same_bits(path, shared_tmp_path):
     whole = do.optimize(coarse(path, ROUGHLY))
     do.optimize(coarse(path, ROUGHLY, iterations=1), shared_tmp_path)
     resumed = do.optimize(coarse(path, ROUGHLY), shared_tmp_path, resume=True)
+    assert_same_bits(resumed, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.serial
+def test_a_marched_run_resumes_in_the_same_bits(shared_tmp_path, monkeypatch):
+    """Drives at their limits let Newton's method fail over the horizon: steps are remembered."""
+    marches, march = [], radau.March.run
+    monkeypatch.setattr(radau.March, "run", lambda self: (marches.append(1), march(self))[1])
+    bound = ("control.limits=[300,150,60]", "simulation.tolerance=1e-4")
+    whole = do.optimize(coarse(CONTROLLED, *bound))
+    assert marches
+    do.optimize(coarse(CONTROLLED, *bound, iterations=1), shared_tmp_path)
+    resumed = do.optimize(coarse(CONTROLLED, *bound), shared_tmp_path, resume=True)
     assert_same_bits(resumed, whole)
 
 

@@ -106,6 +106,7 @@ def test_pin_leaves_its_force_along_x_and_y(tmp_path):
     arrays, table, summary, _ = left_by(loop("pin"), tmp_path)
     assert arrays["closure_force"].shape == (101, 2)
     np.testing.assert_allclose(table["closure_force_y"], arrays["closure_force"][:, 1])
+    np.testing.assert_array_equal(table["closure_closure_y"], table["closure_force_y"])
     assert "slider_position" not in arrays
     assert list(summary["drive_peak"]) == ["crank"]
     largest = np.hypot(*arrays["closure_force"].T).max()

@@ -16,13 +16,13 @@ from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.motion import breakpoints, desired_path, rigid_motion
+from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
+from dolfinopt.motion.curves import curve_by_chord
 from dolfinopt.paths import (
     Curve,
     Law,
     Limits,
     Table,
-    curve_by_chord,
     curve_in_time,
     law_for,
     read_table,
@@ -181,7 +181,7 @@ def test_duration_follows_from_the_limits() -> None:
     assert_close(half.motion.duration, 0.9 * np.pi / 2.0 + 2.0 / 5.0, 1e-14)
     assert scene_from_dict(of.to_dict()).motion == of.motion
     slow = posed(**limits, duration=2.5)
-    speed = np.linalg.norm(desired_path(np.linspace(0.0, 2.5, 5001), slow.motion).pd, axis=1)
+    speed = np.linalg.norm(desired_path(np.linspace(0.0, 2.5, 5001), slow)[1], axis=1)
     assert_close(speed.max(), 2.0 * of.motion.duration / 2.5, 1e-12)
 
     # A long one takes the horizon with it.
@@ -217,10 +217,10 @@ def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
     of = posed(path="points", file=str(file), law=name)
     assert of.motion.duration == 0.4
     t = np.linspace(0.1801, 0.2199, 200)
-    path = desired_path(t, of.motion)
-    assert_close(path.p, np.tile([0.3, 0.2], (200, 1)), 1e-15)
-    assert not path.pd.any()
-    assert not path.pdd.any()
+    place, speed, acceleration = desired_path(t, of)
+    assert_close(place, np.tile([0.3, 0.2], (200, 1)), 1e-15)
+    assert not speed.any()
+    assert not acceleration.any()
     rigid = rigid_motion(t, of)
     assert not rigid.qd.any()
     assert not rigid.qdd.any()
@@ -228,11 +228,11 @@ def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
     # Between stops each move is straight and follows the law.
     law, tau = law_of(name), np.linspace(0.0, 0.18, 50)
     s, sd, _ = law(tau, 0.18)
-    found = desired_path(tau, of.motion)
-    assert_close(found.p, np.array([-0.4, 0.1]) + np.outer(s, [0.7, 0.1]), 1e-12)
-    assert_close(found.pd, np.outer(sd, [0.7, 0.1]), 1e-11)
-    later = desired_path(0.22 + tau, of.motion)
-    assert_close(later.p, np.array([0.3, 0.2]) + np.outer(s, [0.2, 0.4]), 1e-11)
+    found = desired_path(tau, of)
+    assert_close(found[0], np.array([-0.4, 0.1]) + np.outer(s, [0.7, 0.1]), 1e-12)
+    assert_close(found[1], np.outer(sd, [0.7, 0.1]), 1e-11)
+    later = desired_path(0.22 + tau, of)
+    assert_close(later[0], np.array([0.3, 0.2]) + np.outer(s, [0.2, 0.4]), 1e-11)
     check_motion(of)
 
 

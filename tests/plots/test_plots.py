@@ -13,10 +13,11 @@ from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
+from dolfinopt.multibody.closures import Tie
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.mechanism import Closure, Mechanism, plane_chain
-from dolfinopt.multibody.motion import RigidMotion
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.multibody.tree import Mechanism, plane_chain
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots import animation, curves, design, machine, style
@@ -63,7 +64,7 @@ def manipulator(arms: int) -> tuple[list[ArmView], Mechanism]:
     return views, plane_chain(bodies, 6.0, 0.0, (0.0, 0.0), joint_height=-0.5)
 
 
-def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Closure | None = None) -> Any:
+def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Tie | None = None) -> Any:
     """Return what pictures ask of a trajectory."""
     end = end_effector(mechanism, still(q_r), q_e)
     return SimpleNamespace(
@@ -347,6 +348,21 @@ def test_machine_shows_every_arm_where_it_is(arms):
     assert solid.sum() > 2000
 
 
+def tie(site: tuple[int, int], point: complex, direction: complex | None = None) -> Tie:
+    """Return a pin, or a slider on a line along a direction."""
+    normals = np.eye(2)
+    if direction is not None:
+        across = 1j * direction / abs(direction)
+        normals = np.array([[across.real, across.imag]])
+    return Tie.in_plane("closure", site, np.array([point.real, point.imag]), normals)
+
+
+def gap_of(closure: Tie, place: np.ndarray) -> np.ndarray:
+    """Return how far places (n,), complex, are off what it asks for (n, m), m."""
+    away = np.stack([place.real, place.imag], axis=1) - closure.point
+    return away @ np.array([one.e for one in closure.equations]).T
+
+
 def slider_crank() -> tuple[list[ArmView], Any]:
     """Return a rigid crank and a bending rod whose end is on y = 0, over more than a turn."""
     crank = replace(beam("crank", 0.3, 0.2, 10, 2), modes=np.zeros((20, 4, 2, 0)), designed=False)
@@ -357,7 +373,7 @@ def slider_crank() -> tuple[list[ArmView], Any]:
     angle = 80.0 * t
     desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
     q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
-    closure = Closure.slider(0.0, 1.0)
+    closure = tie((1, 0), 0.0, 1.0)
     actual = machine.close_loop(mechanism, closure, desired, q_e)
     assert actual is not None
     return views, motion(mechanism, t, actual, q_e, desired, closure)
@@ -369,13 +385,13 @@ def test_a_drawn_loop_is_closed_by_its_last_joints(kind):
     q_r = np.array([[0.2, 0.5, -0.9, 0.7], [0.2, 0.48, -0.9, 0.8]])
     q_e = 0.02 * np.sin(np.arange(12.0)).reshape(2, 6)
     rigid_end = machine.chain(mechanism, q_r[:1], 0.0 * q_e[:1])[0][0, -1]
-    closure = Closure.pin(rigid_end) if kind == "pin" else Closure.slider(rigid_end, 1.0 + 0.5j)
+    closure = tie((2, 0), rigid_end, None if kind == "pin" else 1.0 + 0.5j)
     closed = machine.close_loop(mechanism, closure, q_r, q_e)
     end = machine.chain(mechanism, closed, q_e)[0][:, -1]
-    assert np.abs(closure.gap(end)).max() < 3e-6
-    free = 4 - closure.count
+    assert np.abs(gap_of(closure, end)).max() < 3e-6
+    free = 4 - len(closure.equations)
     np.testing.assert_array_equal(closed[:, :free], q_r[:, :free])
-    assert machine.close_loop(mechanism, Closure.pin(5.0), q_r, q_e) is None  # out of reach
+    assert machine.close_loop(mechanism, tie((2, 0), 5.0), q_r, q_e) is None  # out of reach
     assert machine.close_loop(mechanism, None, q_r, q_e) is q_r
 
 
@@ -390,12 +406,12 @@ def test_magnified_loops_stay_closed():
     views, mechanism = manipulator(3)
     t, desired = np.arange(2.0), np.array([[0.0, 0.5, -0.6, 0.8], [0.0, 0.52, -0.6, 0.8]])
     shortened = np.tile([-0.01, 0.0], (2, 3))
-    closure = Closure.pin(machine.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
+    closure = tie((2, 0), machine.chain(mechanism, desired[:1], 0.0 * shortened[:1])[0][0, -1])
     actual = machine.close_loop(mechanism, closure, desired, shortened)
     moving = motion(mechanism, t, actual, shortened, desired, closure)
     film = animation.make_film(views, moving, 50.0, 2)
     assert 1.0 <= film.magnification < 50.0
-    assert np.abs(closure.gap(film.motion.place[:, -1])).max() < 3e-6
+    assert np.abs(gap_of(closure, film.motion.place[:, -1])).max() < 3e-6
 
 
 def test_control_errors_are_magnified_like_deformations():

@@ -12,7 +12,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from loops import BOOM_TABLE, SOFT, boom, closed, four_bar
+from loops import BOOM_TABLE, SOFT, bennett, boom, closed, four_bar
 from machines import demo_machine
 from moved_nodes import built_with, node_test, noise
 from remainders import built_of, hold_instants, limit_rates, rates, taylor, wave
@@ -74,6 +74,7 @@ TURNED = SOFT | {"motion": {"horizon": 0.35, "gravity": [0, -9.81, 3.0]}}
 CLOSED = {
     "boom": (BOOM_TABLE, boom(), {}),
     "loop": ("t,turn\n0,0.5\n0.3,2.5\n", four_bar(), TURNED),
+    "bennett": ("t,j1\n0,0.5\n0.3,1.5\n", bennett(), TURNED | {"simulation": {"tolerance": 1e-4}}),
 }
 
 
@@ -279,6 +280,8 @@ CASES = [
     case("boom", "", *SPRUNG, BENT),
     case("boom", "", *YIELDING_BOOM, BOOM_HELD, slow=True),
     case("loop", "", BENT, "control={stiffness=[100.0], damping=[2.0]}"),
+    case("bennett", ""),
+    case("bennett", "peak_force", slow=True),
     # Settling in every rest.
     case("two_arm", "settling", *IN_STROKES, "constraints.settling_after=0.05"),
     case("two_arm", "settling", "motion.dwells=[[0.5,0.7],[1.0,1.2]]"),

@@ -13,7 +13,7 @@ from runs import TWO_ARM, demo, overrides, refused, run, scene, summary_of, toml
 
 import dolfinopt as do
 from dolfinopt import Model
-from dolfinopt.dynamics.build import rests_of
+from dolfinopt.motion.build import rests
 from dolfinopt.part.folder import toml_text
 from dolfinopt.paths import quintic
 from dolfinopt.responses.constraints import (
@@ -188,7 +188,7 @@ def test_the_vibration_between_two_strokes_counts(tmp_path):
     evaluation, both = moved(strokes(tmp_path, BOTH, "constraints.settling=1e-3"))
     dwell = (both.t >= 0.3) & (both.t <= 0.6)
     last = both.distance[both.t >= 1.6].max()
-    assert rests_of(both.scene) == ((0.3, 0.6), (1.6, 2.0))
+    assert rests(both.scene) == ((0.3, 0.6), (1.6, 2.0))
     assert both.settling == both.distance[dwell].max() > 2.5 * last
     limits = {one.quantity: one for one in limits_of(both.scene, evaluation)}
     assert limits["settling"].value == both.settling
@@ -196,7 +196,7 @@ def test_the_vibration_between_two_strokes_counts(tmp_path):
     assert both.settling == pytest.approx(alone.settling, rel=1e-3)
     assert deviation_limits(both.scene) == [(1e-3, 0.3, 0.6), (1e-3, 1.6, 2.0)]
     without = strokes(tmp_path, BOTH, "motion.dwells=false")
-    assert rests_of(without) == ((1.6, 2.0),)
+    assert rests(without) == ((1.6, 2.0),)
     assert moved(without)[1].settling == pytest.approx(last, rel=1e-6)
 
 
@@ -205,7 +205,7 @@ def test_dwells_that_are_stated_take_the_place_of_stops(tmp_path):
     stated = strokes(tmp_path, BOTH, "motion.dwells=[[0.4,0.5],[1.2,1.6]]",
                      "constraints.settling_after=0.05")  # fmt: skip
     # The second one goes on in the rest after the motion.
-    assert rests_of(stated) == ((0.45, 0.5), (1.25, 2.0))
+    assert rests(stated) == ((0.45, 0.5), (1.25, 2.0))
     _, one = moved(stated)
     counted = ((one.t >= 0.45 - 1e-9) & (one.t <= 0.5 + 1e-9)) | (one.t >= 1.25 - 1e-9)
     assert np.array_equal(one.at_rest, counted)
@@ -219,18 +219,18 @@ def test_dwells_that_are_stated_take_the_place_of_stops(tmp_path):
 @pytest.mark.serial
 def test_a_stop_at_the_end_of_a_table_begins_the_last_rest(tmp_path):
     text = BOTH + "1.8,0,1.4,-1.0\n"
-    assert rests_of(strokes(tmp_path, text)) == ((0.3, 0.6), (1.6, 2.0))
+    assert rests(strokes(tmp_path, text)) == ((0.3, 0.6), (1.6, 2.0))
     # Before the first move nothing has settled.
     late = "t,cart,arm1,arm2\n0,0,2,-1\n0.1,0,2,-1\n0.4,0,1.5,-1\n"
-    assert rests_of(strokes(tmp_path, late)) == ((0.4, 2.0),)
+    assert rests(strokes(tmp_path, late)) == ((0.4, 2.0),)
     law = strokes(tmp_path, BOTH, "motion.law=trapezoidal")
-    assert rests_of(law) == ((0.3, 0.6), (1.6, 2.0))
+    assert rests(law) == ((0.3, 0.6), (1.6, 2.0))
 
 
 @pytest.mark.serial
 def test_without_stops_settling_is_as_ever():
     one = scene(*QUICK)
-    assert rests_of(one) == ((one.motion.duration, one.motion.horizon),)
+    assert rests(one) == ((one.motion.duration, one.motion.horizon),)
     _, trajectory = moved(one)
     after = trajectory.t >= one.motion.duration - 1e-9 * one.motion.horizon
     assert np.array_equal(trajectory.at_rest, after)
@@ -267,7 +267,7 @@ def test_dwells_stand_in_the_scene_of_a_part():
     """part.toml is written by the same function."""
     told = scene("motion.dwells=[[0.4,0.5],[1.2,1.6]]", "constraints.settling_after=0.05")
     again = scene_from_dict(tomllib.loads(toml_text(told.to_tree())))
-    assert rests_of(again) == rests_of(told) == ((0.45, 0.5), (1.25, 1.6), (1.95, 3.0))
+    assert rests(again) == rests(told) == ((0.45, 0.5), (1.25, 1.6), (1.95, 3.0))
     none = scene_from_dict(tomllib.loads(toml_text(scene("motion.dwells=false").to_tree())))
     assert none.motion.dwells is False
 

@@ -17,8 +17,8 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics.simulation import Trajectory, load_coefficients
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import places_of, rotated, stress_operator
-from dolfinopt.multibody.inverse_dynamics import load_coefficients as coefficients_of
-from dolfinopt.multibody.inverse_dynamics import outward_pass
+from dolfinopt.multibody.loads import load_coefficients as coefficients_of
+from dolfinopt.multibody.newton_euler import outward_pass
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
 from dolfinopt.responses.stress import (
     CellStress,

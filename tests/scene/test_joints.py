@@ -9,7 +9,7 @@ from scenes import put_at
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.machine import build_spatial_mechanism, rigid_link
+from dolfinopt.multibody.build import build_mechanism, rigid_link
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -69,7 +69,7 @@ def with_fork():
 
 
 def machine_of(scene):
-    return build_spatial_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
+    return build_mechanism(scene, [rigid_link(arm, 2700.0) for arm in scene.arms])
 
 
 def test_machine_of_a_scene(source):
@@ -126,6 +126,7 @@ REFUSED = [
     (("arms", 1, "cells"), [8, 2], "arms.1.cells (slide) = [8, 2]", "three integers"),
     (("arms", 1, "gear_stiffness"), 1e4, "arms.1.gear_stiffness", "joints.1.gear_stiffness"),
     (("joints", 0, "gear_damping"), 1.0, "joints.0.gear_damping", "without joints.gear_stiffness"),
+    (("joints", 0, "rotor_inertia"), 1e-4, "joints.0.rotor_inertia (yaw) = 0.0001", "gear_ratio"),
     (("joints", 0), FIXED | {"friction": [1.0, 0.0]}, "joints.0", "none with a fixed joint"),
     (("joints", 0, "friction_speed"), 1.0, "joints.0.friction_speed", "without joints.friction"),
     (("joints", 0, "bearing_stiffness"), [1e6, 1e6], "joints.0.bearing_stiffness", "six numbers"),

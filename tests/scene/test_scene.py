@@ -328,6 +328,7 @@ BAD_VALUES = [
     ("motion.file", ["absent.csv"], "found neither /"),
     ("motion.law", ["cubic"], '"quintic" | "septic" | "trapezoidal" | "s-curve"'),
     ("motion.duration motion.horizon", [0, 0.0], "a number >= 0.0001 and <= 100000"),
+    ("motion.table_ends", ["still", True], '"rest" | "moving"'),
     ("motion.dwells", [0.5, [0.5, 0.7]], "true or false | an array of arrays of two numbers"),
     ("motion.dwells", [[[0.5, 0.4]], [[0.5, 0.7], [0.6, 0.8]]], "start before end, one after"),
     ("motion.dwells", [[[2.5, 3.5]]], "dwells that end by motion.horizon = 3 [s]"),
@@ -735,9 +736,10 @@ def test_volume_is_limited_unless_mass_is(tables, limit):
 
 
 def test_length_of_a_body_from_a_file(tmp_path):
-    from dolfinopt.exchange.sid import write_sid
-    from dolfinopt.multibody.shape_integrals import in_space, rigid_bar
-    from dolfinopt.multibody.standard_input import to_sid
+    from dolfinopt.exchange.in_space import in_space
+    from dolfinopt.exchange.standard_input import to_sid
+    from dolfinopt.multibody.shape_integrals import rigid_bar
+    from dolfinopt.scene.sid import write_sid
 
     write_sid(tmp_path / "bar.sid", to_sid(in_space(rigid_bar(0.8, 0.05, 1.08))))
     data = minimal()

@@ -30,6 +30,7 @@ from dolfinopt.scene.tables.joints import (
     RotorInertia,
     check_bores,
     check_interfaces,
+    check_motor,
     check_parts,
     check_plane_bearing,
     check_springs,
@@ -321,7 +322,7 @@ class Arm(Table):
         description="moment of inertia at the outboard interface [kg m2]",
     )
     rotor_inertia: RotorInertia = 0.0
-    gear_ratio: GearRatio = 1.0
+    gear_ratio: GearRatio = None
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0
     joint_stiffness: JointStiffness = 0.0
@@ -746,6 +747,7 @@ class Arm(Table):
             )
         self._check_inertia(scene, at)
         check_interfaces(scene, at[-1])
+        check_motor(scene, at[-1])
         check_regions(self, at)
         if self.pattern is not None:
             self._check_pattern(before, at)

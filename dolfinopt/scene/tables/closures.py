@@ -203,6 +203,7 @@ def closing_site(scene: Scene, one: Closures, which: int) -> tuple[int, int] | N
 def as_closure(tree: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return [closure] of a plane scene, not validated yet, that states it as [[closures]].
 
+    Points and directions have two numbers there, or three; `direction` is another word for `axis`.
     None where that is not all that is asked for: validation tells why.
     """
     closures, arms = tree.get("closures"), tree.get("arms")
@@ -210,17 +211,21 @@ def as_closure(tree: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     if not isinstance(closures, list) or len(closures) != 1 or not isinstance(closures[0], dict):
         return None
-    one, last = closures[0], arms[-1].get("name") if isinstance(arms[-1], dict) else None
-    point, axis = one.get("point", [0.0, 0.0, 0.0]), one.get("axis", UP)
-    slides = one.get("kind") == "slider"
-    along = isinstance(axis, list) and len(axis) == 3 and (slides or axis[:2] == UP[:2])
-    if (
-        one.get("kind") not in ("pin", "slider")
-        or set(one) - {"name", "kind", "between", "point", "axis", "side"}
-        or one.get("between") not in ([last, GROUND], [f"{last}.{OUTBOARD}", GROUND])
-        or not (isinstance(point, list) and len(point) == 3 and point[2] == 0.0 and along)
-        or (slides and ("axis" not in one or axis[2] != 0.0))
-    ):
+    one, last = dict(closures[0]), arms[-1].get("name") if isinstance(arms[-1], dict) else None
+    slides, ends = one.get("kind") == "slider", ([last, GROUND], [f"{last}.{OUTBOARD}", GROUND])
+    axis, point = one.pop("axis", one.pop("direction", None)), one.pop("point", [0.0, 0.0])
+    if one.pop("between", None) not in ends or one.get("kind") not in ("pin", "slider"):
         return None
-    found = {key: one[key] for key in ("kind", "side") if key in one} | {"point": point[:2]}
-    return found | ({"direction": axis[:2]} if slides else {})
+    right = _is_flat(axis) if slides else axis is None or (_is_vector(axis) and axis[:2] == UP[:2])
+    if not (right and _is_flat(point)) or set(one) - {"name", "kind", "side"}:
+        return None
+    return one | {"point": point[:2]} | ({"direction": axis[:2]} if slides else {})
+
+
+def _is_flat(x: Any) -> bool:
+    """Return whether a value is a vector of the plane: two numbers, or a third that is 0."""
+    return isinstance(x, list) and (len(x) == 2 or (_is_vector(x) and x[2] == 0.0))
+
+
+def _is_vector(x: Any) -> bool:
+    return isinstance(x, list) and len(x) == 3

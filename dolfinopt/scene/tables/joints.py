@@ -225,14 +225,15 @@ RotorInertia = Annotated[
     Inertia,
     Field(
         description="moment of inertia of the rotor that drives the inboard joint, about its own "
-        "axis [kg m2]",
+        "axis, which is the joint's; not part of joint_inertia [kg m2]",
     ),
 ]
 GearRatio = Annotated[
-    Ratio,
+    Ratio | None,
     Field(
-        description="revolutions of the rotor per revolution of the inboard joint; of a "
-        "prismatic joint in space radians per metre [-]",
+        description="revolutions of the rotor per revolution of the inboard joint, against what "
+        "the joint sits on; of a prismatic joint in space radians per metre; stated with "
+        "rotor_inertia [-]",
     ),
 ]
 GearStiffness = Annotated[
@@ -373,7 +374,8 @@ class JointParts:
 
     Attributes:
         stiffness, damping: of the gear, as the joint feels it; 0: it is rigid.
-        rotor: the rotor's inertia times the gear ratio squared, kg m2 or kg.
+        rotor: the rotor's inertia about its own axis, kg m2.
+        ratio: its turns for one of the joint, rad/m of a prismatic one.
         bearing: springs of the bearing (6,), 0 where it is rigid, and dampers (6,); None: rigid.
         friction: viscous, Coulomb, and the speed that smooths it; None without.
     """
@@ -381,8 +383,39 @@ class JointParts:
     stiffness: float
     damping: float
     rotor: float
+    ratio: float
     bearing: tuple[_Six, _Six] | None
     friction: tuple[float, float, float] | None
+
+
+def _motor(one: Any, arm: Any) -> tuple[float, float | None]:
+    """Return the rotor's inertia and the gear's ratio, of the joint or of the arm that it holds."""
+    inertia = arm.rotor_inertia if one.rotor_inertia is None else one.rotor_inertia
+    return inertia, arm.gear_ratio if one.gear_ratio is None else one.gear_ratio
+
+
+def check_motor(scene: Scene, index: int) -> None:
+    """Refuse a rotor of unknown speed, and a motor's gear at a joint that nothing drives."""
+    arm = scene.arms[index]
+    found = [(k, one) for k, one in enumerate(scene.joints) if one.child == arm.name]
+    at, one = (("joints", found[0][0]), found[0][1]) if found else (("arms", index), arm)
+    inertia, ratio = _motor(one, arm)
+    if inertia > 0.0 and ratio is None:
+        where = at if one.rotor_inertia else ("arms", index)
+        raise Refusal(
+            "expected gear_ratio with it, the rotor's revolutions per revolution of the joint; "
+            "1 of a motor without a gear",
+            (*where, "rotor_inertia"),
+            (*where, "gear_ratio"),
+        )
+    soft = [(*at, "gear_stiffness")] * (one.gear_stiffness > 0.0)
+    soft += [("arms", index, "joint_stiffness")] * (arm.joint_stiffness > 0.0)
+    if found and one.passive and soft:
+        raise Refusal(
+            f"expected 0: the joint {one.name} has passive = true and no motor behind a spring",
+            soft[0],
+            (*at, "passive"),
+        )
 
 
 def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
@@ -393,13 +426,12 @@ def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
         one: Any = joints.get(arm.name, arm)
         soft = (arm.joint_stiffness, arm.joint_damping)
         stiffness, damping = soft if soft[0] > 0.0 else (one.gear_stiffness, one.gear_damping)
-        inertia = arm.rotor_inertia if one.rotor_inertia is None else one.rotor_inertia
-        ratio = arm.gear_ratio if one.gear_ratio is None else one.gear_ratio
+        inertia, ratio = _motor(one, arm)
         bearing = None
         if one.bearing_stiffness is not None and any(one.bearing_stiffness):
             bearing = one.bearing_stiffness, one.bearing_damping or (0.0,) * 6
         friction = None
         if one.friction is not None and any(one.friction):
             friction = (*one.friction, one.friction_speed)
-        found.append(JointParts(stiffness, damping, inertia * ratio**2, bearing, friction))
+        found.append(JointParts(stiffness, damping, inertia, ratio or 1.0, bearing, friction))
     return tuple(found)

@@ -92,8 +92,9 @@ class Joint(Table):
     )
     gear_ratio: Ratio | None = Field(
         default=None,
-        description="revolutions of the rotor per revolution of the joint, radians per metre of a "
-        "prismatic one; default: arms.gear_ratio of the arm that it holds [-]",
+        description="revolutions of the rotor per revolution of the joint, against what the joint "
+        "sits on; radians per metre of a prismatic one; default: arms.gear_ratio of the arm that "
+        "it holds; stated with rotor_inertia [-]",
     )
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0
@@ -325,6 +326,9 @@ DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the l
 class Closure(Table):
     """What holds the outboard interface of the last arm, whose rotation stays free."""
 
+    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
+        default="closure", description="name in the columns of trajectory.csv [-]"
+    )
     kind: ClosureKind = Field(
         description="the interface slides on a line, or turns about a fixed point [-]"
     )

@@ -64,8 +64,8 @@ class Motion(Table):
     initial_joints: tuple[JointValue, ...] | None = Field(
         default=None,
         description="joint coordinates near those at the start of an end-effector's path in "
-        "space, for [[joints]] that move: which solution of inverse kinematics is meant; default: "
-        "0 [rad, m]",
+        "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
+        "solution is meant; default: 0, in the plane by closure.side [rad, m]",
     )
     file: FileName | None = Field(
         default=None,
@@ -114,6 +114,11 @@ class Motion(Table):
         description="simulated time, at least the duration, after which the machine stays at "
         "rest or keeps its speed; the default is the duration if that is longer [s]",
     )
+    table_ends: Literal["rest", "moving"] = Field(
+        default="rest",
+        description="whether a table with times rests at its first and last instant, or moves "
+        "there at the rates of its own rows, as one cut out of a motion does [-]",
+    )
     dwells: bool | tuple[tuple[Instant, Instant], ...] = Field(
         default=True,
         description="rests in which settling counts besides that after the motion: true, every "
@@ -155,9 +160,10 @@ class Motion(Table):
             raise Refusal("expected another point than motion.start", ("end",), ("start",))
         self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
         self.refuse_unused(self.path == "line", "path", "start", "end", "rpy")
-        self.refuse_unused(self.path in ("points", "line", "joints"), "path", "initial_joints")
+        self.refuse_unused(self.path != "arc", "path", "initial_joints")
         self.refuse_unused(tabulated, "path", "file")
         self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
+        self.refuse_unused(tabulated, "path", "table_ends")
         joints = self.path in ("joints", "rotation")
         self.refuse_unused(not joints, "path", "cart_follow", "elbow")
         if self.path == "rotation" and self.base != "fixed":
@@ -217,6 +223,13 @@ class Motion(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
+        if self.table_ends == "moving" and self.horizon > self.duration:
+            raise Refusal(
+                f"expected motion.duration = {self.duration:g} [s], the end of the table, with "
+                'motion.table_ends = "moving": nothing says how the machine moves on',
+                ("motion", "horizon"),
+                ("motion", "table_ends"),
+            )
         if scene.is_spatial:
             return  # `tables.joints` knows
         for key in ("gravity", "start", "end"):
@@ -226,12 +239,17 @@ class Motion(Table):
                     "the plane",
                     ("motion", key),
                 )
-        for key in ("rpy", "initial_joints"):
+        for key in ("rpy", *(["initial_joints"] if scene.closure is None else [])):
             if getattr(self, key) is not None:
                 raise Refusal(
                     "expected none without [[joints]]: the machine moves in the plane",
                     ("motion", key),
                 )
+        if self.initial_joints is not None and len(self.initial_joints) != len(scene.arms):
+            raise Refusal(
+                f"expected {len(scene.arms)} numbers, the angles of all arms' joints",
+                ("motion", "initial_joints"),
+            )
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(

@@ -43,28 +43,6 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 Load = tuple[np.ndarray, np.ndarray]
-PerInstant = float | np.ndarray  # one number, or one at each of n instants
-
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """Factors of a body's mass integrals, stiffness and damping."""
-
-    mass: PerInstant = 1.0
-    stiffness: PerInstant = 1.0
-    damping: PerInstant = 1.0
-
-    def __getitem__(self, part: slice | np.ndarray) -> Scale:
-        """Return it at some of the instants."""
-        return Scale(*(at(x, part) for x in (self.mass, self.stiffness, self.damping)))
-
-
-UNSCALED = Scale()
-
-
-def at(x: PerInstant, part: slice | np.ndarray) -> PerInstant:
-    """Return a value at some of the instants."""
-    return x[part] if isinstance(x, np.ndarray) else x
 
 
 class Constants:
@@ -73,11 +51,11 @@ class Constants:
     Attributes:
         body: the integrals.
         dim: what differs between the plane and space.
-        mass: kg; of a point that the plane's machines carry also (n,), one at each instant.
+        mass: kg.
         T: (P, q) conjugates of the pushes by the coordinates.
         K0: (P, q, q) geometric stiffness by every push, None of a linear body.
         L: (q, q, q) of the displacement along the modes, or None.
-        c, W_rest: (d, 1), (g, 1) of the undeformed body; W_rest also (g, n), as the mass.
+        c, W_rest: (d, 1), (g, 1) of the undeformed body.
         is_point: whether it is rigid with its centre at the origin.
         W: (g q, q) of the modes.
         M: (q, q) mass.
@@ -95,7 +73,7 @@ class Constants:
         if body.is_stiffened:
             self.K0 = np.concatenate([body.K0[self.dim.loads], body.K0_outboard])
             self.L = body.along_modes if len(body.along_modes) else None
-        self.mass: PerInstant = body.mass
+        self.mass = body.mass
         self.c, self.W_rest = body.w[:, :1], body.W[:, :1, 0]
         self.is_point = q == 0 and not self.c.any()
         self.W = np.ascontiguousarray(body.W[:, 1:, 1:]).reshape(self.dim.g * q, q)
@@ -105,20 +83,9 @@ class Constants:
         self.points = body.points if self.dim.d == 3 else body.outboard_point[None]
 
     @classmethod
-    def of_point(cls, mass: PerInstant, inertia: PerInstant) -> Constants:
+    def of_point(cls, mass: float, inertia: float) -> Constants:
         """Return those of a mass (kg) with rotary inertia (kg m2) at the origin, in the plane."""
-        found = cls(rigid_body(0.0, np.zeros(2), 0.0, np.zeros(2)))
-        if np.ndim(mass) or np.ndim(inertia):  # then each has its own at every instant
-            mass, inertia = (x.copy() for x in np.broadcast_arrays(mass, inertia))
-        inertia = np.atleast_1d(inertia)
-        found.mass, found.W_rest = mass, np.stack([inertia, np.zeros_like(inertia)])
-        return found
-
-    def __getitem__(self, part: slice | np.ndarray) -> Constants:
-        """Return them at some of the instants: a point's, of which each has its own."""
-        if not isinstance(self.mass, np.ndarray):
-            return self
-        return self.of_point(self.mass[part], self.W_rest[0, part])
+        return cls(rigid_body(mass, np.zeros(2), inertia, np.zeros(2)))
 
     @cached_property
     def bent(self) -> np.ndarray:
@@ -145,16 +112,6 @@ def weighted(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     return A * x if A.shape[1] != len(A) or len(A) == 1 else A @ x
 
 
-def _scaled(factor: PerInstant, x: np.ndarray) -> np.ndarray:
-    """Return x (q, n) times a factor, which mostly is one."""
-    return x if isinstance(factor, float) and factor == 1.0 else factor * x
-
-
-def _times(x: PerInstant, A: np.ndarray) -> np.ndarray:
-    """Return A times a number, or (n, ...) times one at each instant."""
-    return np.multiply.outer(x, A) if isinstance(x, np.ndarray) else x * A
-
-
 class BodyMotion:
     """A body's frame and elastic coordinates at n instants.
 
@@ -162,15 +119,11 @@ class BodyMotion:
         constants: of the body.
         a, w, wd: its motion.
         rates: (q, 3, n) coordinates e, e', e''.
-        scale: of its integrals; its inertia's factor is in all that it makes of accelerations.
     """
 
-    def __init__(
-        self, constants: Constants, motion: Motion, rates: np.ndarray, scale: Scale = UNSCALED
-    ) -> None:
+    def __init__(self, constants: Constants, motion: Motion, rates: np.ndarray) -> None:
         """Take motion and coordinates."""
         self.constants, self.dim, self.rates = constants, constants.dim, rates
-        self.scale = scale
         self.a, self.w, self.wd = motion
         self.is_flexible = constants.num_modes > 0
         self.alpha = self.dim.alpha(self.w, self.wd)
@@ -250,7 +203,7 @@ class BodyMotion:
             return None
         return -self._bent_rate, -self._bent_by(2)
 
-    def pulled(self, x: np.ndarray) -> np.ndarray:
+    def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x: forces by z as forces by e, (q, n) or (m, q, n)."""
         if self.constants.L is None:
             return x
@@ -269,12 +222,12 @@ class BodyMotion:
     def Y(self) -> np.ndarray:
         """Derivative of the rows by alpha_c (g, q, n); that of beta_c is `Yd`."""
         d, g = self.dim.d, self.dim.g
-        return self.V[d : d + g] + self.pulled(self._Wz[:, :, 0])
+        return self.V[d : d + g] + self.jacobian_transposed(self._Wz[:, :, 0])
 
     @cached_property
     def Yd(self) -> np.ndarray:
         """J' W_c z' (g, q, n)."""
-        return self.pulled(self._Wz[:, :, 1])
+        return self.jacobian_transposed(self._Wz[:, :, 1])
 
     @cached_property
     def moments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -312,40 +265,35 @@ class BodyMotion:
         if self.is_flexible:
             force = force + dim.apply(self.beta, sd) + sdd
             moment = moment + dim.torque(self.beta, H) + dim.axial(second)
-        return self._of_mass(force), self._of_mass(moment)
-
-    def _of_mass(self, x: np.ndarray) -> np.ndarray:
-        """Return inertia (..., n) of the body as it is scaled."""
-        return x if self.scale is UNSCALED else self.scale.mass * x
+        return force, moment
 
     @cached_property
     def modal_inertia(self) -> np.ndarray:
         """alpha_c W_c z + beta_c W_c z' + M z'' (q, n)."""
         pushes = np.empty((len(self.alpha), 3, self.alpha.shape[1]), dtype=self.alpha.dtype)
         pushes[:, 0], pushes[:, 1], pushes[:, 2] = self.alpha, self.beta, self.dim.trace
-        return self._of_mass(np.einsum("crn,ckrn->kn", pushes, self._Wz))
+        return np.asarray(np.einsum("crn,ckrn->kn", pushes, self._Wz))
 
-    def pushes(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
+    def load_coefficients(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return all P of them (P, n) from those of the interfaces, by number."""
         count = self.a.shape[1]
         pulls = [
             outboard[s] if s in outboard else np.zeros((self.dim.b, count))
             for s in range(len(self.constants.points))
         ]
-        return np.concatenate([self._of_mass(self.a), self._of_mass(self.alpha), *pulls])
+        return np.concatenate([self.a, self.alpha, *pulls])
 
     def rows(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the elastic rows (q, n) under pushes of the interfaces, by number."""
-        constants, p = self.constants, self.pushes(outboard)
-        f = self.pulled(self.modal_inertia)
+        constants, p = self.constants, self.load_coefficients(outboard)
+        f = self.jacobian_transposed(self.modal_inertia)
         if constants.K0 is None:
             f = f + constants.T.T @ p
         else:
             f = f + np.einsum("pn,pkn->kn", p, self.V)
-        k, d = self.scale.stiffness, self.scale.damping
-        f = f + weighted(constants.K, _scaled(k, self.rates[:, 0]))
+        f = f + weighted(constants.K, self.rates[:, 0])
         if constants.D is not None:
-            f += weighted(constants.D, _scaled(d, self.rates[:, 1]))
+            f += weighted(constants.D, self.rates[:, 1])
         return f
 
     # -- derivatives -------------------------------------------------------------------------
@@ -361,13 +309,13 @@ class BodyMotion:
         out[:d, d : d + r] = dim.centripetal_by_spin(self.w, s) + 2.0 * dim.by_spin(sd)
         out[:d, d + r :], out[d:, :d] = spun, spun.swapaxes(0, 1)
         out[d:, d : d + r], out[d:, d + r :] = dim.torque_by_spin(self.w, G, H)
-        return self._of_mass(out)
+        return out
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:
         """Derivative of the rows by (a, w, wd), (d + 2 r, q, n)."""
         by_w, by_wd = self.dim.contracted_by_spin(self.w, self.Y, self.Yd)
-        return self._of_mass(np.concatenate([self.V[: self.dim.d], by_w, by_wd]))
+        return np.concatenate([self.V[: self.dim.d], by_w, by_wd])
 
     def load_by_rates(self, kept: np.ndarray) -> np.ndarray:
         """Return the derivatives of (F, T) by those e, e', e'' kept (d + r, 3, k, n)."""
@@ -375,7 +323,7 @@ class BodyMotion:
         d, across = dim.d, slice(dim.d, dim.d + dim.g)
         C, Y, Yd = self.V[:d, kept], self.Y[:, kept], self.Yd[:, kept]
         turned = dim.transposed(Y)
-        first, second = Yd, self.pulled(self._Wz[:, :, 2])[:, kept]
+        first, second = Yd, self.jacobian_transposed(self._Wz[:, :, 2])[:, kept]
         by_e = dim.apply(self.alpha, C)
         by_ed = dim.apply(self.beta, C)
         moved = None
@@ -397,7 +345,7 @@ class BodyMotion:
         out = np.empty((d + dim.r, 3, *C.shape[1:]))
         out[:d, 0], out[:d, 1], out[:d, 2] = by_e, by_ed, C
         out[d:, 0], out[d:, 1], out[d:, 2] = T_e, T_ed, dim.axial(turned)
-        return self._of_mass(out)
+        return out
 
     def rows_by_rates(
         self, kept: np.ndarray, outboard: dict[int, np.ndarray]
@@ -409,9 +357,7 @@ class BodyMotion:
         constants, q = self.constants, self.constants.num_modes
         if constants.L is None:
             by_e, by_ed, by_edd = *self._by_z(kept), constants.M[:, kept]
-            if self.scale is not UNSCALED:
-                by_edd = _times(self.scale.mass, by_edd)
-            held = self.pushes(outboard)
+            held = self.load_coefficients(outboard)
         else:
             by_z, by_zd = self._by_z(np.arange(q))
             assert self.rates_by_e is not None
@@ -422,19 +368,16 @@ class BodyMotion:
             )
             left, own = J.swapaxes(1, 2), J[:, :, kept]
             M = constants.M
-            if self.scale is not UNSCALED:
-                M = _times(self.scale.mass, M)
             by_e = left @ (by_z @ own + by_zd @ Jd[:, :, kept] + M @ Jdd[:, :, kept])
             by_ed = left @ (by_zd @ own + 2.0 * (M @ Jd[:, :, kept]))
             by_edd = left @ (M @ own)
-            held = np.concatenate([self.pushes(outboard), self.modal_inertia])
+            held = np.concatenate([self.load_coefficients(outboard), self.modal_inertia])
         if constants.K0 is not None:
             bent = constants.bent.reshape(len(held), q, q)[:, :, kept]
             by_e -= (held.T @ bent.reshape(len(held), q * len(kept))).reshape(by_e.shape)
-        D, k, d = constants.body.D, self.scale.stiffness, self.scale.damping
-        by_e += _times(k, constants.body.K[:, kept])
+        by_e += constants.body.K[:, kept]
         if constants.D is not None:
-            by_ed += _times(d, D[:, kept])
+            by_ed += constants.body.D[:, kept]
         return by_e, by_ed, by_edd
 
     def _by_z(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -442,7 +385,7 @@ class BodyMotion:
         q = self.constants.num_modes
         W = self.constants.W.reshape(-1, q, q)[:, :, kept]
         flat, shape = W.reshape(len(W), q * len(kept)), (self.w.shape[1], q, len(kept))
-        by_z, by_zd = ((self._of_mass(x).T @ flat).reshape(shape) for x in (self.alpha, self.beta))
+        by_z, by_zd = ((x.T @ flat).reshape(shape) for x in (self.alpha, self.beta))
         return by_z, by_zd
 
     # -- gradient ----------------------------------------------------------------------------

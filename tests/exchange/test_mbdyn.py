@@ -15,14 +15,15 @@ from runs import TWO_ARM, tomllib
 
 from dolfinopt import Model
 from dolfinopt.cli import commands
+from dolfinopt.exchange.in_space import in_space, plate_moments
 from dolfinopt.exchange.mbdyn import fem_text, write_fem
-from dolfinopt.exchange.sid import read_sid, sid_text
+from dolfinopt.exchange.standard_input import load_body, lumped_nodes, modal_element
 from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody.body_motion import BodyMotion, Constants
-from dolfinopt.multibody.shape_integrals import in_space, plate_moments, shape_integrals
-from dolfinopt.multibody.standard_input import load_body, lumped_nodes, modal_element
+from dolfinopt.multibody.body import BodyMotion, Constants
+from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.reduction import Options, craig_bampton
+from dolfinopt.scene.sid import read_sid, sid_text
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.02  # m

@@ -1,4 +1,4 @@
-"""Bodies as standard input data and back, and for MBDyn; see `dolfinopt.exchange.sid`.
+"""Bodies as standard input data and back, and for MBDyn; see `dolfinopt.scene.sid`.
 
 With a frame that accelerates by a + A X, A = wd~ + w~ w~, all that the matrices of the elastic
 coordinates hold are sums of
@@ -33,14 +33,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange import mbdyn, sid
-from dolfinopt.multibody.machine import ONE, PERMUTATION, skew
-from dolfinopt.multibody.measured import (
+from dolfinopt.exchange import mbdyn
+from dolfinopt.exchange.measured import (
     CENTRIFUGAL_EXCESS_SHARE,
     FILE_ROUNDING_SHARE,
     SAME_NODE_SHARE,
 )
+from dolfinopt.multibody.rotations import ONE, PERMUTATION, skew
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
+from dolfinopt.scene import sid
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm

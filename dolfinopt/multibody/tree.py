@@ -4,10 +4,7 @@ Every body hangs on its parent's outboard interface, or on the ground, by one jo
 placed as in URDF; the body's own frame is the joint's. What a body carries at an outboard interface
 without a joint (payload, motor) is a rigid body in the interface's frame. Source: Featherstone,
 Rigid Body Dynamics Algorithms (2008); Schwertassek & Wallrapp (1999).
-
-Plane vectors are complex numbers: v = v_x + i v_y, so S v = i v, a rotation by phi multiplies by
-exp(i phi), u . v = Re(conj(u) v) and the moment of a force F about the origin of its lever u is
-Im(conj(u) F). Every body works in its own tangent frame at its inboard joint.
+Every body works in its own tangent frame at its inboard joint.
 """
 
 from __future__ import annotations
@@ -20,20 +17,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dolfinopt.multibody.body_motion import (
-    UNSCALED,
-    Constants,
-    Load,
-    Motion,
-    PerInstant,
-    Scale,
-)
+from dolfinopt.multibody.body import Constants, Load, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 if TYPE_CHECKING:
-    from dolfinopt.multibody.motion import RigidMotion
+    from dolfinopt.multibody.rigid_motion import RigidMotion
 
 # -- what moves the free rigid coordinates, and what holds the last interface: drives and
 # closures
@@ -103,19 +93,17 @@ class Springs:
     Attributes:
         joints: (M,) places of their joints among the free rigid coordinates.
         stiffness, damping: (M,) N m/rad, N m s/rad.
-        rotor: (M,) inertia of the motors as the joints feel it, kg m2.
         friction: of the motors, as the joints feel it.
     """
 
     joints: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
-    rotor: np.ndarray
     friction: Friction
 
 
 NOTHING = np.zeros(0)
-NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, NOTHING, Friction.none(0))
+NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, Friction.none(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +124,7 @@ class Drives:
             springs give under u_ff.
         table: `dynamics.tables.Table` of forces (R) that are added; or None.
         springs: between drives and arms, where a drive is controlled.
-        rotors: (R,) inertia of rotors on the desired motion, before springs, which their motors
-            move as well, kg m2; or None.
-        friction: (R,) of these motors; or None.
+        friction: (R,) of motors before springs that are on the desired motion; or None.
     """
 
     free: np.ndarray
@@ -149,7 +135,6 @@ class Drives:
     rigid_feed_forward: bool = False
     table: Any = None
     springs: Springs = NO_SPRINGS
-    rotors: np.ndarray | None = None
     friction: Friction | None = None
     winding: bool = False
 
@@ -182,59 +167,7 @@ class Drives:
         return np.isfinite(self.limits)
 
 
-@dataclass(frozen=True, eq=False)
-class Closure:
-    """The last outboard interface slides on a line, or turns about a fixed point.
-
-    g_i = Re(conj(n_i) (p - point)) = 0 with m unit normals n_i; the force of the ground on the
-    interface is sum_i lambda_i n_i, N, beside a given constant one.
-
-    Attributes:
-        point: complex, m.
-        normals: (m,) complex: one across the line, or both axes.
-        force: given force on the interface, complex, N.
-    """
-
-    point: complex
-    normals: np.ndarray
-    force: complex = 0.0
-
-    @property
-    def count(self) -> int:
-        """Number m of constraints."""
-        return len(self.normals)
-
-    def gap(self, place: np.ndarray) -> np.ndarray:
-        """Return g (n, m), m, of places (n,)."""
-        return (np.conj(self.normals) * (place[:, None] - self.point)).real
-
-    def project(self, derivative: np.ndarray) -> np.ndarray:
-        """Return the part along every normal (n, m, ...) of complex derivatives (n, ...)."""
-        shape = (1, -1) + (1,) * (derivative.ndim - 1)
-        return (np.conj(self.normals).reshape(shape) * derivative[:, None]).real
-
-    @classmethod
-    def slider(cls, point: complex, direction: complex, force: float = 0.0) -> Closure:
-        """Return the closure of a slider on the line through `point` along `direction`.
-
-        Args:
-            point: m.
-            direction: of any length.
-            force: on the slider along the direction, N.
-        """
-        unit = direction / abs(direction)
-        return cls(point, np.array([1j * unit]), force * unit)
-
-    @classmethod
-    def pin(cls, point: complex) -> Closure:
-        """Return the closure of a pin at `point`, m."""
-        return cls(point, np.array([1.0, 1j]))
-
-
-# -- values that are the same at all instants, or given at each: several mechanisms in one batch
-#
-# Scenarios of the same bodies (other payloads, gravity, materials) lie one after the other in the
-# arrays of instants; what they share is stored once.
+# -- few instants: the same bits wherever arrays lie in memory
 
 
 def repeated(count: int) -> np.ndarray | None:
@@ -249,6 +182,23 @@ JointType = Literal["revolute", "prismatic", "fixed"]
 Site = tuple[int, int]  # body, and which of its outboard interfaces
 
 
+@dataclass(frozen=True)
+class Rotor:
+    """The rotor of a joint's motor, carried by what the joint sits on, its axis along the joint's.
+
+    Attributes:
+        inertia: J about its axis, which is not part of any body's inertia, kg m2.
+        ratio: turns of the rotor for one of the joint, against what carries it; rad/m of a
+            prismatic joint, whose screw is right-handed.
+        motor: its place among the motors behind springs, which have coordinates of their own;
+            None: it turns with the joint.
+    """
+
+    inertia: float
+    ratio: float
+    motor: int | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Joint:
     """What holds a body.
@@ -261,7 +211,7 @@ class Joint:
         axis: (3,) unit vector in the joint's frame; (1,) of a plane's joint, which turns.
         origin: (d,) of the joint's frame in the parent's interface frame, m.
         rotation: (d, d) from the joint's frame to the parent's interface frame.
-        rotor: inertia of what drives it, times the gear ratio squared, kg m2 (prismatic: kg).
+        rotor: of what drives it, or None.
         interface: number of the parent's outboard interface, 0 for the first.
     """
 
@@ -272,7 +222,7 @@ class Joint:
     axis: np.ndarray
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    rotor: float = 0.0
+    rotor: Rotor | None = None
     interface: int = 0
 
     @cached_property
@@ -299,32 +249,18 @@ class AppliedForce:
     known: bool = True
 
 
-def _diagonal_or_matrix(A: np.ndarray) -> np.ndarray:
-    """Return the diagonal of a matrix that has nothing else, or the matrix."""
-    diagonal = np.diagonal(A)
-    return diagonal if np.count_nonzero(A) == np.count_nonzero(diagonal) else A
-
-
-def product(x: np.ndarray, A: np.ndarray) -> np.ndarray:
-    """Return x A (n, q) of a matrix, or of its diagonal."""
-    return x * A if A.ndim == 1 else x @ A
-
-
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """Bodies, the joints that hold them, what they carry, and gravity; in the plane or in space.
-
-    Loads, gravity and scales may differ from instant to instant: several mechanisms in one.
 
     Attributes:
         bodies: in the order of the elastic coordinates.
         joints: that hold them, in the same order.
         loads: what they carry at interfaces without a joint, in the interfaces' frames.
-        gravity: (d, 1), or (d, n) of instants that differ, m/s2.
+        gravity: (d, 1) m/s2.
         end: the end-effector's interface.
         origin: (d,) of the ground's frame, which a cart moves along x, m.
         cart: its mass, kg, of the first rigid coordinate; None without one.
-        scales: of every body's elastic rows, forces and moments, or none.
         forces: given ones on interfaces.
         bearings: the bodies whose joints sit on bearings, see `joints.with_bearings`: the last
             bodies, massless, in this order.
@@ -339,21 +275,10 @@ class Mechanism:
     end: Site
     origin: np.ndarray
     cart: float | None = None
-    scales: tuple[Scale, ...] = ()
     forces: tuple[AppliedForce, ...] = ()
     bearings: tuple[int, ...] = ()
     friction: Friction | None = None
     rods: int = 0
-
-    def __getitem__(self, part: slice | np.ndarray) -> Mechanism:
-        """Return it at some of the instants."""
-        loads = {site: one[part] for site, one in self.loads.items()}
-        alike = all(one is self.loads[site] for site, one in loads.items())
-        if alike and not self.scales and self.gravity.shape[1] == 1:
-            return self
-        gravity = self.gravity if self.gravity.shape[1] == 1 else self.gravity[:, part]
-        scales = tuple(scale[part] for scale in self.scales)
-        return replace(self, loads=loads, gravity=gravity, scales=scales)
 
     @property
     def rigid(self) -> Mechanism:
@@ -400,10 +325,31 @@ class Mechanism:
         """Number N of elastic coordinates of all bodies."""
         return sum(body.num_modes for body in self.bodies)
 
-    @property
+    @cached_property
     def num_rigid(self) -> int:
         """Number R of rigid coordinates, of cart, joints and rods."""
-        return len(self.rotors)
+        return (self.cart is not None) + len(self.movable) + self.rods
+
+    @cached_property
+    def rotors(self) -> Mapping[int, int]:
+        """Coordinates of all rotors by the bodies whose joints they drive.
+
+        That of the joint, or R + its place of a motor behind a spring.
+        """
+        return {
+            i: joint.coordinate if joint.rotor.motor is None else self.num_rigid + joint.rotor.motor
+            for i, joint in enumerate(self.joints)
+            if joint.rotor is not None and joint.coordinate is not None
+        }
+
+    @cached_property
+    def motor_joints(self) -> np.ndarray:
+        """Coordinates (M,) of the joints whose motors are behind springs.
+
+        The motors' own coordinates follow the R rigid ones.
+        """
+        pairs = [(k, self.joints[i].coordinate) for i, k in self.rotors.items()]
+        return np.array([own for k, own in sorted(pairs) if k >= self.num_rigid], dtype=int)
 
     @cached_property
     def movable(self) -> tuple[int, ...]:
@@ -415,12 +361,6 @@ class Mechanism:
     def cart_coordinate(self) -> int | None:
         """Place of the cart among the rigid coordinates, None without one."""
         return None if self.cart is None else 0
-
-    @cached_property
-    def rotors(self) -> np.ndarray:
-        """Mass of the cart and reflected inertia of every rigid coordinate's drive (R,)."""
-        cart = [] if self.cart is None else [self.cart]
-        return np.array([*cart, *(self.joints[i].rotor for i in self.movable), *[0.0] * self.rods])
 
     # -- how the recursions go along it ------------------------------------------------------
 
@@ -451,16 +391,17 @@ class Mechanism:
 
     @cached_property
     def order(self) -> tuple[int, ...]:
-        """The bodies, every one behind its parent."""
+        """The bodies depth first: behind its parent every one with all that hangs on it."""
         found: list[int] = []
-        while len(found) < len(self.joints):
-            more = [
-                i
-                for i, joint in enumerate(self.joints)
-                if i not in found and (joint.parent == GROUND or joint.parent in found)
-            ]
-            assert more, "joints form a loop"
-            found += more
+
+        def visit(site: Site) -> None:
+            for k in self.hanging[site]:
+                found.append(k)
+                for s in self.sites[k]:
+                    visit((k, s))
+
+        visit((GROUND, 0))
+        assert len(found) == len(self.joints), "joints form a loop"
         return tuple(found)
 
     @cached_property
@@ -481,10 +422,6 @@ class Mechanism:
         if parent == GROUND:
             return False
         return self.bodies[parent].num_modes > 0 or self.is_felt(parent)
-
-    def scale(self, i: int) -> Scale:
-        """Return that of a body."""
-        return self.scales[i] if self.scales else UNSCALED
 
     def base(self, q_r: np.ndarray) -> np.ndarray:
         """Return where the ground's frame is (d, n), m, for rigid coordinates (n, R)."""
@@ -534,18 +471,16 @@ class Mechanism:
         return np.where(slides + [True] * self.rods, 1.0, reach)
 
     @cached_property
-    def stiffnesses(self) -> tuple[np.ndarray, ...]:
-        """Every body's stiffness (q, q), or its diagonal (q,) where there is nothing else."""
-        return tuple(_diagonal_or_matrix(body.K) for body in self.bodies)
+    def _unit(self) -> tuple[bool, ...]:
+        """Whether bodies' coordinates are normalised: their stiffness is the identity."""
+        return tuple(np.array_equal(body.K, np.eye(len(body.K))) for body in self.bodies)
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
         norms = []
-        for part, K in zip(self.slices, self.stiffnesses, strict=True):
+        for part, body, unit in zip(self.slices, self.bodies, self._unit, strict=True):
             e = q[..., part]
-            unit = K.ndim == 1 and (K == 1.0).all()
-            loads = e if unit else product(e, K)
-            squares = np.einsum("...nk,...nk->...n", loads, e)
+            squares = np.einsum("...nk,...nk->...n", e if unit else e @ body.K, e)
             norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
         return np.stack(norms, axis=-1)
 
@@ -594,20 +529,19 @@ class JointHardware:
 
     Attributes:
         mass, inertia: at the outboard interface, kg, kg m2.
-        rotor: inertia of the rotor that drives the inboard joint, times its gear ratio squared,
-            kg m2.
+        rotor: that drives the inboard joint, or None.
     """
 
     mass: float = 0.0
     inertia: float = 0.0
-    rotor: float = 0.0
+    rotor: Rotor | None = None
 
 
 def plane_chain(
     bodies: Sequence[ShapeIntegrals],
-    payload_mass: PerInstant,
-    payload_inertia: PerInstant,
-    gravity: tuple[PerInstant, PerInstant],
+    payload_mass: float,
+    payload_inertia: float,
+    gravity: Sequence[float],
     joint_height: float,
     *,
     hardware: Sequence[JointHardware] = (),
@@ -642,11 +576,24 @@ def plane_chain(
         bodies=tuple(bodies),
         joints=tuple(joints),
         loads=loads,
-        gravity=np.stack(np.broadcast_arrays(*map(np.atleast_1d, gravity))),
+        gravity=np.array(gravity, dtype=float)[:, None],
         end=(last, 0),
         origin=np.array([0.0, joint_height]),
         cart=cart_mass,
     )
+
+
+def spatial_mechanism(
+    bodies: Sequence[ShapeIntegrals],
+    joints: Sequence[Joint],
+    carried: Mapping[Site, ShapeIntegrals],
+    gravity: Sequence[float] | np.ndarray,
+    end: Site,
+) -> Mechanism:
+    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
+    loads = {site: Constants(one) for site, one in carried.items()}
+    down = np.array(gravity, dtype=float)[:, None]
+    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
 
 
 # -- what is between a drive and its arm: bearings, friction ---------------------------------
@@ -704,7 +651,7 @@ def with_bearings(mechanism: Mechanism, bearings: Mapping[int, ShapeIntegrals]) 
     for place, k in enumerate(bearings, len(joints)):
         held = joints[k]
         name = f"bearing of {held.name}"
-        more.append(replace(held, name=name, kind="fixed", coordinate=None, rotor=0.0))
+        more.append(replace(held, name=name, kind="fixed", coordinate=None, rotor=None))
         joints[k] = replace(held, parent=place, interface=0, origin=np.zeros(d), rotation=np.eye(d))
     return replace(
         mechanism,

@@ -12,26 +12,21 @@ from readers import State, forces_of_sid, random_state
 from remainders import substructure
 from runs import refused
 
-from dolfinopt.exchange.sid import (
+from dolfinopt.exchange.in_space import in_space, plate_moments
+from dolfinopt.exchange.standard_input import from_sid, load_body, to_sid
+from dolfinopt.fem.geometric_stiffness import unit_loads
+from dolfinopt.multibody.body import BodyMotion, Constants
+from dolfinopt.multibody.frames import Interface
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, shape_integrals
+from dolfinopt.reduction import Options, craig_bampton
+from dolfinopt.scene.sid import (
     StandardInputData,
     Taylor,
     read_sid,
     write_sid,
 )
-from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.multibody.body_motion import BodyMotion, Constants
-from dolfinopt.multibody.inverse_dynamics import inverse_dynamics
-from dolfinopt.multibody.kinematics import Interface
-from dolfinopt.multibody.motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import (
-    TABLE,
-    ShapeIntegrals,
-    in_space,
-    plate_moments,
-    shape_integrals,
-)
-from dolfinopt.multibody.standard_input import from_sid, load_body, to_sid
-from dolfinopt.reduction import Options, craig_bampton
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 

@@ -18,16 +18,10 @@ from scipy.optimize import brentq
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.measured import TABLE_CORNERS_LIMIT
-from dolfinopt.multibody.motion import (
-    Bend,
-    RigidMotion,
-    arc,
-    breakpoints,
-    desired_path,
-    line,
-    rigid_motion,
-)
+from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid_motion
+from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
+from dolfinopt.motion.plane import Bend
+from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.paths import quintic, septic
 from dolfinopt.scene.load import Scene, scene_from_dict
 
@@ -87,18 +81,19 @@ def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
 @pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
 def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
     """On the ellipse, monotone in x, a straight line when it is flattened altogether."""
-    motion = scene(radius=0.9, flattening=flattening).motion
-    path = arc(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), motion)
+    of = scene(radius=0.9, flattening=flattening)
+    path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
     expected = [[-0.9, 0.0], [0.0, 0.9 * flattening], [0.9, 0.0], [0.9, 0.0]]
-    assert_close(path.p, expected, 1e-14)
-    path = arc(DENSE, motion)
-    height = flattening * np.sqrt(np.maximum(0.9**2 - path.p[:, 0] ** 2, 0.0))
+    assert_close(path[0], expected, 1e-14)
+    place = desired_path(DENSE, of)[0]
+    height = flattening * np.sqrt(np.maximum(0.9**2 - place[:, 0] ** 2, 0.0))
     # The square root of a rounding error at the ends, where x^2 = r^2.
-    assert_close(path.p[:, 1], height, 1e-7, 0.9)
-    assert (np.diff(path.p[DENSE <= DURATION, 0]) > 0.0).all()
-    path = arc(INSIDE, motion)
-    assert_close(derivative(lambda t: arc(INSIDE + t, motion).p), path.pd, DIFFERENCES)
-    assert_close(derivative(lambda t: arc(INSIDE + t, motion).pd), path.pdd, DIFFERENCES)
+    assert_close(place[:, 1], height, 1e-7, 0.9)
+    assert (np.diff(place[DENSE <= DURATION, 0]) > 0.0).all()
+    path = desired_path(INSIDE, of)
+    for k in (0, 1):
+        by = derivative(lambda t, k=k: desired_path(INSIDE + t, of)[k])
+        assert_close(by, path[k + 1], DIFFERENCES)
 
 
 def assert_rates(of: Scene, t: np.ndarray) -> None:
@@ -113,10 +108,10 @@ def assert_rates(of: Scene, t: np.ndarray) -> None:
 def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
     """With the elbow on the side asked for and the cart where it should be; then all is at rest."""
     of = scene(**keys)
-    motion, path = rigid_motion(DENSE, of), arc(DENSE, of.motion)
-    assert_close(end_points(motion, of), path.p, 1e-14)
+    motion, path = rigid_motion(DENSE, of), desired_path(DENSE, of)
+    assert_close(end_points(motion, of), path[0], 1e-14)
     assert (np.sign(motion.q[:, 2]) == of.motion.elbow).all()
-    for found, of_path in ((motion.q, path.p), (motion.qd, path.pd), (motion.qdd, path.pdd)):
+    for found, of_path in zip((motion.q, motion.qd, motion.qdd), path, strict=True):
         assert np.array_equal(found[:, 0], of.motion.cart_follow * of_path[:, 0])
     assert_rates(of, INSIDE)
     steps = np.abs(np.diff(motion.q, axis=0)).max(axis=0)  # no jump by 2 pi
@@ -129,12 +124,12 @@ def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
 @pytest.mark.parametrize("law", ["quintic", "septic"])
 def test_line_is_straight(law: str) -> None:
     """From start to end, by the law, all derivatives along it."""
-    motion = scene(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=law).motion
-    path = line(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), motion)
-    assert_close(path.p, [[-0.4, 0.1], [0.2, 0.35], [0.8, 0.6], [0.8, 0.6]], 1e-15)
-    path = line(INSIDE, motion)
+    of = scene(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=law)
+    path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
+    assert_close(path[0], [[-0.4, 0.1], [0.2, 0.35], [0.8, 0.6], [0.8, 0.6]], 1e-15)
+    p, pd, pdd = desired_path(INSIDE, of)
     s = quintic(INSIDE, DURATION) if law == "quintic" else septic(INSIDE, DURATION)
-    for found, expected in zip((path.p - [-0.4, 0.1], path.pd, path.pdd), s, strict=True):
+    for found, expected in zip((p - [-0.4, 0.1], pd, pdd), s, strict=True):
         assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
 
 
@@ -199,7 +194,7 @@ def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str)
         at = TIMES if path == "joints in time" else np.array(breakpoints(of)[:-1])
         assert_close(rigid_motion(at, of).q[:, -rows.shape[1] :], rows, 1e-12)
     else:
-        assert_close(end_points(motion, of), desired_path(DENSE, of.motion).p, 2e-14)
+        assert_close(end_points(motion, of), desired_path(DENSE, of)[0], 2e-14)
     if base == "fixed":
         assert (motion.q[:, 0] == 0.1).all()
         assert not motion.qd[:, 0].any()
@@ -324,7 +319,7 @@ def test_breakpoints(tmp_path: Path) -> None:
     of = of_kind(tmp_path, 2, "points", "septic", "cart")
     instants = breakpoints(of)
     assert len(instants) == len(POINTS) + 1
-    assert_close(desired_path(np.array(instants[:-1]), of.motion).p, POINTS, 1e-13)
+    assert_close(desired_path(np.array(instants[:-1]), of)[0], POINTS, 1e-13)
     x = np.linspace(-0.5, 0.5, TABLE_CORNERS_LIMIT + 3)
     file = tmp_path / "many.csv"
     file.write_text("\n".join(["x,y", *(f"{a!r},{a * a!r}" for a in x.tolist())]))
@@ -379,3 +374,42 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
     arms = (of.arms[0].model_copy(update={"name": name}), of.arms[1])
     with refused(f"'{name}'", "another name"):
         check_motion(of.model_copy(update={"arms": arms}))
+
+
+def sampled(folder: Path, count: int = 200, **keys: Any) -> Scene:
+    """Return joints that swing as 0.6 sin(2 t), a recording from the midst of the motion."""
+    t = np.linspace(0.0, 0.5, count)
+    rows = np.column_stack([t, 0.3 * t, 0.6 * np.sin(2.0 * t), 0.5 * np.cos(2.0 * t)])
+    file = folder / "cut.csv"
+    text = ["t,cart,arm0,arm1", *(",".join(map(repr, row)) for row in rows.tolist())]
+    file.write_text("\n".join(text))
+    tables = {"motion": {"path": "joints", "file": str(file), **keys}}
+    return scene_from_dict(scene(tables=tables).to_tree() | tables, "test.toml")
+
+
+@pytest.mark.parametrize("count", [4, 6, 200])
+def test_a_table_may_move_at_its_ends(tmp_path: Path, count: int) -> None:
+    """At its own rates there, and no rest is forced upon it; its horizon is its own."""
+    of = sampled(tmp_path, count, table_ends="moving")
+    assert of.motion.horizon == of.motion.duration == 0.5
+    t = np.linspace(0.0, 0.5, 41)
+    motion = rigid_motion(t, of)
+    close = 1e-7 if count == 200 else 0.2 / count
+    assert_close(motion.qd[:, 1], 1.2 * np.cos(2.0 * t), close)
+    assert_close(motion.q[:, 1], 0.6 * np.sin(2.0 * t), close)
+    assert forced_rest(of) is None
+
+
+def test_a_forced_rest_is_told(tmp_path: Path) -> None:
+    """With the acceleration that it needs, that of the rows, and the key that takes their rates."""
+    of = sampled(tmp_path)
+    motion = rigid_motion(np.linspace(0.0, 0.5, 4001), of)
+    told = forced_rest(of)
+    assert told is not None and 'motion.table_ends = "moving"' in told
+    largest = float(re.search(r"acceleration of (\S+)", told)[1])
+    assert largest == pytest.approx(np.abs(motion.qdd).max(), rel=0.02) and largest > 100.0
+    assert float(re.search(r"rows have (\S+):", told)[1]) == pytest.approx(2.0, rel=0.1)
+    calm = of_kind(tmp_path, 2, "joints in time", "quintic", "cart")
+    assert forced_rest(calm) is None
+    with refused("motion.horizon = 1", "motion.duration = 0.5", "table_ends"):
+        sampled(tmp_path, table_ends="moving", horizon=1.0)

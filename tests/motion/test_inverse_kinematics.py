@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +10,10 @@ from runs import refused, tomllib
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.multibody.inverse_kinematics import Follower, end_path, relative_vectors
-from dolfinopt.multibody.machine import end_chain, joint_motion
-from dolfinopt.multibody.motion import breakpoints
+from dolfinopt.motion.build import breakpoints, rigid_motion, target_of
+from dolfinopt.motion.poses import relative_vectors
+from dolfinopt.multibody.build import skeleton
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.scene.load import load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -35,8 +35,15 @@ def scene_of(demo, *changes):
 
 def differences(scene, t, key, h=1e-3):
     """Return the derivative of a joint motion by differences of fourth order."""
-    a, b, c, d = (getattr(joint_motion(t + k * h, scene), key) for k in (-2, -1, 1, 2))
+    a, b, c, d = (getattr(rigid_motion(t + k * h, scene), key) for k in (-2, -1, 1, 2))
     return (a - 8.0 * b + 8.0 * c - d) / (12.0 * h)
+
+
+def end_of(scene, q):
+    """Return the end-effector's place (n, 3) and rotation (n, 3, 3) for joints (n, R)."""
+    mechanism = skeleton(scene)
+    place, R = Posed(mechanism, q, np.zeros((len(q), 0))).interface(*mechanism.end)
+    return place.T, R.transpose(2, 0, 1)
 
 
 @pytest.fixture(scope="module")
@@ -50,19 +57,19 @@ def bent(tmp_path_factory):
 def test_yaw_pitch_pitch(bent):
     """Against the closed form, and rates against differences; at rest at both ends."""
     t = np.linspace(0.0, 0.6, 41)
-    q = joint_motion(t, bent).q
-    x, y, z = end_path(t, bent).p.T
+    q = rigid_motion(t, bent).q
+    x, y, z = target_of(t, bent).place[0].T
     r = np.hypot(x, y)
     elbow = -np.arccos((r**2 + z**2 - L1**2 - L2**2) / (2.0 * L1 * L2))
     shoulder = np.arctan2(z, r) - np.arctan2(L2 * np.sin(elbow), L1 + L2 * np.cos(elbow))
     assert np.abs(q - np.stack([np.arctan2(y, x), shoulder, elbow], axis=1)).max() < EXACT
     inner = np.linspace(0.01, 0.59, 23)
-    motion = joint_motion(inner, bent)
+    motion = rigid_motion(inner, bent)
     assert np.abs(differences(bent, inner, "q") - motion.qd).max() < 1e-7
     assert np.abs(differences(bent, inner, "qd") - motion.qdd).max() < 1e-6
-    ends = joint_motion(np.array([0.0, 0.6, 0.7]), bent)
+    ends = rigid_motion(np.array([0.0, 0.6, 0.7]), bent)
     assert np.abs(ends.qd).max() < EXACT and np.abs(ends.qdd[2]).max() < EXACT
-    one = joint_motion(inner[5:6], bent)
+    one = rigid_motion(inner[5:6], bent)
     assert np.abs(one.q - motion.q[5:6]).max() < 1e-14  # whichever instants are asked for
 
 
@@ -70,7 +77,7 @@ def test_other_solution_by_the_guess(bent):
     """The elbow on the other side; whole turns as near as the guess."""
     guess = "motion.initial_joints=[6.2, -0.3, 1]"
     other = scene_of(ARM, f"motion.file={bent.motion.file}", guess)
-    a, b = (joint_motion(np.array([0.3]), scene).q[0] for scene in (bent, other))
+    a, b = (rigid_motion(np.array([0.3]), scene).q[0] for scene in (bent, other))
     assert b[0] == pytest.approx(a[0] + 2.0 * np.pi, abs=EXACT)
     assert b[2] == pytest.approx(-a[2], abs=EXACT)
 
@@ -86,7 +93,7 @@ def test_line_by_a_law():
     length = np.linalg.norm([0.3, 0.4, 0.1])
     assert scene.motion.duration == pytest.approx(length / 1.0 + 1.0 / 5.0)
     t = np.linspace(0.0, scene.motion.duration, 9)
-    found = end_chain(scene).at(joint_motion(t, scene).q).place
+    found = end_of(scene, rigid_motion(t, scene).q)[0]
     along = (found - scene.motion.start) @ (np.array([-0.3, 0.4, 0.1]) / length)
     assert np.abs(np.linalg.norm(found - scene.motion.start, axis=1) - along).max() < EXACT
     assert breakpoints(scene)[1:3] == pytest.approx((0.2, scene.motion.duration - 0.2))
@@ -102,40 +109,39 @@ TURNED = np.array([0.8, 0.4, -0.5, 0.3, 0.3, -0.6])
 @pytest.mark.parametrize("kind", ["roll,pitch,yaw", "rx,ry,rz"])
 def test_six_axes(kind, tmp_path):
     """Poses of a robot with an offset wrist: forward of inverse, and the joints they were of."""
-    chain = end_chain(load_scene(ROBOT))
     t = np.linspace(0.0, 1.8, 5)
     q = JOINTS + ((t / 1.8) ** 2 * (3.0 - 2.0 * t / 1.8))[:, None] * TURNED
-    pose = chain.at(q)
-    turned = Rotation.from_matrix(pose.rotation)
+    place, R = end_of(load_scene(ROBOT), q)
+    turned = Rotation.from_matrix(R)
     rows = turned.as_euler("xyz") if kind == "roll,pitch,yaw" else turned.as_rotvec()
-    file = write(tmp_path / "poses.csv", f"t,x,y,z,{kind}", t, pose.place, rows)
+    file = write(tmp_path / "poses.csv", f"t,x,y,z,{kind}", t, place, rows)
     guess = f"motion.initial_joints={(JOINTS + 0.1).tolist()}"
     scene = scene_of(ROBOT, f"motion.file={file}", guess)
-    assert np.abs(joint_motion(t, scene).q - q).max() < EXACT
+    assert np.abs(rigid_motion(t, scene).q - q).max() < EXACT
     between = np.linspace(0.01, 1.79, 37)
-    motion, path = joint_motion(between, scene), end_path(between, scene)
-    found = chain.at(motion.q)
-    assert np.abs(found.place - path.p).max() < EXACT
-    assert np.abs(found.rotation - path.turning[0]).max() < EXACT
+    motion, target = rigid_motion(between, scene), target_of(between, scene)
+    place, R = end_of(scene, motion.q)
+    assert np.abs(place - target.place[0]).max() < EXACT
+    assert np.abs(R - target.turning[0]).max() < EXACT
     assert np.abs(differences(scene, between, "q") - motion.qd).max() < 1e-8
     assert np.abs(differences(scene, between, "qd") - motion.qdd).max() < 1e-7
 
 
 def test_turn_on_the_spot(tmp_path):
     """From stop to stop by a law with limits, which are of the speed along the path: not here."""
-    pose = end_chain(load_scene(ROBOT)).at(JOINTS[None])
-    start = Rotation.from_matrix(pose.rotation)
+    place, R = end_of(load_scene(ROBOT), JOINTS[None])
+    start = Rotation.from_matrix(R)
     turned = Rotation.from_rotvec([0.0, 0.0, 0.4]) * start
     rows = np.vstack([start.as_rotvec(), turned.as_rotvec()])
-    table = "t,x,y,z,rx,ry,rz", [0.0, 0.5], np.vstack([pose.place] * 2), rows
+    table = "t,x,y,z,rx,ry,rz", [0.0, 0.5], np.vstack([place] * 2), rows
     file = write(tmp_path / "turn.csv", *table)
     law = "motion.law=s-curve", "motion.max_speed=0.5", "motion.max_jerk=50.0"
     guess = f"motion.initial_joints={JOINTS.tolist()}"
     scene = scene_of(ROBOT, f"motion.file={file}", guess, "motion.horizon=0.5", *law)
     t = np.linspace(0.0, 0.5, 6)
-    found = end_chain(scene).at(joint_motion(t, scene).q)
-    assert np.abs(found.place - pose.place).max() < EXACT
-    back = Rotation.from_matrix(found.rotation) * start.inv()
+    found, turned = end_of(scene, rigid_motion(t, scene).q)
+    assert np.abs(found - place).max() < EXACT
+    back = Rotation.from_matrix(turned) * start.inv()
     assert np.abs(back.as_rotvec()[:, :2]).max() < EXACT
     assert back.as_rotvec()[-1, 2] == pytest.approx(0.4, abs=EXACT)
 
@@ -151,13 +157,13 @@ def test_joints_of_the_table(tmp_path):
     free = write(tmp_path / "b.csv", "t,x,y,z", [0.0, 0.2, 0.4], points)
     other = scene_of(ARM, f"motion.file={free}", end, "motion.initial_joints=[0, 0.8, -1]")
     t = np.linspace(0.0, 0.4, 11)
-    a, b = (joint_motion(t, one) for one in (scene, other))
+    a, b = (rigid_motion(t, one) for one in (scene, other))
     for key in ("q", "qd", "qdd"):
         assert getattr(a, key) == pytest.approx(getattr(b, key), abs=EXACT)
     # With another yaw the point leaves the plane of the two.
     write(tmp_path / "a.csv", "t,x,y,z,yaw", [0.0, 0.2, 0.4], points, [0.3, 0.4, 0.3])
     with refused("(shoulder, elbow)", "m off at best"):
-        joint_motion(t, scene)
+        rigid_motion(t, scene)
 
 
 def test_rotation_vectors_go_on():
@@ -168,16 +174,6 @@ def test_rotation_vectors_go_on():
     )
     R = turns.as_matrix()
     assert np.abs(relative_vectors(R) - angles[:, None] * [0.0, 0.6, 0.8]).max() < 1e-12
-
-
-def test_a_slide_is_no_angle_where_the_reach_is_one_metre():
-    """Its unit is the reach then as that of an angle is 1 rad, and whole turns mean nothing."""
-    kinds = ("revolute", "prismatic")
-    joints = tuple(SimpleNamespace(coordinate=k, kind=kind) for k, kind in enumerate(kinds))
-    chain = SimpleNamespace(reach=1.0, joints=joints, coordinates=(0, 1))
-    follower = Follower(None, chain, np.arange(2), np.zeros(0, dtype=int))
-    assert follower._units.tolist() == [1.0, 1.0]
-    assert follower._slides.tolist() == [False, True]
 
 
 UP = [[0.6, 0, 0.2], [0.5, 0, 0.2]]

@@ -1,0 +1,301 @@
+"""Paths of the plane, and the coordinates of a chain of arms that follow them in closed form.
+
+Of two and more arms all elbows bend by the same angle; one arm follows the path's height, and its
+cart the rest. Plane vectors are complex numbers, v = v_x + i v_y, where arms are turned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from dolfinopt.errors import InputError
+from dolfinopt.motion.curves import Derivatives, Words, inverse
+from dolfinopt.motion.measured import SINGULAR_DISTANCE_SHARE
+from dolfinopt.paths import Law, Values
+
+# -- paths: points (n, 2) and two time derivatives -------------------------------------------
+
+
+def arc(values: Values, radius: float, flattening: float) -> Derivatives:
+    """Return the flattened semicircle about the origin, from (-r, 0) over the top to (r, 0).
+
+    p = r (cos phi, flattening sin phi), phi = pi (1 - s).
+
+    Args:
+        values: s (n,) from 0 to 1, and two time derivatives.
+        radius: r, m.
+        flattening: see above.
+    """
+    s, sd, sdd = values
+    phi, phid, phidd = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
+    c, z = np.cos(phi), np.sin(phi)
+    scale = radius * np.array([1.0, flattening])
+    p = np.stack([c, z], axis=1)
+    tangent = np.stack([-z, c], axis=1)
+    pd = tangent * phid[:, None]
+    pdd = tangent * phidd[:, None] - p * (phid**2)[:, None]
+    return scale * p, scale * pd, scale * pdd
+
+
+def line(values: Values, start: np.ndarray, end: np.ndarray) -> Derivatives:
+    """Return the straight line p = start + s (end - start), s and derivatives (n,)."""
+    s, sd, sdd = (value[:, None] for value in values)
+    return start + s * (end - start), sd * (end - start), sdd * (end - start)
+
+
+@lru_cache(maxsize=1)
+def _gauss() -> tuple[np.ndarray, np.ndarray]:
+    x, w = np.polynomial.legendre.leggauss(8)  # exact to degree 15, more than any law has
+    return x, w
+
+
+def rotation(
+    t: np.ndarray, law: Law, speed: float, start_angle: float, duration: float
+) -> Derivatives:
+    """Return the angle of a joint that runs up to constant speed, and two derivatives (n,).
+
+    The law is that of the speed: speed s(t / duration); for the quintic the angle is
+    start + speed duration (2.5 u^4 - 3 u^5 + u^6).
+
+    Args:
+        t: (n,) instants, s.
+        law: time law.
+        speed: rad/s.
+        start_angle: rad.
+        duration: of the run-up, s.
+    """
+    s, sd, _ = law(t, duration)
+    x, w = _gauss()
+    knots = np.unique(np.concatenate([[0.0], law.knots, [1.0]])) * duration
+    angle = np.maximum(t - duration, 0.0)  # the speed is 1 from there on
+    for first, last in pairwise(knots):
+        length = np.clip(t - first, 0.0, last - first)
+        nodes = first + 0.5 * length[:, None] * (x + 1.0)
+        angle = angle + 0.5 * length * (law(nodes.ravel(), duration)[0].reshape(nodes.shape) @ w)
+    return start_angle + speed * angle, speed * s, speed * sd
+
+
+# -- chains ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A chain of two and more arms whose elbows all bend by the same angle beta.
+
+    z(beta) = sum_k L_k exp(i k beta) is its end, seen from the first arm; the distance |z| falls
+    from the stretched chain, beta = 0, to the first angle where it is least. Its square is a
+    polynomial in u = cos(beta), sum_m c_m T_m(u) in Chebyshev's, c_0 = sum_k L_k^2,
+    c_m = 2 sum_k L_k L_{k+m}; for two arms this is the cosine rule.
+    """
+
+    lengths: tuple[float, ...]
+
+    @cached_property
+    def series(self) -> np.ndarray:
+        """Coefficients c of |z|^2 (arms,), m2."""
+        products = np.correlate(self.lengths, self.lengths, mode="full")[len(self.lengths) - 1 :]
+        return np.append(products[:1], 2.0 * products[1:])
+
+    @cached_property
+    def least(self) -> float:
+        """Cosine of the angle at the end of the range, -1 for two arms."""
+        roots = chebyshev.chebroots(chebyshev.chebder(self.series))
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (np.abs(roots.real) < 1.0)]
+        return float(real.max(initial=-1.0))
+
+    @cached_property
+    def reach(self) -> tuple[float, float]:
+        """Least and largest distance |z|, m."""
+        if len(self.lengths) == 2:
+            return abs(self.lengths[0] - self.lengths[1]), sum(self.lengths)
+        return float(np.sqrt(np.maximum(self.square(np.array(self.least)), 0.0))), sum(self.lengths)
+
+    def square(self, u: np.ndarray) -> np.ndarray:
+        """Return |z|^2 by the cosine of beta."""
+        return chebyshev.chebval(u, self.series)
+
+    @cached_property
+    def _guess(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ascending |z|^2 and the cosines there, dense towards both ends."""
+        u = self.least + (1.0 - self.least) * np.sin(np.linspace(0.0, np.pi / 2.0, 101)) ** 2
+        return self.square(u), u
+
+    def cosine(self, square: np.ndarray) -> np.ndarray:
+        """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding."""
+        if len(self.lengths) == 2:
+            return (square - self.series[0]) / self.series[1]
+        slopes = chebyshev.chebder(self.series)
+
+        def squares(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return self.square(u), chebyshev.chebval(u, slopes)
+
+        rounding = float(4.0 * np.finfo(float).eps * self.reach[1] ** 2)
+        guess = np.interp(square, *self._guess)
+        return inverse(squares, square, guess, (self.least, 1.0), rounding)
+
+    def lever(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return z and its two derivatives by beta (n,), complex."""
+        order = np.arange(len(self.lengths))
+        turned = np.exp(1j * np.outer(beta, order)) * self.lengths
+        return turned.sum(axis=1), turned @ (1j * order), turned @ (-1.0 * order**2)
+
+
+@lru_cache(maxsize=64)
+def bend_of(lengths: tuple[float, ...]) -> Bend:
+    """Return the chain of these arms, m."""
+    return Bend(lengths)
+
+
+def chain_on(
+    t: np.ndarray, path: Derivatives, base: Derivatives, bend: Bend, elbow: int, words: Words
+) -> Derivatives:
+    """Return cart and joints (n, 1 + arms) of two and more arms, the first angle up to turns.
+
+    Args:
+        t: (n,) instants, s, for messages.
+        path: of the end (n, 2).
+        base: x and y of the first joint (n, 2).
+        bend: the chain.
+        elbow: sign of the elbows' angle.
+        words: for messages.
+
+    Raises:
+        InputError: the path leaves the reach or passes a singular position.
+    """
+    # With r the end-effector from the shoulder, r = exp(i alpha) z(beta); velocities and
+    # accelerations from its derivatives, two real equations each for the rates of alpha and beta.
+    r, rd, rdd = ((p - b) @ [1.0, 1j] for p, b in zip(path, base, strict=True))
+    distance = np.abs(r)
+    _check_distance(t, distance, bend, words)
+    beta = elbow * np.arccos(bend.cosine(distance**2))
+    z, z_b, z_bb = bend.lever(beta)
+    alpha = np.angle(r) - np.angle(z)
+    singular = (np.conj(z) * z_b).real  # zero where the distance does not change with beta
+
+    def rates(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Solve i z a + z_b b = v for real a, b by Cramer's rule."""
+        return (np.conj(z_b) * v).imag / singular, (np.conj(z) * v).real / singular
+
+    back = np.exp(-1j * alpha)
+    alpha_d, beta_d = rates(back * rd)
+    turning = -(alpha_d**2) * z + 2j * alpha_d * beta_d * z_b + beta_d**2 * z_bb
+    alpha_dd, beta_dd = rates(back * rdd - turning)
+    elbows = len(bend.lengths) - 1
+    angles = (alpha, beta), (alpha_d, beta_d), (alpha_dd, beta_dd)
+    q, qd, qdd = (
+        np.column_stack([x[:, 0], a, *(elbows * [b])])
+        for x, (a, b) in zip(base, angles, strict=True)
+    )
+    return q, qd, qdd
+
+
+def one_arm_on(
+    t: np.ndarray, path: Derivatives, length: float, height: float, elbow: int, words: Words
+) -> Derivatives:
+    """Return cart and joint (n, 2) of one arm: L sin(alpha) is the path's height over the joint's.
+
+    The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
+
+    Raises:
+        InputError: the path is higher or lower than the arm reaches.
+    """
+    p, pd, pdd = path
+    above = p[:, 1] - height
+    _check_height(t, above, length, words)
+    lean = np.arcsin(above / length)
+    alpha = lean if elbow == 1 else np.pi - lean
+    c, z = length * np.cos(alpha), length * np.sin(alpha)
+    alpha_d = pd[:, 1] / c
+    alpha_dd = (pdd[:, 1] + z * alpha_d**2) / c
+    return (
+        np.column_stack([p[:, 0] - c, alpha]),
+        np.column_stack([pd[:, 0] + z * alpha_d, alpha_d]),
+        np.column_stack([pdd[:, 0] + z * alpha_dd + c * alpha_d**2, alpha_dd]),
+    )
+
+
+def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, words: Words) -> None:
+    """Raise when the shoulder's distance to the path leaves the reach of the arms."""
+    margin = SINGULAR_DISTANCE_SHARE * max(bend.lengths)
+    near, far = bend.reach
+    if len(distance) == 0 or (distance.min() >= near + margin and distance.max() <= far - margin):
+        return
+    for right, limit, word in (
+        (distance <= far - margin, far, "stretched or out of reach"),
+        (distance >= near + margin, near, "folded or too near"),
+    ):
+        if not right.all():  # not a number, from an overflow, is not right
+            wrong = np.flatnonzero(~right)
+            worst = wrong[np.argmax(np.abs(distance[wrong] - limit))]
+            arms = " and ".join(", ".join(f"{a:g} m" for a in bend.lengths).rsplit(", ", 1))
+            bent = ", all elbows bent alike," if len(bend.lengths) > 2 else ""
+            raise InputError(
+                f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
+                f"{distance[worst]:.6g} m from the shoulder, {word}: arms of {arms}{bent} need a "
+                f"distance between {near:g} m and {far:g} m; change {words.motion}"
+            )
+
+
+def _check_height(t: np.ndarray, height: np.ndarray, length: float, words: Words) -> None:
+    """Raise when the path is higher or lower than one arm reaches."""
+    wrong = np.flatnonzero(~(np.abs(height) <= (1.0 - SINGULAR_DISTANCE_SHARE) * length))
+    if wrong.size:
+        worst = wrong[np.argmax(np.abs(height[wrong]))]
+        side = "below" if height[worst] < 0.0 else "above"
+        raise InputError(
+            f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
+            f"{abs(height[worst]):.6g} m {side} the shoulder, upright or out of reach: one arm of "
+            f"{length:g} m needs less than {length:g} m; change {words.motion}"
+        )
+
+
+@dataclass(frozen=True)
+class Tied:
+    """What holds the end of the last arm in the plane.
+
+    Attributes:
+        point: of a line, or a pin, m.
+        direction: of the line; None of a pin.
+        side: sign of the last joint's angle at the start.
+    """
+
+    point: complex
+    direction: complex | None
+    side: int
+
+
+def branch_guess(joints: np.ndarray, lengths: np.ndarray, base: complex, tie: Tied) -> np.ndarray:
+    """Return joint angles (arms,) near those that close a loop at its start, by `side`.
+
+    Of a loop that does not close the nearest ones.
+
+    Args:
+        joints: angles of the first arms, which are given, rad.
+        lengths: of all arms, m.
+        base: place of the first joint, m.
+        tie: what holds the last arm's end.
+    """
+    angles = np.cumsum(joints)
+    own = lengths[: len(joints)]
+    away = tie.point - base - (own * np.exp(1j * angles)).sum()
+    before = float(angles[-1])
+    if tie.direction is None:
+        a, b = lengths[-2:]
+        cosine = (abs(away) ** 2 - a * a - b * b) / (2.0 * a * b)
+        beta = tie.side * np.arccos(np.clip(cosine, -1.0, 1.0))
+        first = np.angle(away) - np.angle(a + b * np.exp(1j * beta))
+        return np.append(joints, [first - before, beta])
+    along = float(np.angle(tie.direction))
+    height = (np.conj(1j * np.exp(1j * along)) * away).real
+    lean = float(np.arcsin(np.clip(height / lengths[-1], -1.0, 1.0)))
+    choices = np.array([along + lean - before, along + np.pi - lean - before])
+    wrapped = np.angle(np.exp(1j * choices))
+    right = (np.sign(wrapped) == tie.side) | (np.abs(wrapped) < 1e-9)
+    # Where the sign does not tell, the stretched way.
+    chosen = int(np.argmax(right)) if right.sum() == 1 else int(np.argmin(np.abs(wrapped)))
+    return np.append(joints, wrapped[chosen])

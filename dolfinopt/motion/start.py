@@ -1,0 +1,231 @@
+"""The joints at t = 0: least squares from a guess, and whether the right joints are passive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from dolfinopt.errors import InputError
+from dolfinopt.motion.constraints import Target
+from dolfinopt.motion.counts import Counts, counts_of
+from dolfinopt.motion.measured import (
+    FITS_SHARE,
+    MISFIT_FACTOR,
+    REACHED_SHARE,
+    SINGULAR_SHARE,
+    START_GUESSES,
+)
+from dolfinopt.motion.task import Task, widest
+from dolfinopt.multibody.closures import Distance
+from dolfinopt.multibody.measured import RANK_SHARE
+from dolfinopt.multibody.ranks import rank
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where the motion begins.
+
+    Attributes:
+        q: (R,) closed pose at t = 0.
+        usual: (R,) a closed pose nearby that is not singular, unless all are.
+        counts: of the closures there.
+        misfit: by which links leave the closures open at best, m; 0 by rounding.
+    """
+
+    q: np.ndarray
+    usual: np.ndarray
+    counts: Counts
+    misfit: float
+
+    def tolerance(self, reach: float) -> float:
+        """Return the distance up to which a pose counts as reached, m."""
+        return REACHED_SHARE * reach + MISFIT_FACTOR * self.misfit
+
+
+def nearest(
+    task: Task, q: np.ndarray, target: Target, free: np.ndarray, rows: slice = slice(None)
+) -> tuple[np.ndarray, float]:
+    """Return the pose (R,) near q where some equations fit best, and how far off they are, m.
+
+    Args:
+        task: equations.
+        q: (R,).
+        target: at one instant.
+        free: coordinates that move.
+        rows: equations that count.
+    """
+    constraints, turned = task.constraints, target.turning is not None
+    units = constraints.units[free]
+
+    def pose(x: np.ndarray) -> np.ndarray:
+        out = q[None].copy()
+        out[0, free] += x * units
+        return out
+
+    def padded(x: np.ndarray) -> np.ndarray:  # as many equations as unknowns, for MINPACK
+        return np.pad(x, [(0, max(len(free) - len(x), 0)), *[(0, 0)] * (x.ndim - 1)])
+
+    def error(x: np.ndarray) -> np.ndarray:
+        return padded(-constraints.error(pose(x), target)[0, rows] / constraints.reach)
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        return padded(constraints.at(pose(x)).rows(turned)[0, rows][:, free])
+
+    if len(free) == 0:
+        off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
+        return q, float(off)
+    accuracy = np.finfo(float).eps
+    found = least_squares(
+        error,
+        np.zeros(len(free)),
+        jacobian,
+        method="lm",
+        xtol=accuracy,
+        ftol=accuracy,
+        gtol=accuracy,
+    )
+    return pose(found.x)[0], float(np.linalg.norm(found.fun)) * constraints.reach
+
+
+def start_of(task: Task) -> Start:
+    """Return the start near the guess.
+
+    Raises:
+        InputError: the number of passive joints is wrong, or no pose reaches the path's start.
+    """
+    target = task.target(np.zeros(1))
+    q, off = _nearest_of_many(task, target)
+    usual, counts, misfit = _usual(task, q, target)
+    _check(task, counts)
+    start, reach = Start(q, usual, counts, misfit), task.constraints.reach
+    if off > start.tolerance(reach):
+        raise unreached(task, 0.0, q, target)
+    _check_path(task, usual, target)
+    return start
+
+
+def _nearest_of_many(task: Task, target: Target) -> tuple[np.ndarray, float]:
+    """Return the pose near the guess that is reached first, and how far off it is, m."""
+    guess = task.with_given(_with_lengths(task)[None], target)[0]
+    random, best, least = np.random.default_rng(0), guess, np.inf
+    units = task.constraints.units[task.unknown]
+    for k in range(START_GUESSES):
+        shifted = guess.copy()
+        away = random.uniform(-task.width, task.width, len(task.unknown))
+        shifted[task.unknown] += (k > 0) * away * units
+        q, off = nearest(task, shifted, target, task.unknown)
+        if off < least:
+            best, least = q, off
+        if least <= REACHED_SHARE * task.constraints.reach:
+            break
+    turning = task.unknown[~task.constraints.slides[task.unknown]]
+    best[turning] -= 2.0 * np.pi * np.round((best[turning] - guess[turning]) / (2.0 * np.pi))
+    return best, least
+
+
+def _with_lengths(task: Task) -> np.ndarray:
+    """Return the guess with rods as long as its joints have them."""
+    guess, loops = task.guess.copy(), task.constraints.loops
+    gaps = task.constraints.at(guess[None]).closed.gap[0]
+    for gap, one in zip(gaps, loops.equations, strict=True):
+        if isinstance(one, Distance) and one.coordinate is not None:
+            guess[one.coordinate] += gap
+    return guess
+
+
+def _usual(task: Task, q: np.ndarray, target: Target) -> tuple[np.ndarray, Counts, float]:
+    """Return a closed pose that is not singular, the counts there, and the links' misfit, m.
+
+    A special pose would miscount, and so would an open one: the start is moved along the closures,
+    with all coordinates free, whatever drives ask for.
+    """
+    constraints, turned = task.constraints, target.turning is not None
+    free, k = np.union1d(task.passive, task.driven), constraints.loops.count
+    closing = slice(0, k)
+    pose, misfit = nearest(task, q, target, free, closing)
+    if misfit > FITS_SHARE * constraints.reach:
+        raise unreached(task, 0.0, pose, target)
+
+    def rows(q: np.ndarray) -> np.ndarray:
+        return constraints.at(q[None]).rows(turned)[0]
+
+    share = max(RANK_SHARE, MISFIT_FACTOR * misfit / constraints.reach)
+    G = rows(pose)[closing, free]
+    moves = np.linalg.svd(G)[2][rank(G, max(share, SINGULAR_SHARE)) :]
+    random, usual, largest = np.random.default_rng(1), pose, -1.0
+    for size in (0.5, 0.2, 0.1, 0.03):
+        moved = pose.copy()
+        moved[free] += size * constraints.units[free] * (random.uniform(-1, 1, len(moves)) @ moves)
+        other, off = nearest(task, moved, target, free, closing)
+        at = rows(other)
+        least = min(_least(at[closing][:, task.passive]), _least(at[:, task.unknown]))
+        if off < 2.0 * misfit + REACHED_SHARE * constraints.reach and least > largest:
+            usual, largest = other, least
+    counts = counts_of(rows(usual)[closing], task.passive, task.driven, share)
+    fits = not counts.redundant or misfit <= REACHED_SHARE * constraints.reach
+    return usual, counts, 0.0 if fits else misfit
+
+
+def _least(G: np.ndarray) -> float:
+    return float(np.linalg.svd(G, compute_uv=False).min(initial=1.0))
+
+
+# -- what is refused -------------------------------------------------------------------------
+
+
+def _check(task: Task, counts: Counts) -> None:
+    """Raise where the number of passive joints is wrong; the one check of all paths."""
+    ties = ", ".join(tie.name for tie in task.constraints.loops.ties)
+    where = f"{task.words.source}: closures ({ties})"
+    if counts.missing:
+        raise InputError(
+            f"{where}: they hold {counts.missing} of the driven coordinates: give "
+            f"{counts.missing} more of the joints passive = true, among "
+            f"{task.called(counts.held)}, or leave out a closure"
+        )
+    if counts.loose:
+        raise InputError(
+            f"{where}: they leave {counts.loose} of the passive joints undetermined: drive "
+            f"{counts.loose} of {task.called(counts.undetermined)}, without passive = true, or "
+            "take another kind of closure"
+        )
+
+
+def _check_path(task: Task, usual: np.ndarray, target: Target) -> None:
+    """Raise where path and closures do not determine the unknowns even at usual poses."""
+    G = task.constraints.at(usual[None]).rows(target.turning is not None)[0, :, task.unknown].T
+    if (found := rank(G)) < len(task.unknown):
+        null = np.abs(np.linalg.svd(G)[2][found:]).max(axis=0)
+        idle = task.called(task.unknown[null > SINGULAR_SHARE])
+        raise InputError(
+            f"{task.words.source}: motion: path and closures leave {len(task.unknown) - found} of "
+            f"the joints undetermined ({idle}); prescribe one of them by a column of the table"
+        )
+
+
+def unreached(task: Task, t: float, q: np.ndarray, target: Target) -> InputError:
+    """Return which closure stays open, or how far the end-effector is off, at pose q (R,)."""
+    error, words = task.constraints.error(q[None], target)[0], task.words
+    reach, k = task.constraints.reach, task.constraints.loops.count
+    joints, start = task.called(task.unknown), f"{words.start}, " if t == 0.0 else ""
+    if k and np.abs(error[:k]).max() > 0.1 * np.abs(error).max():
+        name, far = widest(task, error)
+        return InputError(
+            f"{words.source}: closures: at t = {t:.4g} s the loop of {name} cannot be closed: the "
+            f"joints that follow ({joints}) leave it open by {far:.4g} m at best; change "
+            f"{start}its point, the arms' lengths, or {words.motion}"
+        )
+    own = error[k:]
+    d = target.place[0].shape[1]
+    place = ", ".join(f"{x:.6g}" for x in target.place[0][0])
+    off, turned = f"{np.linalg.norm(own[:d]):.4g} m", ""
+    if len(own) > d:
+        turned = " turned as it is to be"
+        off += f" and {np.linalg.norm(own[d:]) / reach:.4g} rad"
+    return InputError(
+        f"{words.source}: motion: at t = {t:.4g} s the end-effector cannot be at ({place}) m"
+        f"{turned}: the joints that follow the path ({joints}) leave it {off} off at best; change "
+        f"{start}{words.motion}"
+    )

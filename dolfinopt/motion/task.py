@@ -1,0 +1,113 @@
+"""Which coordinates of rigid links follow from which, and Newton's method for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.motion.constraints import Constraints, Target
+from dolfinopt.motion.curves import Words
+from dolfinopt.multibody.ranks import least_norm
+
+NEWTON_STEPS = 5  # from samples that are right to 1e-5, three leave rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Coordinates `unknown` that keep constraints while `given` ones move as prescribed.
+
+    Attributes:
+        constraints: equations.
+        names: of all R coordinates.
+        unknown, given: their places.
+        passive: those without a drive: the closures alone must determine them.
+        target: of instants (n,), s, what is prescribed.
+        guess: (R,) near the start.
+        width: of random starts around it, rad or the reach.
+        end: of the motion, s.
+        resolution: number of instants that resolve what is prescribed.
+        words: for messages.
+    """
+
+    constraints: Constraints
+    names: tuple[str, ...]
+    unknown: np.ndarray
+    given: np.ndarray
+    passive: np.ndarray
+    target: Callable[[np.ndarray], Target]
+    guess: np.ndarray
+    width: float
+    end: float
+    resolution: int
+    words: Words
+
+    @property
+    def driven(self) -> np.ndarray:
+        """Places of the coordinates that move and are not passive."""
+        moving = np.union1d(self.unknown, self.given)
+        return np.setdiff1d(moving, self.passive)
+
+    def called(self, places: Iterable[int]) -> str:
+        """Return names of coordinates."""
+        return ", ".join(self.names[k] for k in places)
+
+    def with_given(self, q: np.ndarray, target: Target) -> np.ndarray:
+        """Return poses (n, R) whose given coordinates are as prescribed."""
+        out = q.copy()
+        out[:, self.given] = target.joints[0]
+        return out
+
+    def newton(
+        self, q: np.ndarray, target: Target, enough: float = 1e-9
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return poses (n, R) by Newton's method, the last steps (n, u) and G (n, k, R) before.
+
+        Steps are least squares where there are more equations than unknowns: what they leave is
+        the misfit of the links.
+
+        Raises:
+            numpy.linalg.LinAlgError: a singular pose.
+        """
+        units, before = self.constraints.units[self.unknown], np.inf
+        turned, reach = target.turning is not None, self.constraints.reach
+        for _ in range(NEWTON_STEPS):
+            here = self.constraints.at(q)
+            G = here.rows(turned)
+            step = least_norm(G[:, :, self.unknown], here.error(target) / reach)
+            q = q.copy()
+            q[:, self.unknown] += step * units
+            size = float(np.abs(step).max(initial=0.0))
+            if size < enough or size > 10.0 * before:
+                break
+            before = size
+        return q, step, G
+
+    def rates(self, q: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:
+        """Return rates and accelerations (n, R) of poses on the path, exact to rounding."""
+        here, turned = self.constraints.at(q), target.turning is not None
+        G = here.rows(turned)
+        qd = self.velocity(G, target)
+        right = self.constraints.right(target, 2) - here.acceleration(qd, turned)
+        return qd, self._solved(G, target.joints[2], right)
+
+    def velocity(self, G: np.ndarray, target: Target) -> np.ndarray:
+        """Return the rates (n, R) by G (n, k, R)."""
+        return self._solved(G, target.joints[1], self.constraints.right(target, 1))
+
+    def _solved(self, G: np.ndarray, known: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """Return x (n, R) with G x = right (n, k), in m, and its given entries (n, g)."""
+        units, found = self.constraints.units, np.zeros((len(G), len(self.names)))
+        found[:, self.given] = known
+        left = right / self.constraints.reach - np.einsum("nkr,nr->nk", G, found / units)
+        found[:, self.unknown] = least_norm(G[:, :, self.unknown], left) * units[self.unknown]
+        return found
+
+
+def widest(task: Task, error: np.ndarray) -> tuple[str, float]:
+    """Return the closure that equations' errors (k,) leave farthest open, and by how much, m."""
+    loops = task.constraints.loops
+    sizes = loops.by_tie(error[: loops.count])
+    worst = int(np.argmax(sizes))
+    return loops.ties[worst].name, sizes[worst]

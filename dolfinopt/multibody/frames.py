@@ -1,0 +1,484 @@
+"""From a body to those that hang on it: interfaces, joints and the rotors that drive them.
+
+Motions and loads as in `body`. What carries a motion outwards carries the derivatives of a
+function inwards by its transpose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from dolfinopt.multibody.body import BodyMotion, Load, Motion
+from dolfinopt.multibody.dimension import (
+    DIMENSIONS,
+    Dimension,
+    PlaneTurning,
+    Turning,
+    product,
+    transposed_product,
+)
+from dolfinopt.multibody.tree import Joint
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTransform:
+    """Derivative of one frame's motion by that of the one that carries it, at n instants.
+
+    Its blocks are (., ., n), or some of them (., .) alike at all instants; None: zero.
+
+    Attributes:
+        dim: plane or space.
+        turn: the rotation into the components of the one carried.
+        by_w, by_wd: of its acceleration (d, r, n).
+        turned: of its angular acceleration by w (r, r, n).
+    """
+
+    dim: Dimension
+    turn: np.ndarray
+    by_w: np.ndarray | None
+    by_wd: np.ndarray | None
+    turned: np.ndarray | None = None
+
+    @cached_property
+    def matrix(self) -> np.ndarray:
+        """It as matrices (n, d + 2 r, d + 2 r), or one."""
+        d, r = self.dim.d, self.dim.r
+        some = self.turn, self.by_w, self.by_wd, self.turned
+        counts = {x.shape[2] for x in some if x is not None and x.ndim == 3}
+        out = np.zeros((max(counts, default=1), d + 2 * r, d + 2 * r))
+        a, w, wd = slice(0, d), slice(d, d + r), slice(d + r, d + 2 * r)
+        rotated = self.turn if r == d else np.ones((1, 1))
+        blocks = (a, a, self.turn), (w, w, rotated), (wd, wd, rotated), (wd, w, self.turned)
+        for rows, columns, block in (*blocks, (a, w, self.by_w), (a, wd, self.by_wd)):
+            if block is not None:
+                out[:, rows, columns] = block if block.ndim == 2 else block.transpose(2, 0, 1)
+        return out
+
+    @cached_property
+    def of_loads(self) -> np.ndarray:
+        """What carries a load on the one frame to the origin of the other (n, d + r, d + r)."""
+        # Forces and moments work on displacements and rotations as a and wd go.
+        d, r = self.dim.d, self.dim.r
+        kept = np.r_[0:d, d + r : d + 2 * r]
+        return self.matrix[:, kept[:, None], kept].swapaxes(1, 2)
+
+    def transposed(self, by: Motion) -> Motion:
+        """Return derivatives by the carrying frame's motion from those by the carried one's."""
+        a, w, wd = by
+        back = self.turn.swapaxes(0, 1)
+        to = product(back, a), self.dim.rotated(back, w), self.dim.rotated(back, wd)
+        extra = (1, self.by_w, a), (2, self.by_wd, a), (1, self.turned, wd)
+        found = list(to)
+        for place, block, x in extra:
+            if block is not None:
+                found[place] = found[place] + transposed_product(block, x)
+        return found[0], found[1], found[2]
+
+
+class Interface:
+    """An outboard interface of a body, displaced by u and turned by theta: a body's conjugates.
+
+    Attributes:
+        body: as it moves.
+        number: which of its interfaces.
+        place: reference point from the body's origin (d, n), m.
+    """
+
+    def __init__(self, body: BodyMotion, number: int = 0) -> None:
+        """Take the body, and which of its interfaces it is."""
+        self.body, self.number, self.dim = body, number, body.dim
+        self.places = body.constants.outboard(number)
+        point = body.constants.points[number][:, None]
+        if body.is_flexible:
+            self.u = body.conjugates[self.places][: self.dim.d]
+            self.place = point + self.u[:, 0]
+        else:
+            self.place = np.broadcast_to(point, body.a.shape)
+
+    @cached_property
+    def turning(self) -> Turning:
+        """Its rotation against the body's frame."""
+        theta = self.body.conjugates[self.places][self.dim.d :]
+        return self.body.constants.turning(theta[:, 0], theta[:, 1], theta[:, 2])
+
+    @cached_property
+    def _unturned(self) -> Motion:
+        """Its motion in the body's components."""
+        body, dim = self.body, self.dim
+        a = body.a + dim.apply(body.alpha, self.place)
+        if not body.is_flexible:
+            return a, body.w, body.wd
+        turning = self.turning
+        a += dim.apply(body.beta, self.u[:, 1]) + self.u[:, 2]
+        wd = body.wd + turning.acceleration
+        if dim.r > 1:
+            wd = wd + dim.commutator(body.w, turning.velocity)
+        return a, body.w + turning.velocity, wd
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Its motion in its own components."""
+        if not self.body.is_flexible:
+            return self._unturned
+        a, w, wd = self._unturned
+        back = self.turning.R.swapaxes(0, 1)
+        return product(back, a), self.dim.rotated(back, w), self.dim.rotated(back, wd)
+
+    def in_body(self, load: Load) -> Load:
+        """Return a load on the interface, in its components, in those of the body."""
+        if not self.body.is_flexible:
+            return load
+        R = self.turning.R
+        return product(R, load[0]), self.dim.rotated(R, load[1])
+
+    def at_origin(self, load: Load) -> Load:
+        """Return a load on the interface, in the body's components, about the body's origin."""
+        return load[0], load[1] + self.dim.moment(self.place, load[0])
+
+    def load_coefficients(self, load: Load) -> np.ndarray:
+        """Return what works on (u, theta) (b, n): force and J' moment, of `in_body`."""
+        return np.concatenate([load[0], self.turning.jacobian_transposed(load[1])])
+
+    def virtual(self, body: Load, zeta: np.ndarray) -> Load:
+        """Return its virtual displacement and rotation, the body's components.
+
+        Args:
+            body: those of the body's frame.
+            zeta: (q, n) virtual coordinates.
+        """
+        p, phi = body
+        p = p + self.dim.velocity(phi, self.place)
+        if not self.body.is_flexible:
+            return p, phi
+        moved = np.einsum("pkn,kn->pn", self.body.V[self.places], zeta)
+        return p + moved[: self.dim.d], phi + self.turning.jacobian_times(moved[self.dim.d :])
+
+    def in_interface(self, load: Load) -> Load:
+        """Return vectors of the body's components in those of the interface."""
+        if not self.body.is_flexible:
+            return load
+        back = self.turning.R.swapaxes(0, 1)
+        return product(back, load[0]), self.dim.rotated(back, load[1])
+
+    # -- derivatives: arrays (d + 2 r, ..., n) of motions, (d + r, ..., n) of loads -----------
+
+    @cached_property
+    def _by_spin(self) -> np.ndarray:
+        """Derivative of the acceleration by the body's angular velocity (d, r, n)."""
+        body, dim = self.body, self.dim
+        out = dim.centripetal_by_spin(body.w, self.place)
+        return out + 2.0 * dim.by_spin(self.u[:, 1]) if body.is_flexible else out
+
+    @cached_property
+    def passage(self) -> MotionTransform:
+        """From the body's motion to its own, in its own components."""
+        dim, by_w, by_wd = self.dim, self._by_spin, self.dim.by_spin(self.place)
+        if not self.body.is_flexible:
+            return MotionTransform(dim, np.eye(dim.d), by_w, by_wd)
+        back, turned = self.turning.R.swapaxes(0, 1), None
+        if dim.r > 1:
+            turned = -product(back, dim.skew(self.turning.velocity))
+        return MotionTransform(dim, back, product(back, by_w), product(back, by_wd), turned)
+
+    @cached_property
+    def _by_theta(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Derivatives of w and wd by theta, and of wd by theta'; None: zero, in the plane."""
+        turning, w, dim = self.turning, self.body.w, self.dim
+        if isinstance(turning, PlaneTurning):
+            return None
+        by_theta = turning.by_theta(turning.rate)
+        of_wd = dim.commutator(w, by_theta) + turning.acceleration_by_theta
+        return by_theta, of_wd, dim.commutator(w, turning.J) + turning.acceleration_by_rate
+
+    def moved_by_rates(self, kept: np.ndarray) -> np.ndarray:
+        """Return the derivatives of its motion by those e, e', e'' kept (d + 2 r, 3, k, n).
+
+        What turns with the interface is counted: the derivatives are those of its components.
+        """
+        body, dim, d, r = self.body, self.dim, self.dim.d, self.dim.r
+        B = body.V[self.places][:, kept]
+        u, theta = B[:d], B[d:]
+        out = np.zeros((d + 2 * r, 3, *u.shape[1:]))
+        by_e, by_ed, by_edd = out.swapaxes(0, 1)
+        phi = self.turning.jacobian_times(theta)
+        a, w, wd = self._unturned
+        by_e[:d] = dim.apply(body.alpha, u) - dim.velocity(phi, a)
+        by_ed[:d], by_edd[:d] = dim.apply(body.beta, u), u
+        by_ed[d : d + r] = by_edd[d + r :] = phi
+        if (by_theta := self._by_theta) is not None:
+            of_w, of_wd, of_rate = by_theta
+            by_e[d : d + r] = product(of_w, theta) + dim.commutator(w, phi)
+            by_e[d + r :] = product(of_wd, theta) + dim.commutator(wd, phi)
+            by_ed[d + r :] = product(of_rate, theta)
+        if (rates := body.rates_by_e) is not None:
+            Bd, Bdd = (x[self.places][:, kept] for x in rates)
+            turned, second = (
+                self.turning.jacobian_times(Bd[d:]),
+                self.turning.jacobian_times(Bdd[d:]),
+            )
+            by_e[:d] += dim.apply(body.beta, Bd[:d]) + Bdd[:d]
+            by_ed[:d] += 2.0 * Bd[:d]
+            by_e[d : d + r] += turned
+            by_e[d + r :] += second
+            by_ed[d + r :] += 2.0 * turned
+            if by_theta is not None:
+                by_e[d + r :] += product(by_theta[2], Bd[d:])
+        back = self.turning.R.swapaxes(0, 1)
+        parts = out[:d], out[d : d + r], out[d + r :]
+        return np.concatenate([product(back, parts[0]), *(dim.rotated(back, x) for x in parts[1:])])
+
+    def by_displacement(self, by: Motion) -> Motion:
+        """Return derivatives by (u, theta), their rates and second ones, each (b, n).
+
+        Those by its motion, in its components, are given; of a flexible body.
+        """
+        body, dim, turning = self.body, self.dim, self.turning
+        a, w, wd = product(turning.R, by[0]), *(dim.rotated(turning.R, x) for x in by[1:])
+        own_a, own_w, own_wd = self._unturned
+        turn = dim.commutator(w, own_w) + dim.commutator(wd, own_wd) - dim.moment(own_a, a)
+        value, rate, second = (
+            turning.jacobian_transposed(turn),
+            turning.jacobian_transposed(w),
+            turning.jacobian_transposed(wd),
+        )
+        if (by_theta := self._by_theta) is not None:
+            of_w, of_wd, of_rate = by_theta
+            value = value + transposed_product(of_w, w) + transposed_product(of_wd, wd)
+            rate = rate + transposed_product(of_rate, wd)
+        return (
+            np.concatenate([dim.applied_transposed(body.alpha, a), value]),
+            np.concatenate([dim.applied_transposed(body.beta, a), rate]),
+            np.concatenate([a, second]),
+        )
+
+    def load_by_rates(self, load: Load, kept: np.ndarray) -> np.ndarray:
+        """Return the derivative of `in_body` by those e kept (d + r, k, n); `load` its result."""
+        dim = self.dim
+        phi = self.turning.jacobian_times(self.body.V[self.places][self.dim.d :, kept])
+        return np.concatenate([dim.velocity(phi, load[0]), dim.commutator(phi, load[1])])
+
+    def coefficients_by_e(self, load: Load, kept: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of J' moment by those e kept (r, k, n); None: zero."""
+        by_theta = self.turning.by_theta(load[1], -1.0)
+        if by_theta is None:
+            return None
+        return product(by_theta, self.body.V[self.places][self.dim.d :, kept])
+
+    @cached_property
+    def rows_by_load(self) -> np.ndarray:
+        """Derivative of the rows by a load of `in_body` (d + r, q, n)."""
+        B, d = self.body.V[self.places], self.dim.d
+        return np.concatenate([B[:d], self.turning.jacobian_times(B[d:])])
+
+    @cached_property
+    def rows_by_own_load(self) -> np.ndarray:
+        """Derivative of the rows by a load in its own components (d + r, q, n)."""
+        d = self.dim.d
+        return np.concatenate(self.in_interface((self.rows_by_load[:d], self.rows_by_load[d:])))
+
+
+class MovingJoint:
+    """A joint that moves: from an interface's motion to that of the body it holds.
+
+    Attributes:
+        joint: what it is.
+        inner: motion of the interface that it sits on.
+        R: (d, d, n) from the body's frame to the interface's, or one (d, d).
+        r: (d, n) or (d, 1) from the interface to the body's origin, m.
+    """
+
+    def __init__(self, joint: Joint, inner: Motion, rates: np.ndarray | None) -> None:
+        """Take the interface's motion, and the coordinate with its rates (3, n) if there is one."""
+        self.joint, self.inner, self.rates = joint, inner, rates
+        self.dim = DIMENSIONS[len(joint.origin)][0]
+        self.slides = joint.kind == "prismatic"
+        self.R, self.r = joint.rotation, joint.origin[:, None]
+        if rates is None:
+            return
+        if self.slides:
+            self.r = self.r + (joint.rotation @ joint.axis)[:, None] * rates[0]
+            return
+        # Of a column NumPy takes other instructions, and another last bit, where the end of its
+        # stride touches the memory of the result.
+        angle = np.ascontiguousarray(rates[0])
+        turns = np.stack([np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)])
+        self.R = joint.turns @ turns
+
+    @cached_property
+    def _rate(self) -> np.ndarray:
+        """Relative velocity or angular velocity, in the body's components (., n)."""
+        assert self.rates is not None
+        return self.joint.axis[:, None] * self.rates[1]
+
+    @cached_property
+    def is_offset(self) -> bool:
+        """Whether the body's origin is not the interface's."""
+        return bool(self.r.any())
+
+    @cached_property
+    def _passed(self) -> Motion:
+        """The interface's motion at the joint, in the body's components, the joint held."""
+        (a, w, wd), dim, back = self.inner, self.dim, self.R.swapaxes(0, 1)
+        if self.is_offset:
+            a = a + dim.apply(dim.alpha(w, wd), np.broadcast_to(self.r, a.shape))
+        return product(back, a), dim.rotated(back, w), dim.rotated(back, wd)
+
+    @cached_property
+    def motion(self) -> Motion:
+        """Motion of the body's frame."""
+        a, w, wd = self._passed
+        if self.rates is None:
+            return a, w, wd
+        second, dim = self.joint.axis[:, None] * self.rates[2], self.dim
+        if self.slides:
+            return a + 2.0 * dim.velocity(w, self._rate) + second, w, wd
+        if dim.r > 1:
+            wd = wd + dim.commutator(w, self._rate)
+        return a, w + self._rate, wd + second
+
+    def at_interface(self, load: Load) -> Load:
+        """Return a load on the body's frame as the interface feels it, in its components."""
+        force, moment = product(self.R, load[0]), self.dim.rotated(self.R, load[1])
+        if self.is_offset:
+            moment = moment + self.dim.moment(self.r, force)
+        return force, moment
+
+    def drive(self, load: Load) -> np.ndarray:
+        """Return what the drive gives (..., n), N m or N, of a load on the body's frame."""
+        return np.tensordot(self.joint.axis, load[0 if self.slides else 1], 1)
+
+    def virtual(self, interface: Load, drive: np.ndarray | None) -> Load:
+        """Return displacement and rotation of the body's frame, its components.
+
+        Args:
+            interface: those of the interface.
+            drive: (n,) virtual coordinate.
+        """
+        p, phi = interface
+        if self.is_offset:
+            p = p + self.dim.velocity(phi, self.r)
+        back = self.R.swapaxes(0, 1)
+        p, phi = product(back, p), self.dim.rotated(back, phi)
+        if drive is None:
+            return p, phi
+        own = self.joint.axis[:, None] * drive
+        return (p + own, phi) if self.slides else (p, phi + own)
+
+    # -- derivatives -------------------------------------------------------------------------
+
+    @cached_property
+    def passage(self) -> MotionTransform:
+        """From the interface's motion to that of the body's frame."""
+        dim, back = self.dim, self.R.swapaxes(0, 1)
+        by_w = by_wd = turned = None
+        if self.is_offset:
+            by_w = product(back, dim.centripetal_by_spin(self.inner[1], self.r))
+            by_wd = product(back, dim.by_spin(self.r))
+        if self.rates is not None and self.slides:
+            spun = 2.0 * dim.by_spin(self._rate)
+            if dim.r > 1:
+                spun = product(spun, back[..., None] if back.ndim == 2 else back)
+            by_w = spun if by_w is None else by_w + spun
+        elif self.rates is not None and dim.r > 1:
+            turned = -product(dim.skew(self._rate), back)
+        return MotionTransform(dim, back, by_w, by_wd, turned)
+
+    @cached_property
+    def moved_by_joint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of the motion by the coordinate and its rates (d + 2 r, n)."""
+        dim, d, r = self.dim, self.dim.d, self.dim.r
+        (a, w, wd), axis = self._passed, self.joint.axis[:, None]
+        value, rate, second = np.zeros((3, d + 2 * r, a.shape[1]))
+        along = np.broadcast_to(axis, (len(axis), a.shape[1]))
+        if self.slides:
+            value[:d] = dim.apply(dim.alpha(w, wd), along)
+            rate[:d], second[:d] = 2.0 * dim.velocity(w, along), axis
+            return value, rate, second
+        turned = dim.commutator(w, along)
+        value[:d], value[d : d + r] = -dim.velocity(along, a), turned
+        value[d + r :] = dim.commutator(wd, along) + dim.commutator(turned, self._rate)
+        rate[d : d + r], rate[d + r :], second[d + r :] = axis, turned, axis
+        return value, rate, second
+
+    def load_by_joint(self, load: Load) -> np.ndarray:
+        """Return the derivative of `at_interface` by the coordinate (d + r, n)."""
+        dim, R = self.dim, self.R
+        along = np.broadcast_to(self.joint.axis[:, None], (len(self.joint.axis), load[0].shape[1]))
+        if self.slides:
+            axis = self.joint.rotation @ along
+            force = np.zeros_like(load[0])
+            return np.concatenate([force, dim.moment(axis, product(R, load[0]))])
+        force = product(R, dim.velocity(along, load[0]))
+        moment = dim.rotated(R, dim.commutator(along, load[1]))
+        if self.is_offset:
+            moment = moment + dim.moment(self.r, force)
+        return np.concatenate([force, moment])
+
+
+class MovingRotor:
+    """A rotor whose axis n is fixed to the interface that carries it, in whose components all is.
+
+    Its angular momentum is h = J s n beside what the interface's body has, s = n . w + N v with the
+    interface's angular velocity w and the motor's speed v as the joint would have it. To move it,
+    the motor gives N J s', and the interface the moment
+
+        dh/dt = J s' n + w x J s n.
+
+    Attributes:
+        load: force (zero) and moment on the interface (., n).
+        force: of the motor (n,), N m, N.
+    """
+
+    def __init__(self, joint: Joint, inner: Motion, rates: np.ndarray) -> None:
+        """Take the joint, the interface's motion, the motor's speed and acceleration (2, n)."""
+        assert joint.rotor is not None
+        a, self.w, wd = inner
+        self.dim = dim = DIMENSIONS[len(joint.origin)][0]
+        self.axis = dim.rotated(joint.rotation, joint.axis[:, None])
+        self.inertia, self.ratio = joint.rotor.inertia, joint.rotor.ratio
+        speed, change = ((self.axis * x).sum(axis=0) for x in (self.w, wd))
+        self.momentum = self.inertia * (speed + self.ratio * rates[0])
+        moment = self.inertia * (change + self.ratio * rates[1])
+        self.force = self.ratio * moment
+        self.load = np.zeros_like(a), self.axis * moment
+        if dim.r > 1:
+            self.load = self.load[0], self.load[1] + self._gyroscopic(self.momentum)
+
+    def _gyroscopic(self, momentum: np.ndarray | float) -> np.ndarray:
+        """Return w x n times a momentum (r, n): zero in the plane."""
+        return self.dim.commutator(self.w, np.asarray(self.axis * momentum))
+
+    @cached_property
+    def load_by_motion(self) -> np.ndarray:
+        """Derivative of force and moment by the interface's motion (d + r, d + 2 r, n)."""
+        dim, d, r, J = self.dim, self.dim.d, self.dim.r, self.inertia
+        out = np.zeros((d + r, d + 2 * r, self.w.shape[1]))
+        out[d:, d + r :] = (J * self.axis @ self.axis.T)[:, :, None]
+        if dim.r > 1:
+            out[d:, d : d + r] = self._gyroscopic(J)[:, None] * self.axis[:, :, None].swapaxes(0, 1)
+            out[d:, d : d + r] -= dim.skew(self.axis[:, 0])[:, :, None] * self.momentum
+        return out
+
+    @cached_property
+    def force_by_motion(self) -> np.ndarray:
+        """Derivative of the motor's force by the interface's motion (d + 2 r,)."""
+        d, r = self.dim.d, self.dim.r
+        return np.concatenate([np.zeros(d + r), self.ratio * self.inertia * self.axis[:, 0]])
+
+    @cached_property
+    def load_by_motor(self) -> np.ndarray:
+        """Derivative of force and moment by the motor's angle and its rates (d + r, 3, n)."""
+        d, own = self.dim.d, self.ratio * self.inertia
+        out = np.zeros((d + self.dim.r, 3, self.w.shape[1]))
+        out[d:, 2] = own * self.axis
+        if self.dim.r > 1:
+            out[d:, 1] = self._gyroscopic(own)
+        return out
+
+    @property
+    def force_by_motor(self) -> float:
+        """Derivative of the motor's force by its acceleration, kg m2."""
+        return self.ratio**2 * self.inertia

@@ -1,0 +1,176 @@
+"""Vector-Jacobian product of inverse dynamics with the integrals of every body.
+
+The multipliers are a virtual displacement, which runs out along the tree like velocities do; its
+products with inertia and elastic forces are linear in every integral. The outboard interface
+enters through the kinematics, too: a pass back carries the derivatives by the frames' motion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dolfinopt.multibody.body import BodyMotion, Load, Motion, Weights
+from dolfinopt.multibody.frames import Interface
+from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tree import GROUND, Mechanism, Site
+
+
+def body_gradient(
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    q: np.ndarray,
+    qd: np.ndarray,
+    qdd: np.ndarray,
+    multipliers: np.ndarray,
+    of_forces: np.ndarray | None = None,
+) -> list[ShapeIntegrals]:
+    """Return the derivative of sum_n multipliers_n . residual_n + of_forces_n . forces_n.
+
+    Args:
+        mechanism, motion, q, qd, qdd: as for `inverse_dynamics`, n instants; held.
+        multipliers: (n, N) of the elastic residual.
+        of_forces: (n, R) of the rigid coordinates' forces, or (n, R + M) of the motors' behind
+            springs as well; none by default.
+
+    Returns:
+        The derivative by every body's integrals.
+    """
+    tree = mechanism
+    drives = np.zeros((len(q), tree.num_rigid + len(tree.motor_joints)))
+    if of_forces is not None:
+        drives[:, : of_forces.shape[1]] = of_forces
+    links = outward_pass(tree, motion, (q, qd, qdd))
+    loads = inward_pass(tree, links)
+    zeta = np.ascontiguousarray(multipliers.T)
+    moves, ends = _virtual_motion(tree, links, zeta, drives)
+    by_motion: dict[int, Motion] = {}
+    by_rotation = _by_rotation(tree, links, moves, zeta)
+    gradient: dict[int, ShapeIntegrals] = {}
+    for i in reversed(tree.order):
+        link, own = links[i], zeta[tree.slices[i]]
+        by = [_motion_gradient(link.body, moves[i])]
+        outboard: dict[int, Weights] = {}
+        if link.body.is_flexible:
+            of_rows = np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
+            by.append(_split(link.body, of_rows))
+        for s, interface in link.interfaces.items():
+            parts = [links[k].joint.passage.transposed(by_motion[k]) for k in tree.hanging[i, s]]
+            parts += [
+                _rotor_gradient(links[k], ends[i, s], drives[:, tree.rotors[k]])
+                for k in tree.hanging[i, s]
+                if k in tree.rotors
+            ]
+            if s in link.carried:
+                parts.append(_motion_gradient(link.carried[s], ends[i, s]))
+            displaced = (np.zeros((link.body.dim.b, zeta.shape[1])),) * 3
+            if parts:
+                on_interface = _sum_motions(parts)
+                by.append(interface.passage.transposed(on_interface))
+                if link.body.is_flexible:
+                    displaced = interface.by_displacement(on_interface)
+            if link.body.is_flexible:
+                both = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
+                outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
+                if (i, s) in by_rotation:
+                    outboard[s].value[link.body.dim.d :] += by_rotation[i, s]
+        by_motion[i] = _sum_motions(by)
+        gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
+    return [gradient[i] for i in range(len(links))]
+
+
+def _by_rotation(
+    tree: Mechanism, links: list[Link], moves: dict[int, Load], zeta: np.ndarray
+) -> dict[Site, np.ndarray]:
+    """Return the derivatives by every interface's theta (r, n) through forces of the world."""
+    # What turns a body turns such a force the other way in the body's components.
+    found: dict[Site, np.ndarray] = {}
+    if not tree.forces:
+        return found
+    dim, of_bodies = tree.dim, dict.fromkeys(range(len(links)), np.zeros((tree.dim.r, 1)))
+    for i in reversed(tree.order):
+        link, own = links[i], zeta[tree.slices[i]]
+        total = np.zeros((dim.r, zeta.shape[1]))
+        for s, interface in link.interfaces.items():
+            turned = sum(
+                (dim.rotated(links[k].joint.R, of_bodies[k]) for k in tree.hanging[i, s]),
+                np.zeros_like(total),
+            )
+            if link.body.is_flexible:
+                turned = dim.rotated(interface.turning.R, turned)
+                found[i, s] = interface.turning.jacobian_transposed(turned)
+            total += turned
+            if s in link.applied:
+                p, phi = interface.virtual(moves[i], own)
+                force, moment = link.applied[s].in_world
+                total -= dim.moment(force, p) + dim.commutator(moment, phi)
+        of_bodies[i] = total
+    return found
+
+
+def _motion_gradient(body: BodyMotion, virtual: Load) -> Motion:
+    """Return the derivatives of virtual . (F, T) by a body's motion."""
+    return _split(body, np.einsum("ijn,in->jn", body.load_by_motion, np.concatenate(virtual)))
+
+
+def _rotor_gradient(link: Link, virtual: Load, drive: np.ndarray) -> Motion:
+    """Return the derivatives by the motion of what carries a rotor; `drive` (n,) is its motor's."""
+    assert link.rotor is not None
+    by = np.einsum("ijn,in->jn", link.rotor.load_by_motion, np.concatenate(virtual))
+    return _split(link.body, by + link.rotor.force_by_motion[:, None] * drive)
+
+
+def _split(body: BodyMotion, x: np.ndarray) -> Motion:
+    d, r = body.dim.d, body.dim.r
+    return x[:d], x[d : d + r], x[d + r :]
+
+
+def _sum_motions(parts: list[Motion]) -> Motion:
+    a, w, wd = parts[0]
+    for one in parts[1:]:
+        a, w, wd = a + one[0], w + one[1], wd + one[2]
+    return a, w, wd
+
+
+def _virtual_motion(
+    tree: Mechanism, links: list[Link], zeta: np.ndarray, of_forces: np.ndarray
+) -> tuple[dict[int, Load], dict[Site, Load]]:
+    """Return displacement and rotation of every frame and outboard interface, in its components."""
+    moves: dict[int, Load] = {}
+    ends: dict[Site, Load] = {}
+    ground = tree.virtual_ground(of_forces)
+    for i in tree.order:
+        link, joint = links[i], tree.joints[i]
+        inner = ground if joint.parent == GROUND else ends[joint.parent, joint.interface]
+        drive = None if joint.coordinate is None else of_forces[:, joint.coordinate]
+        moves[i] = link.joint.virtual(inner, drive)
+        for s, interface in link.interfaces.items():
+            p, phi = interface.virtual(moves[i], zeta[tree.slices[i]])
+            ends[i, s] = interface.in_interface((p, phi))
+    return moves, ends
+
+
+def _interface_weights(
+    interface: Interface,
+    loads: tuple[Load, Load],
+    virtual: Load,
+    zeta: np.ndarray,
+    displaced: Motion,
+) -> Weights:
+    """Return the derivatives (b, n) by (u, theta), their rates and variation."""
+    # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
+    # frame, zeta (q, n) its multipliers; `displaced` are those by (u, theta) and their rates
+    # through the interface's motion.
+    load, (own_force, own_moment) = loads
+    (force, moment), dim, turning = load, interface.dim, interface.turning
+    p, phi = interface.virtual(virtual, zeta)
+    # The load's lever, its components, and J' of the row.
+    turned = turning.jacobian_transposed(dim.moment(own_force, p) + dim.commutator(own_moment, phi))
+    by_theta = turning.by_theta(moment, -1.0)
+    if by_theta is not None:
+        theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][dim.d :], zeta)
+        turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
+    value, rate, second = displaced
+    value = value + np.concatenate([-dim.velocity(virtual[1], force), turned])
+    return Weights(value, rate, second, interface.load_coefficients(load))

@@ -1,0 +1,138 @@
+"""What loads the bodies of a machine that moves, and how much it stiffens or softens them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.multibody.body import Load
+from dolfinopt.multibody.closures import Loops
+from dolfinopt.multibody.newton_euler import (
+    NOTHING,
+    Link,
+    interface_coefficients,
+    inverse_dynamics,
+    inward_pass,
+    outward_pass,
+)
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
+from dolfinopt.multibody.tree import Mechanism, Site
+
+# -- what loads every body: its frame's acceleration, and from outboard ------------------------
+
+
+def body_loads(
+    mechanism: Mechanism, motion: RigidMotion, rates: Rates, pull: Mapping[Site, Load] = NOTHING
+) -> list[np.ndarray]:
+    """Return what loads every body in the order of its K0 and K0_outboard (n, P).
+
+    In the plane (a_x, a_y, wd, -w^2, F_x, F_y, T), in space (a, A_ab, force, moment). The moment is
+    what works on the rotation vector of the interface. Of several interfaces force and moment of
+    one stand behind those of the other.
+
+    Args:
+        mechanism, motion, rates: as for `inverse_dynamics`.
+        pull: see `inward_pass`.
+    """
+    links = outward_pass(mechanism, motion, rates, pull)
+    return _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
+
+
+def _body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.ndarray]:
+    found = []
+    for link, loads in zip(links, outboard, strict=True):
+        pulls = {s: np.concatenate(load) for s, load in loads.items()}
+        if link.body.is_flexible:
+            pulls = interface_coefficients(link, loads)
+        p, order = link.body.load_coefficients(pulls), link.body.dim.loads
+        found.append(np.concatenate([p[order], p[len(order) :]]).T)
+    return found
+
+
+def is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
+    """Return whether anything loads the bodies while they are not deformed."""
+    rest = np.zeros((len(motion.q), mechanism.num_coordinates))
+    return any(p.any() for p in body_loads(mechanism, motion, (rest, rest, rest)))
+
+
+def load_coefficients(mechanism: Mechanism, motion: RigidMotion, rates: Rates) -> list[np.ndarray]:
+    """Return c (n, P + g q) of every body: what loads its nodes, as inertia acts.
+
+    c = -(p, alpha_c z + beta_c z' + trace_c z''), p of `body_loads`, c before the modes, z being
+    the displacement along them, see `body_motion`. See `dynamics.simulation`.
+    """
+    links = outward_pass(mechanism, motion, rates)
+    loads = _body_loads(links, inward_pass(mechanism, links).outboard)
+    found = []
+    for link, p in zip(links, loads, strict=True):
+        elastic = link.body.accelerations(link.body.z)
+        found.append(-np.hstack([p, elastic.reshape(-1, len(p)).T]))
+    return found
+
+
+# -- how much the loads of a motion stiffen or soften the arms, before anything is simulated -----
+
+
+@dataclass(frozen=True)
+class Stiffening:
+    """Whether bodies have geometric stiffness, and why.
+
+    Attributes:
+        estimate: largest relative change of an arm's stiffness along the motion; None in space
+            where the scene itself says whether it counts.
+        on: whether it is taken into account.
+        neglected: what the deviation would miss without it, over its largest; None if not compared.
+    """
+
+    estimate: float | None
+    on: bool
+    neglected: float | None = None
+
+
+def largest_change(
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    loops: Loops | None = None,
+    dependent: np.ndarray | None = None,
+) -> float:
+    """Return the largest |eigenvalue| of K^-1 sum_p p K0_p over arms and instants.
+
+    The loads p are those of the machine with rigid arms on the desired motion.
+
+    Args:
+        mechanism: bodies with geometric stiffness.
+        motion: at n instants.
+        loops: closures; or None.
+        dependent: rigid coordinates that follow from them.
+    """
+    largest = 0.0
+    loads = _loads(mechanism.rigid, motion, loops, dependent)
+    for body, p in zip(mechanism.bodies, loads, strict=True):
+        largest = max(largest, stiffness_change(body, p))
+    return largest
+
+
+def stiffness_change(body: ShapeIntegrals, p: np.ndarray) -> float:
+    """Return the largest |eigenvalue| of K^-1 sum_p p K0_p of a body under loads p (n, loads)."""
+    if body.num_modes == 0 or not body.is_stiffened:
+        return 0.0
+    inverse = np.linalg.inv(np.linalg.cholesky(body.K))
+    K0 = inverse @ np.concatenate([body.K0, body.K0_outboard]) @ inverse.T
+    values = np.linalg.eigvalsh(np.tensordot(p, K0, 1))
+    return float(np.abs(values).max(initial=0.0))
+
+
+def _loads(
+    rigid: Mechanism, motion: RigidMotion, loops: Loops | None, dependent: np.ndarray | None
+) -> list[np.ndarray]:
+    """Return what loads every body (n, loads); in the plane a_x, a_y, wd, -w^2, F_x, F_y, T."""
+    none = np.zeros((len(motion.q), 0))
+    pull: Mapping[Site, Load] = {}
+    if loops is not None and dependent is not None:
+        forces = inverse_dynamics(rigid, motion, none, none, none)[1]
+        here = loops.at(rigid, motion.q, none)
+        pull = here.interface_loads(here.closing(forces, dependent))
+    return body_loads(rigid, motion, (none, none, none), pull)
