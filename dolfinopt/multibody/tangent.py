@@ -228,14 +228,12 @@ def linearise(
         for row, k in enumerate(map(int, rigid[rigid < tree.num_rigid])):
             walk.drives[:, row, 3 * columns.rigid[k] + 1] += slope[:, k]
     first = len(columns.drives)
-    blocks = [Block(slice(0, first), slice(0, walk.drives.shape[2]), None, walk.drives)] * (
-        first > 0
-    )
+    drives = Block(slice(0, first), slice(0, walk.drives.shape[2]), None, walk.drives)
     kept = [part.start + own for part, own in zip(tree.slices, columns.kept, strict=True)]
     own = np.concatenate([np.arange(first), *(first + rows for rows in kept)]).astype(int)
     order = columns.order
     as_they_stand = bool((order == np.arange(len(order))).all())
-    return Tangent((*blocks, *walk.blocks), own, slice(None) if as_they_stand else order)
+    return Tangent((drives, *walk.blocks), own, slice(None) if as_they_stand else order)
 
 
 @dataclass(frozen=True, eq=False)
