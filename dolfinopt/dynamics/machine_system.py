@@ -27,11 +27,10 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
+from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.measured import (
     CLOSURE_COMPLIANCE_SHARE,
     DEVIATION_ROUNDING,
-    EQUILIBRIUM_ITERATIONS,
-    MACHINE_EQUILIBRIUM_ROUNDING_ERROR,
 )
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.tables import motion_at_stages
@@ -409,36 +408,25 @@ class MachineSystem:
 
     def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
-        instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
-        rest, ydd, some = np.zeros_like(y), np.zeros_like(y), self._at_start
-        load = None
-        for _ in range(EQUILIBRIUM_ITERATIONS):
-            residual = instants.residual(y, rest, ydd)[0, some]
-            if not residual.any():
-                return y, ydd[0, ground]
-            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])[np.ix_(some, some)]
-            size, x = np.abs(matrix).max(axis=1), np.abs(y + ydd)[0, some]
-            if not size.all():
-                break
-            # Rows of like size; the backward error judges what rounding leaves of each.
-            matrix, residual = matrix / size[:, None], residual / size
-            load = np.abs(residual) if load is None else load
-            rounding = (np.abs(matrix) @ x + load).max()
-            try:
-                step = np.linalg.solve(matrix, -residual)
-            except np.linalg.LinAlgError:
-                break
-            if np.abs(residual).max() <= 10.0 * MACHINE_EQUILIBRIUM_ROUNDING_ERROR * rounding:
-                return y, ydd[0, ground]
-            change = np.zeros(y.shape[1])
-            change[some] = step
-            ydd[0, ground] += change[ground]
-            change[ground] = 0.0
-            y = y + change
-            if np.abs(change).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(
-                1.0, np.abs(y).max()
-            ):
-                return y, ydd[0, ground]
+        instants, some = self.at(np.zeros(1)), self._at_start
+
+        def states(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            whole, ydd = y.copy(), np.zeros_like(y)
+            whole[0, some] = x
+            ground = slice(*self.ends[1:])
+            ydd[:, ground] = whole[:, ground]
+            whole[:, ground] = 0.0
+            return whole, np.zeros_like(y), ydd
+
+        x = equilibrium(
+            lambda x: instants.residual(*states(x))[0, some],
+            lambda x: self._at_rest(instants.linearise(*states(x)).dense()[0])[np.ix_(some, some)],
+            y[0, some],
+            size=1.0,  # rad: nothing may load a machine
+        )
+        if x is not None:
+            y, _, ydd = states(x)
+            return y, ydd[0, slice(*self.ends[1:])]
         limited = bool(self.drives.limited.any())
         raise ConvergenceError(
             "the machine finds no equilibrium at t = 0: the drives are too "
