@@ -18,7 +18,14 @@ from dolfinopt.dynamics.measured import (
 )
 from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
 from dolfinopt.errors import InputError
-from dolfinopt.motion.build import breakpoints, check_path, passive_coordinates, rests, rigid_motion
+from dolfinopt.motion.build import (
+    breakpoints,
+    check_path,
+    passive_coordinates,
+    rests,
+    rigid_motion,
+    table_rows,
+)
 from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -76,9 +83,10 @@ def build_system(
     if motion is None:
         motion = desired_motion(scene)
     mechanism, instants = build_mechanism(scene, bodies), breakpoints(scene)
-    if loads := loads_of(scene):
+    loads, rows = loads_of(scene), table_rows(scene)
+    if loads or len(rows):
         mechanism = replace(mechanism, forces=forces_of(scene))
-        motion = LoadedMotion(motion, loads)
+        motion = LoadedMotion(motion, loads, rows)
         tables = [load.table for load in loads if load.table is not None]
         instants = with_ends(instants, tables, scene.motion.horizon)
     if not is_machine(scene):

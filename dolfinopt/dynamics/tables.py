@@ -81,15 +81,12 @@ class LoadedMotion:
         return self._loaded(motion, lambda table: table.at_stages(time_grid, nodes))
 
     def _motion_at(self, time_grid: np.ndarray, nodes: np.ndarray) -> RigidMotion:
-        if self.rows is None:
-            return self.motion(stage_instants(time_grid, nodes))
-
-        def rates(t: np.ndarray) -> np.ndarray:
-            motion = self.motion(t)
-            return np.hstack([motion.q, motion.qd, motion.qdd])
-
-        rates_there = stage_values_of(rates, self.rows, time_grid, nodes)
-        return RigidMotion(*np.split(rates_there, 3, axis=1))
+        motion = self.motion(stage_instants(time_grid, nodes))
+        if self.rows is None or not len(self.rows):
+            return motion
+        # The load is linear in the acceleration alone, whose jumps are the sharp ones.
+        qdd = stage_values_of(lambda t: self.motion(t).qdd, self.rows, time_grid, nodes)
+        return replace(motion, qdd=qdd)
 
     def _loaded(self, motion: RigidMotion, values: Callable[[Table], np.ndarray]) -> RigidMotion:
         if not self.loads:

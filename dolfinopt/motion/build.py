@@ -128,6 +128,16 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     return (0.0, *instants[apart].tolist(), motion.horizon)
 
 
+def table_rows(scene: Scene) -> np.ndarray:
+    """Return the instants (m,) of the rows of the motion's table, s."""
+    motion = scene.motion
+    if motion.path not in ("points", "joints"):
+        return np.zeros(0)
+    curve, timed = curve_of(scene)
+    t = rows_of(scene).table.t
+    return t if timed and t is not None else np.array(_when(np.array(curve.kinks), motion))
+
+
 def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
     """Return the intervals in which settling counts, the delay of each taken off; s.
 
