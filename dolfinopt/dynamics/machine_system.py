@@ -42,49 +42,8 @@ from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import complement, least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
-from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tangent import Tangent, linearise
 from dolfinopt.multibody.tree import Drives, Mechanism
-
-
-@dataclass(frozen=True, eq=False)
-class DenseLinearisation:
-    """Derivative of a residual at n instants as matrices, see `system.Linearisation`.
-
-    Attributes:
-        matrix: (n, N, 3, N) of all rows by all coordinates, their rates and accelerations.
-        keep: (S,) coordinates that have columns.
-    """
-
-    matrix: np.ndarray
-    keep: np.ndarray
-
-    def window(self, first: int, last: int) -> DenseLinearisation:
-        """Return the instants first..last - 1."""
-        return DenseLinearisation(self.matrix[first:last], self.keep)
-
-    def dense(self) -> np.ndarray:
-        """Return the kept coordinates' own rows (n, S, 3 S)."""
-        return self._part(self.keep)
-
-    def times(
-        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
-    ) -> np.ndarray:
-        """Return the change of the wanted rows (m, W), see `system.Linearisation`."""
-        change = np.concatenate([q, qd, qdd], axis=1)
-        change = change.reshape(len(self.matrix), -1, change.shape[1])
-        rows = change @ self._part(wanted).swapaxes(1, 2)
-        return rows.reshape(len(q), len(wanted))
-
-    def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
-        flat = self.matrix.reshape(*self.matrix.shape[:2], -1)
-        found = rows.reshape(len(flat), -1, rows.shape[1]) @ flat
-        found = found.reshape(len(rows), 3, -1)[:, :, self.keep]
-        return found[:, 0], found[:, 1], found[:, 2]
-
-    def _part(self, rows: np.ndarray) -> np.ndarray:
-        chosen = self.matrix[:, rows][..., self.keep]
-        return chosen.reshape(len(self.matrix), len(rows), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,40 +192,40 @@ class MachineInstants:
 
     def linearise(
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
-    ) -> DenseLinearisation:
+    ) -> Tangent:
         """Return its derivative by the coordinates `keep`, or all."""
         machine = self.machine
         (R, moving, last), S, count = machine.ends, machine.num_coordinates, len(y)
         motion = self.motion(y, yd, ydd)
         (_, q, _), (_, qd, _), (_, qdd, multipliers) = (self.split(x) for x in (y, yd, ydd))
-        matrix = np.zeros((count, S, 3, S))
+        matrix = np.zeros((count, S, S, 3))
         passing = self.passing(y, yd)
         springs, every = machine.drives.springs, machine.drive_columns
         motors = every[springs.joints]
         rigid = np.concatenate([machine.drives.free, machine.motor_coordinates])
         tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, rigid).dense()
         places = np.concatenate([np.arange(R), motors, np.arange(R, moving)])
-        parts = tangent.reshape(count, len(places), 3, len(places))
-        matrix[:, places[:, None, None], np.arange(3)[:, None], places] = parts
-        matrix[:, every, 0, every] += passing * machine.drives.stiffness
-        matrix[:, every, 1, every] += passing * machine.drives.damping
+        parts = tangent.reshape(count, len(places), 3, len(places)).swapaxes(2, 3)
+        matrix[:, places[:, None], places] = parts
+        matrix[:, every, every, 0] += passing * machine.drives.stiffness
+        matrix[:, every, every, 1] += passing * machine.drives.damping
         for order, value in enumerate((springs.stiffness, springs.damping)):
             for rows, sign in ((springs.joints, 1.0), (motors, -1.0)):
-                matrix[:, rows, order, springs.joints] += sign * value
-                matrix[:, rows, order, motors] -= sign * value
+                matrix[:, rows, springs.joints, order] += sign * value
+                matrix[:, rows, motors, order] -= sign * value
         if springs.friction.acts:
-            matrix[:, motors, 1, motors] += springs.friction.slope(self.motor_rates(yd, ydd)[0])
+            matrix[:, motors, motors, 1] += springs.friction.slope(self.motor_rates(yd, ydd)[0])
         if machine.loops is not None:
             here = machine.loops.at(machine.mechanism, motion.q, q)
             J = here.jacobian[:, :, machine.columns]  # (n, m, R + N)
             H = here.hessian(multipliers)[:, machine.columns[:, None], machine.columns]
-            matrix[:, :moving, 0, :moving] -= H
-            matrix[:, :moving, 2, moving:last] -= J.swapaxes(1, 2)
-            matrix[:, moving:last, 0, :moving] += machine.gap_scale * J
+            matrix[:, :moving, :moving, 0] -= H
+            matrix[:, :moving, moving:last, 2] -= J.swapaxes(1, 2)
+            matrix[:, moving:last, :moving, 0] += machine.gap_scale * J
             if self.redundant is not None:
                 given = CLOSURE_COMPLIANCE_SHARE * self.redundant[0]
-                matrix[:, moving:last, 2, moving:last] += given
-        return DenseLinearisation(matrix, np.arange(S) if keep is None else keep)
+                matrix[:, moving:last, moving:last, 2] += given
+        return Tangent.of_matrix(matrix, keep)
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,6 +75,16 @@ class Tangent:
     order: np.ndarray | slice
     count: int
 
+    @classmethod
+    def of_matrix(cls, matrix: np.ndarray, keep: np.ndarray | None = None) -> Tangent:
+        """Return that of W rows by W coordinates and their rates (n, W, W, 3), by some or all."""
+        count, size = matrix.shape[:2]
+        own = np.arange(size) if keep is None else keep
+        right = matrix if keep is None else matrix[:, :, keep]
+        right = right.reshape(count, size, 3 * len(own))
+        block = Block(slice(0, size), slice(0, right.shape[2]), None, right)
+        return cls((block,), own, slice(None), count)
+
     def window(self, first: int, last: int) -> Tangent:
         """Return the instants first..last - 1."""
         part, blocks = slice(first, last), []
@@ -355,7 +365,7 @@ class _Walk:
     def _widened(self, by_motion: np.ndarray) -> np.ndarray:
         """Return derivatives (n, ., m) by a motion of those by (a, w, wd), (., d + 2 r, n)."""
         out = np.zeros((self.count, len(by_motion), self.motion_size))
-        out[:, :, : by_motion.shape[1]] = by_motion.transpose(2, 0, 1)
+        _add(out, by_motion)
         return out
 
     # -- inwards -------------------------------------------------------------------------------
@@ -397,13 +407,13 @@ class _Walk:
                 by_rigid[:, :, :3] = of_loads @ (on_frame.by_motion @ by_joint)
                 by_rigid[:, :, 0] += joint.load_by_joint(self.loads.joints[k]).T
             if (rotor := self.links[k].rotor) is not None:
-                by_motion += self._widened(rotor.load_by_motion)
+                _add(by_motion, rotor.load_by_motion)
                 if (place := columns.rigid.get(tree.rotors[k])) is not None:
                     own = _three(slice(place, place + 1), first)
                     by_rigid[:, :, own] += rotor.load_by_motor.transpose(2, 0, 1)
             parts += [by_rigid, of_loads @ on_frame.outboard]
         if i != GROUND and s in self.links[i].carried:
-            by_motion += self._widened(self.links[i].carried[s].load_by_motion)
+            _add(by_motion, self.links[i].carried[s].load_by_motion)
         return _LoadDerivative(by_motion, _side_by_side([by_motion[:, :, :0], *parts]))
 
     def _on_frame(self, i: int, outboard: dict[int, _OutboardLoad]) -> _LoadDerivative:
@@ -483,6 +493,11 @@ class _Walk:
         for place, left, right in parts:
             np.matmul(left, right, out=whole[:, :, _three(place)])
         self.blocks.append(Block(rows, slice(0, whole.shape[2]), None, whole))
+
+
+def _add(by_motion: np.ndarray, more: np.ndarray) -> None:
+    """Add derivatives by (a, w, wd) (., d + 2 r, n) to those by a motion (n, ., m)."""
+    by_motion[:, :, : more.shape[1]] += more.transpose(2, 0, 1)
 
 
 def _side_by_side(parts: list[np.ndarray]) -> np.ndarray:

@@ -13,10 +13,11 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution, Stages, Strategy, radau_iia
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.estimate import _free_vibrations, _lost
-from dolfinopt.dynamics.machine_system import DenseLinearisation, MachineSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.tangent import Tangent
 from dolfinopt.multibody.tree import Drives, plane_chain
 from dolfinopt.paths import quintic
 from dolfinopt.profiling import Profile
@@ -58,12 +59,12 @@ class Pendulum:
         rows = qdd[:, 0] + x * pull, qdd[:, 1] + y * pull + GRAVITY, 0.5 * (x * x + y * y - 1.0)
         return np.stack(rows, axis=1)
 
-    def linearise(self, q, qd, qdd, keep=None) -> DenseLinearisation:
+    def linearise(self, q, qd, qdd, keep=None) -> Tangent:
         matrix = np.zeros((len(q), 3, 3, 3))
-        matrix[:, [0, 1], 0, [0, 1]] = qdd[:, 2:]
-        matrix[:, 2, 0, :2] = matrix[:, :2, 2, 2] = q[:, :2]
-        matrix[:, [0, 1], 2, [0, 1]] = 1.0
-        return DenseLinearisation(matrix, np.arange(3) if keep is None else keep)
+        matrix[:, [0, 1], [0, 1], 0] = qdd[:, 2:]
+        matrix[:, 2, :2, 0] = matrix[:, :2, 2, 2] = q[:, :2]
+        matrix[:, [0, 1], [0, 1], 2] = 1.0
+        return Tangent.of_matrix(matrix, keep)
 
     def initial_state(self) -> State:
         return np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 3))
