@@ -588,6 +588,15 @@ class MachineModes:
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
     guided = True
 
+    @property
+    def coupled(self) -> bool:
+        """Whether closures hold rigid arms more often than needed.
+
+        Elastic coordinates then bear what these multipliers would: without their columns Newton's
+        step and the error's estimate are off by the share of compliance that closures have.
+        """
+        return self.system.num_redundant > 0
+
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., S) of coordinates (..., S)."""
         return self._with(q, self.arms.to_modes)
