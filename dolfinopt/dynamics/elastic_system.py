@@ -198,6 +198,7 @@ class Modes(Generic[Own]):
     inverses: tuple[np.ndarray, ...]
     frequencies: np.ndarray
     guided = True
+    coupled = False
 
     @cached_property
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

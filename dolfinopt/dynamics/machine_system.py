@@ -37,6 +37,7 @@ from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.measured import RANK_SHARE
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import complement, least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -343,7 +344,7 @@ class MachineSystem:
                 ahead[:, springs.joints] += springs.friction.force(speeds)
         if pushes is not None:
             ahead += pushes
-        return MachineInstants(self, desired, ahead, winding, self._redundant(desired))
+        return MachineInstants(self, desired, ahead, winding, self.redundant_at(desired))
 
     @property
     def num_redundant(self) -> int:
@@ -351,7 +352,7 @@ class MachineSystem:
         _, moving, last = self.ends
         return last - moving - len(self.drives.dependent)
 
-    def _redundant(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray] | None:
+    def redundant_at(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray] | None:
         """Return P (n, k, k) and g_0 = P g (n, k), m, of rigid arms on a desired motion."""
         if self.loops is None or self.num_redundant == 0:
             return None
@@ -365,7 +366,7 @@ class MachineSystem:
 
         (N' G_e K^-1 G_e' N)^-1 N' g_0, N spanning P: it is told, not summed in.
         """
-        found = self._redundant(self.motion(np.zeros(1)))
+        found = self.redundant_at(self.motion(np.zeros(1)))
         if self.loops is None or found is None:
             return 0.0
         P, left = (x[0] for x in found)
@@ -575,6 +576,17 @@ class MachineModes:
     frequencies: np.ndarray
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
     guided = True
+
+    @cached_property
+    def coupled(self) -> bool:
+        """Whether directions in which closures hold rigid arms too often turn as the machine moves.
+
+        Elastic coordinates then bear what these multipliers would: without their columns Newton's
+        step and the error's estimate are off by the share of compliance that closures have.
+        """
+        t = np.linspace(0.0, self.system.breakpoints[-1], 5)
+        found = self.system.redundant_at(self.system.motion(t))
+        return found is not None and bool(np.ptp(found[0], axis=0).max() > RANK_SHARE)
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., S) of coordinates (..., S)."""
