@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,15 +11,6 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.motion import plane
 from dolfinopt.motion.constraints import Constraints, Target
-from dolfinopt.motion.curves import (
-    Derivatives,
-    Words,
-    along,
-    curve_by_chord,
-    curve_by_laws,
-    inverse,
-    part_of,
-)
 from dolfinopt.motion.measured import (
     DENSE_INSTANTS,
     LEAST_ROWS,
@@ -27,6 +18,7 @@ from dolfinopt.motion.measured import (
     TABLE_CORNERS_LIMIT,
 )
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
+from dolfinopt.motion.task import Words
 from dolfinopt.multibody.build import loops_of, skeleton
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -37,7 +29,11 @@ from dolfinopt.paths import (
     Curve,
     Limits,
     Table,
+    Values,
+    along,
     column_names,
+    curve_by_chord,
+    curve_by_laws,
     curve_in_time,
     moves,
     read_table,
@@ -171,7 +167,7 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
 def _when(s: np.ndarray, motion: Motion) -> list[float]:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration
-    instants = inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
+    instants = plane.inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
     return [float(t) for t in instants]
 
 
@@ -314,15 +310,19 @@ def prescribed_joints(scene: Scene) -> tuple[str, ...]:
 # -- what the scene prescribes: paths, joints ------------------------------------------------
 
 
-def desired_path(t: np.ndarray, scene: Scene) -> Derivatives:
+def desired_path(t: np.ndarray, scene: Scene) -> Values:
     """Return where the end-effector should be in the plane (n, 2), and two derivatives."""
     motion = scene.motion
-    if motion.path == "points":
+    if motion.path != "arc":
         return _along_table(t, scene)
-    values = time_law(motion)(t, motion.duration)
-    if motion.path == "arc":
-        return plane.arc(values, motion.radius, motion.flattening)
-    return plane.line(values, np.array(motion.start), np.array(motion.end))
+    path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
+    return along(path, time_law(motion), t, motion.duration)
+
+
+def _part(values: Values, columns: slice) -> Values:
+    """Return some columns of all three."""
+    q, qd, qdd = (x[:, columns] for x in values)
+    return q, qd, qdd
 
 
 def target_of(t: np.ndarray, scene: Scene) -> Target:
@@ -332,19 +332,20 @@ def target_of(t: np.ndarray, scene: Scene) -> Target:
         return Target(_with_springs(_prescribed(t, scene), scene), free)
     values, start = _along_table(t, scene), rows_of(scene).start
     first = 3 if start is None else 6
-    turned = None if start is None else turning(start, part_of(values, slice(3, 6)))
-    joints = _with_springs(part_of(values, slice(first, None)), scene)
-    return Target(joints, part_of(values, slice(3)), turned)
+    turned = None if start is None else turning(start, _part(values, slice(3, 6)))
+    joints = _with_springs(_part(values, slice(first, None)), scene)
+    return Target(joints, _part(values, slice(3)), turned)
 
 
-def _along_table(t: np.ndarray, scene: Scene) -> Derivatives:
+def _along_table(t: np.ndarray, scene: Scene) -> Values:
     """Return the curve through the scene's table and two derivatives, in its time or by the law."""
     curve, timed = curve_of(scene)
-    law = None if timed else time_law(scene.motion)
-    return along(curve, law, t, scene.motion.duration)
+    if timed:
+        return curve(t)
+    return along(curve, time_law(scene.motion), t, scene.motion.duration)
 
 
-def _prescribed(t: np.ndarray, scene: Scene) -> Derivatives:
+def _prescribed(t: np.ndarray, scene: Scene) -> Values:
     """Return the coordinates that a table or a rotation prescribes, and two derivatives.
 
     In the plane on a fixed base its constant place before them.
@@ -353,10 +354,8 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Derivatives:
     if motion.path == "joints":
         joints = _along_table(t, scene)
     else:
-        turned = plane.rotation(
-            t, time_law(motion), motion.speed, motion.start_angle, motion.duration
-        )
-        joints = part_of(turned, None)
+        law = time_law(motion)
+        joints = plane.rotation(t, law, motion.speed, motion.start_angle, motion.duration)
     if scene.is_spatial or motion.base == "cart":
         return joints
     places = (motion.base_position, 0.0, 0.0)
@@ -364,7 +363,7 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Derivatives:
     return q, qd, qdd
 
 
-def _with_springs(joints: Derivatives, scene: Scene) -> Derivatives:
+def _with_springs(joints: Values, scene: Scene) -> Values:
     """Return given coordinates and, behind them, the lengths of springs, which stay at rest."""
     lengths = [one.length for one in scene.rods if not one.driven]
     still = np.tile(np.array(lengths, dtype=float), (len(joints[0]), 1))
@@ -375,7 +374,7 @@ def _with_springs(joints: Derivatives, scene: Scene) -> Derivatives:
 # -- chains of the plane ---------------------------------------------------------------------
 
 
-def _chain(t: np.ndarray, scene: Scene) -> Derivatives:
+def _chain(t: np.ndarray, scene: Scene) -> Values:
     """Return cart and joints (n, 1 + arms) of a chain in the plane on its path."""
     motion, path = scene.motion, desired_path(t, scene)
     if len(scene.arms) == 1:
@@ -389,7 +388,7 @@ def _chain(t: np.ndarray, scene: Scene) -> Derivatives:
     return found
 
 
-def _bare_chain(t: np.ndarray, path: Derivatives, scene: Scene) -> Derivatives:
+def _bare_chain(t: np.ndarray, path: Values, scene: Scene) -> Values:
     """Return cart and joints of two and more arms, the first angle up to whole turns."""
     motion, bend = scene.motion, plane.bend_of(tuple(arm.length for arm in scene.arms))
     p, v, a = (motion.cart_follow * np.array([1.0, 0.0]) * x for x in path)

@@ -15,11 +15,11 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.motion.curves import Derivatives
 from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.tree import Mechanism
+from dolfinopt.paths import Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ class Target:
             ground's frame; None where it is free.
     """
 
-    joints: Derivatives
-    place: Derivatives
-    turning: Derivatives | None = None
+    joints: Values
+    place: Values
+    turning: Values | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,11 @@ from scipy.interpolate import CubicHermiteSpline
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion.constraints import Target
-from dolfinopt.motion.curves import Derivatives
 from dolfinopt.motion.measured import SAMPLES, TURN_LIMIT
 from dolfinopt.motion.singular import BranchLost, Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached
 from dolfinopt.motion.task import Task
+from dolfinopt.paths import Values
 
 LEAST_STEP = 1e-6  # of the motion: behind a shorter step there is no continuation
 REFINED = 4  # instants a sample at which singular positions are looked for
@@ -58,7 +58,7 @@ class Follower:
             f"are not told apart; change {self.task.words.motion} or the arms' lengths"
         )
 
-    def at(self, t: np.ndarray) -> Derivatives:
+    def at(self, t: np.ndarray) -> Values:
         """Return all coordinates and two derivatives (n, R) at instants t (n,), s.
 
         Raises:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.motion.curves import Derivatives
 from dolfinopt.multibody.dimension import SpaceTurning
+from dolfinopt.paths import Values
 
 RPY = ("roll", "pitch", "yaw")
 VECTOR = ("rx", "ry", "rz")
@@ -42,7 +42,7 @@ def relative_vectors(R: np.ndarray) -> np.ndarray:
     return vectors
 
 
-def turning(start: np.ndarray, vectors: Derivatives) -> Derivatives:
+def turning(start: np.ndarray, vectors: Values) -> Values:
     """Return R (n, 3, 3), angular velocity and acceleration (n, 3) in the ground's frame.
 
     Args:

@@ -8,10 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.motion.constraints import Constraints, Target
-from dolfinopt.motion.curves import Words
 from dolfinopt.multibody.ranks import least_norm
 
 NEWTON_STEPS = 5  # from samples that are right to 1e-5, three leave rounding
+
+
+@dataclass(frozen=True)
+class Words:
+    """What messages name: where the motion is stated, and the keys that change it and its start."""
+
+    source: str
+    motion: str
+    start: str
 
 
 @dataclass(frozen=True, eq=False)

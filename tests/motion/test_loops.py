@@ -220,7 +220,7 @@ DURATION, SPEED = 0.05, 150.0  # s, rad/s
 def crank(t: np.ndarray, law: str = "quintic") -> tuple[np.ndarray, ...]:
     """Return angle and rates of the first joint (n, 1)."""
     one = law_for(law, 1.0, Limits(np.inf, np.inf, np.inf), 0.25)
-    return tuple(x[:, None] for x in rotation(t, one, SPEED, 0.4, DURATION))
+    return rotation(t, one, SPEED, 0.4, DURATION)
 
 
 def test_run_up_of_a_crank() -> None:
