@@ -446,7 +446,8 @@ def _follower(scene: Scene, stamp: int) -> Follower:
     unknown = [k for k in range(len(names)) if k not in given]
     slides = np.array([unit == "m" for unit in scene.rigid_units.values()])
     has_path = motion.path not in ("joints", "rotation")
-    constraints = Constraints(skeleton(scene), loops_of(scene) or Loops(), slides, has_path)
+    turned = has_path and rows_of(scene).start is not None
+    constraints = Constraints(skeleton(scene), loops_of(scene) or Loops(), slides, has_path, turned)
     if not constraints.loops.ties:
         _check_joints(scene, constraints, unknown)
     guess, width = _guess(scene)

@@ -56,7 +56,7 @@ def nearest(
         free: coordinates that move.
         rows: equations that count.
     """
-    constraints, turned = task.constraints, target.turning is not None
+    constraints = task.constraints
     units = constraints.units[free]
 
     def pose(x: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ def nearest(
         return padded(-constraints.error(pose(x), target)[0, rows] / constraints.reach)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        return padded(constraints.at(pose(x)).rows(turned)[0, rows][:, free])
+        return padded(constraints.at(pose(x)).rows()[0, rows][:, free])
 
     if len(free) == 0:
         off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
@@ -102,7 +102,7 @@ def start_of(task: Task) -> Start:
     start, reach = Start(q, usual, counts, misfit), task.constraints.reach
     if off > start.tolerance(reach):
         raise unreached(task, 0.0, q, target)
-    _check_path(task, usual, target)
+    _check_path(task, usual)
     return start
 
 
@@ -141,7 +141,7 @@ def _usual(task: Task, q: np.ndarray, target: Target) -> tuple[np.ndarray, Count
     A special pose would miscount, and so would an open one: the start is moved along the closures,
     with all coordinates free, whatever drives ask for.
     """
-    constraints, turned = task.constraints, target.turning is not None
+    constraints = task.constraints
     free, k = np.union1d(task.passive, task.driven), constraints.loops.count
     closing = slice(0, k)
     pose, misfit = nearest(task, q, target, free, closing)
@@ -149,7 +149,7 @@ def _usual(task: Task, q: np.ndarray, target: Target) -> tuple[np.ndarray, Count
         raise unreached(task, 0.0, pose, target)
 
     def rows(q: np.ndarray) -> np.ndarray:
-        return constraints.at(q[None]).rows(turned)[0]
+        return constraints.at(q[None]).rows()[0]
 
     share = max(RANK_SHARE, MISFIT_FACTOR * misfit / constraints.reach)
     G = rows(pose)[closing, free]
@@ -193,9 +193,9 @@ def _check(task: Task, counts: Counts) -> None:
         )
 
 
-def _check_path(task: Task, usual: np.ndarray, target: Target) -> None:
+def _check_path(task: Task, usual: np.ndarray) -> None:
     """Raise where path and closures do not determine the unknowns even at usual poses."""
-    G = task.constraints.at(usual[None]).rows(target.turning is not None)[0, :, task.unknown].T
+    G = task.constraints.at(usual[None]).rows()[0, :, task.unknown].T
     if (found := rank(G)) < len(task.unknown):
         null = np.abs(np.linalg.svd(G)[2][found:]).max(axis=0)
         idle = task.called(task.unknown[null > SINGULAR_SHARE])

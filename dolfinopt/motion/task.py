@@ -69,8 +69,8 @@ class Task:
 
     def newton(
         self, q: np.ndarray, target: Target, enough: float = 1e-9
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return poses (n, R) by Newton's method, the last steps (n, u) and G (n, k, R) before.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses (n, R) by Newton's method, and the last steps (n, u).
 
         Steps are least squares where there are more equations than unknowns: what they leave is
         the misfit of the links.
@@ -79,38 +79,32 @@ class Task:
             numpy.linalg.LinAlgError: a singular pose.
         """
         units, before = self.constraints.units[self.unknown], np.inf
-        turned, reach = target.turning is not None, self.constraints.reach
         for _ in range(NEWTON_STEPS):
             here = self.constraints.at(q)
-            G = here.rows(turned)
-            step = least_norm(G[:, :, self.unknown], here.error(target) / reach)
+            error = here.error(target) / self.constraints.reach
+            step = least_norm(here.rows()[:, :, self.unknown], error)
             q = q.copy()
             q[:, self.unknown] += step * units
             size = float(np.abs(step).max(initial=0.0))
             if size < enough or size > 10.0 * before:
                 break
             before = size
-        return q, step, G
+        return q, step
 
-    def rates(self, q: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:
-        """Return rates and accelerations (n, R) of poses on the path, exact to rounding."""
-        here, turned = self.constraints.at(q), target.turning is not None
-        G = here.rows(turned)
-        qd = self.velocity(G, target)
-        right = self.constraints.right(target, 2) - here.acceleration(qd, turned)
-        return qd, self._solved(G, target.joints[2], right)
+    def rates(self, q: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rates and accelerations (n, R) of poses on the path to rounding, and G there."""
+        here = self.constraints.at(q)
+        G, units = here.rows(), self.constraints.units
 
-    def velocity(self, G: np.ndarray, target: Target) -> np.ndarray:
-        """Return the rates (n, R) by G (n, k, R)."""
-        return self._solved(G, target.joints[1], self.constraints.right(target, 1))
+        def solved(order: int, right: np.ndarray) -> np.ndarray:  # G x = right with x as given
+            x = np.zeros_like(q)
+            x[:, self.given] = target.joints[order]
+            left = right / self.constraints.reach - np.einsum("nkr,nr->nk", G, x / units)
+            x[:, self.unknown] = least_norm(G[:, :, self.unknown], left) * units[self.unknown]
+            return x
 
-    def _solved(self, G: np.ndarray, known: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return x (n, R) with G x = right (n, k), in m, and its given entries (n, g)."""
-        units, found = self.constraints.units, np.zeros((len(G), len(self.names)))
-        found[:, self.given] = known
-        left = right / self.constraints.reach - np.einsum("nkr,nr->nk", G, found / units)
-        found[:, self.unknown] = least_norm(G[:, :, self.unknown], left) * units[self.unknown]
-        return found
+        qd = solved(1, self.constraints.right(target, 1))
+        return qd, solved(2, self.constraints.right(target, 2) - here.acceleration(qd)), G
 
 
 def widest(task: Task, error: np.ndarray) -> tuple[str, float]:
