@@ -14,14 +14,13 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.measured import PREDICTION_LIMIT, SAMPLES, TURN_LIMIT
+from dolfinopt.motion.measured import PREDICTION_LIMIT, SAMPLES
 from dolfinopt.motion.singular import Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached
 from dolfinopt.motion.task import Task
 from dolfinopt.paths import Values
 
 LEAST_STEP = 1e-6  # of the motion: behind a shorter step there is no continuation
-REFINED = 4  # instants a sample at which singular positions are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,8 @@ class Follower:
         samples = self._samples()
         t = samples[0]
         if len(t) > 1:
-            fine = np.interp(np.arange(REFINED * (len(t) - 1) + 1) / REFINED, np.arange(len(t)), t)
+            # Four instants a sample, at which singular positions are looked for.
+            fine = np.interp(np.arange(4 * len(t) - 3) / 4, np.arange(len(t)), t)
             target = self.task.target(fine)
             q = self.task.with_given(CubicHermiteSpline(*samples)(fine), target)
             q = self.task.newton(q, target)[0]
@@ -106,7 +106,7 @@ class Follower:
         target, units = task.target(t), task.constraints.units
         parts = [target.joints[0] / units[task.given], target.place[0] / task.constraints.reach]
         moved = np.abs(np.diff(np.hstack(parts), axis=0)).max(axis=1, initial=0.0)
-        way = np.append(0.0, np.cumsum(moved / TURN_LIMIT + SAMPLES / len(moved)))
+        way = SAMPLES * np.append(0.0, np.cumsum(moved / (2.0 * np.pi) + 1.0 / len(moved)))
         return np.interp(np.linspace(0.0, way[-1], int(np.ceil(way[-1])) + 1), way, t)
 
     def _reached(
@@ -126,19 +126,15 @@ class Follower:
         good = np.abs(last).max() < 1e-5 and off <= PREDICTION_LIMIT
         return (q[0], qd, qdd, G) if good and self._regularity.on_one_side(before, G) else None
 
-    @property
-    def _rough(self) -> float:
-        """Distance that a sample may be off, m: steps of 1e-5 leave less than their square."""
-        reach = self.task.constraints.reach
-        return 1e-8 * reach + self.start.tolerance(reach)
-
     def _lost(self, before: np.ndarray, t: float) -> InputError:
         """Return why there is no pose at t near one (R,): out of reach, or a singular position."""
-        task = self.task
-        for instant in (min(t + task.end / SAMPLES / REFINED, task.end), t):
+        task, reach = self.task, self.task.constraints.reach
+        # Steps of 1e-5 leave less than their square.
+        rough = 1e-8 * reach + self.start.tolerance(reach)
+        for instant in (min(t + 0.01 * task.end, task.end), t):
             target = task.target(np.array([instant]))
             q = task.with_given(before[None], target)[0]
             q, off = nearest(task, q, target, task.unknown)
-            if off > self._rough:
+            if off > rough:
                 return unreached(task, instant, q, target)
         return self._regularity.refusal(before, t)

@@ -35,6 +35,5 @@ SINGULAR_SHARE = 1e-3
 
 # -- follower --------------------------------------------------------------------------------
 
-SAMPLES = 16  # at least
-TURN_LIMIT = 0.4  # rad, or of the reach, of what is prescribed between samples
+SAMPLES = 16  # of a motion at least, and more for each turn of what is prescribed
 PREDICTION_LIMIT = 0.05  # rad, or of the reach, between prediction and pose of a step

@@ -42,13 +42,14 @@ class Regularity:
         if (wrong := np.flatnonzero(sizes.min(axis=1) < SINGULAR_SHARE)).size:
             raise self.refusal(q[wrong[0]], float(t[wrong[0]]))
         for i, j in self._suspects(samples, sizes):
+            near = CubicHermiteSpline(*samples)
             found = minimize_scalar(
-                lambda t, j=j: self.sizes(self._near(samples, t)[None])[0, j],
+                lambda t, j=j, near=near: self.sizes(near(t)[None])[0, j],
                 bounds=t[i : i + 2],
                 method="bounded",
             )
             if found.fun < SINGULAR_SHARE:
-                raise self.refusal(self._near(samples, found.x), float(found.x))
+                raise self.refusal(near(found.x), float(found.x))
 
     def on_one_side(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Return whether two poses, by their G (1, k, R), have no singular position between."""
@@ -85,17 +86,6 @@ class Regularity:
         rises = self.sizes(q[1:] - h * qd[1:]) < sizes[1:]
         low = np.minimum(sizes[:-1], sizes[1:]) < 0.3
         return [(int(i), int(j)) for i, j in np.argwhere(falls & rises & low)]
-
-    def _near(self, samples: Samples, instant: float) -> np.ndarray:
-        """Return the pose (R,) at an instant, as samples have it where Newton's method fails."""
-        target = self.task.target(np.array([instant]))
-        q = self.task.with_given(CubicHermiteSpline(*samples)(np.array([instant])), target)
-        try:
-            other = self.task.newton(q, target)[0]
-        except np.linalg.LinAlgError:
-            return q[0]
-        moved = np.abs(other - q).max() / self.task.constraints.units.max()
-        return other[0] if moved < 0.05 else q[0]
 
     def refusal(self, q: np.ndarray, t: float) -> InputError:
         """Return which closure leaves which joints undetermined at a pose (R,), and when."""

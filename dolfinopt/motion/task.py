@@ -10,8 +10,6 @@ import numpy as np
 from dolfinopt.motion.constraints import Constraints, Target
 from dolfinopt.multibody.ranks import least_norm
 
-NEWTON_STEPS = 5  # from samples that are right to 1e-5, three leave rounding
-
 
 @dataclass(frozen=True)
 class Words:
@@ -52,10 +50,9 @@ class Task:
     words: Words
 
     @property
-    def driven(self) -> np.ndarray:
-        """Places of the coordinates that move and are not passive."""
-        moving = np.union1d(self.unknown, self.given)
-        return np.setdiff1d(moving, self.passive)
+    def moving(self) -> np.ndarray:
+        """Places of the coordinates that are unknown, given or passive."""
+        return np.unique([*self.unknown, *self.given, *self.passive]).astype(int)
 
     def called(self, places: Iterable[int]) -> str:
         """Return names of coordinates."""
@@ -79,7 +76,7 @@ class Task:
             numpy.linalg.LinAlgError: a singular pose.
         """
         units, before = self.constraints.units[self.unknown], np.inf
-        for _ in range(NEWTON_STEPS):
+        for _ in range(5):  # from samples that are right to 1e-5, three leave rounding
             here = self.constraints.at(q)
             error = here.error(target) / self.constraints.reach
             step = least_norm(here.rows()[:, :, self.unknown], error)
