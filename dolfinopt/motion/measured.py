@@ -35,5 +35,5 @@ SINGULAR_SHARE = 1e-3
 
 # -- follower --------------------------------------------------------------------------------
 
-SAMPLES = 16  # of a motion at least, and more for each turn of what is prescribed
+SAMPLES = 12  # of a motion at least, and more for each turn of what is prescribed
 PREDICTION_LIMIT = 0.05  # rad, or of the reach, between prediction and pose of a step
