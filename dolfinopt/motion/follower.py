@@ -14,13 +14,11 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.measured import PREDICTION_LIMIT, SAMPLES
+from dolfinopt.motion.measured import SAMPLES
 from dolfinopt.motion.singular import Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached
 from dolfinopt.motion.task import Task
 from dolfinopt.paths import Values
-
-LEAST_STEP = 1e-6  # of the motion: behind a shorter step there is no continuation
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +62,6 @@ class Follower:
             InputError: the motion cannot be followed, or passes a singular position.
         """
         task, table = self.task, self.table
-        if len(t) == 0:
-            none = np.zeros((0, len(task.names)))
-            return none, none, none
         target = task.target(t)
         q = task.with_given(table(np.clip(t, 0.0, task.end)), target)
         q = task.newton(q, target)[0]
@@ -91,7 +86,7 @@ class Follower:
             if found is not None:
                 t, (q, qd, qdd, G) = ahead.pop(), found
                 samples.append((t, q, qd[0]))
-            elif h > LEAST_STEP * task.end:
+            elif h > 1e-6 * task.end:  # behind a shorter step there is no continuation
                 ahead.append(t + 0.5 * h)
             else:
                 raise self._lost(q, ahead[-1])
@@ -123,7 +118,7 @@ class Follower:
             return None
         off = np.abs((q - near) / task.constraints.units).max()
         # Not a number is not good.
-        good = np.abs(last).max() < 1e-5 and off <= PREDICTION_LIMIT
+        good = np.abs(last).max() < 1e-5 and off <= 0.5 / SAMPLES
         return (q[0], qd, qdd, G) if good and self._regularity.on_one_side(before, G) else None
 
     def _lost(self, before: np.ndarray, t: float) -> InputError:

@@ -133,7 +133,7 @@ def inverse(
     return u
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def bend_of(lengths: tuple[float, ...]) -> Bend:
     """Return the chain of these arms, m."""
     return Bend(lengths)

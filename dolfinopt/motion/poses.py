@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.paths import Values
+from dolfinopt.paths import SAME, Values
 
 RPY = ("roll", "pitch", "yaw")
 VECTOR = ("rx", "ry", "rz")
@@ -31,12 +31,9 @@ def relative_vectors(R: np.ndarray) -> np.ndarray:
     vectors: np.ndarray = Rotation.from_matrix(R[0].T @ R).as_rotvec()
     for k in range(1, len(vectors)):
         before, angle = vectors[k - 1], float(np.linalg.norm(vectors[k]))
-        axis = vectors[k] / angle if angle > 1e-12 else before
-        if angle <= 1e-12:
-            length = float(np.linalg.norm(before))
-            if length == 0.0:
-                continue
-            axis, angle = before / length, 0.0
+        # Without a turn its axis may be any: that before.
+        axis = vectors[k] if angle > SAME else before
+        axis = axis / max(float(np.linalg.norm(axis)), SAME)
         turns = np.round((axis @ before - angle) / (2.0 * np.pi))
         vectors[k] = (angle + 2.0 * np.pi * turns) * axis
     return vectors

@@ -19,7 +19,6 @@ from dolfinopt.motion.measured import (
     MISFIT_FACTOR,
     REACHED_SHARE,
     SINGULAR_SHARE,
-    START_GUESSES,
 )
 from dolfinopt.motion.task import Task, widest
 from dolfinopt.multibody.closures import Distance
@@ -128,7 +127,7 @@ def _nearest_of_many(task: Task, target: Target) -> tuple[np.ndarray, float]:
     guess = task.with_given(_with_lengths(task)[None], target)[0]
     random, best, least = np.random.default_rng(0), guess, np.inf
     units = task.constraints.units[task.unknown]
-    for k in range(START_GUESSES):
+    for k in range(10):  # the first as stated, the others around it at random
         shifted = guess.copy()
         away = random.uniform(-task.width, task.width, len(task.unknown))
         shifted[task.unknown] += (k > 0) * away * units

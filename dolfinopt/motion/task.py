@@ -75,17 +75,15 @@ class Task:
         Raises:
             numpy.linalg.LinAlgError: a singular pose.
         """
-        units, before = self.constraints.units[self.unknown], np.inf
+        units = self.constraints.units[self.unknown]
         for _ in range(5):  # from samples that are right to 1e-5, three leave rounding
             here = self.constraints.at(q)
             error = here.error(target) / self.constraints.reach
             step = least_norm(here.rows()[:, :, self.unknown], error)
             q = q.copy()
             q[:, self.unknown] += step * units
-            size = float(np.abs(step).max(initial=0.0))
-            if size < enough or size > 10.0 * before:
+            if np.abs(step).max(initial=0.0) < enough:
                 break
-            before = size
         return q, step
 
     def rates(self, q: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
