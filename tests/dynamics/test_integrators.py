@@ -36,12 +36,13 @@ from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.multibody.tree import plane_chain
-from dolfinopt.paths import Limits, law_for, quintic
+from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
 Motion = Callable[[np.ndarray], RigidMotion]
+QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 HOMES = np.array([0.0, 0.6, 0.8, -0.5])  # m, rad: where the motions begin
 ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
@@ -60,7 +61,7 @@ def still(t: np.ndarray) -> RigidMotion:
 
 def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMotion:
     """Return a quintic motion of that size over 0.6 s, then rest."""
-    s, sd, sdd = quintic(t, ENDS[1])
+    s, sd, sdd = QUINTIC(t, ENDS[1])
     home = np.resize(HOMES, len(size))
     return RigidMotion(home + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size))
 
