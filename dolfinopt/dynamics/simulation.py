@@ -28,6 +28,7 @@ from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Loops, Tie
+from dolfinopt.multibody.dimension import SPACE
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
     deviation,
@@ -40,7 +41,7 @@ from dolfinopt.multibody.loads import load_coefficients as coefficients_of
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import SPACE, Rates, ShapeIntegrals, add_integrals
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.profiling import Profile
@@ -794,7 +795,7 @@ def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     wide = body.in_basis(np.eye(q, q + more))
     w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
     k = 1 + q + np.arange(more)  # beside the reference position and the modes
-    if len(body.W) == len(SPACE):
+    if len(body.W) == SPACE.g:
         _probe_space(w, W, outboard, k)
         K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
         return replace(wide, w=w, W=W, outboard=outboard, K=K)

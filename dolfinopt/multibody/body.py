@@ -66,7 +66,7 @@ class Constants:
     def __init__(self, body: ShapeIntegrals) -> None:
         """Take the integrals."""
         self.body, q = body, body.num_modes
-        self.dim, self.turning = DIMENSIONS[len(body.w)]
+        self.dim = DIMENSIONS[len(body.w)]
         self.num_modes = q
         self.T = np.concatenate([body.w[:, 1:], body.W[:, 1:, 0], body.outboard])
         self.K0 = self.L = None

@@ -224,7 +224,7 @@ class ClosedLoops:
     def __init__(self, loops: Loops, posed: Posed) -> None:
         """Take them and the poses."""
         self.loops, self.posed = loops, posed
-        dim: Dimension = DIMENSIONS[len(posed.mechanism.gravity)][0]
+        dim: Dimension = DIMENSIONS[len(posed.mechanism.gravity)]
         self.dim, one, none = dim, np.eye(dim.d), np.zeros(dim.d)
         self._sites = [
             (

@@ -102,7 +102,7 @@ class Interface:
     def turning(self) -> Turning:
         """Its rotation against the body's frame."""
         theta = self.body.conjugates[self.places][self.dim.d :]
-        return self.body.constants.turning(theta[:, 0], theta[:, 1], theta[:, 2])
+        return self.body.constants.dim.turning(theta[:, 0], theta[:, 1], theta[:, 2])
 
     @cached_property
     def _unturned(self) -> Motion:
@@ -293,7 +293,7 @@ class MovingJoint:
     def __init__(self, joint: Joint, inner: Motion, rates: np.ndarray | None) -> None:
         """Take the interface's motion, and the coordinate with its rates (3, n) if there is one."""
         self.joint, self.inner, self.rates = joint, inner, rates
-        self.dim = DIMENSIONS[len(joint.origin)][0]
+        self.dim = DIMENSIONS[len(joint.origin)]
         self.slides = joint.kind == "prismatic"
         self.R, self.r = joint.rotation, joint.origin[:, None]
         if rates is None:
@@ -436,7 +436,7 @@ class MovingRotor:
         """Take the joint, the interface's motion, the motor's speed and acceleration (2, n)."""
         assert joint.rotor is not None
         a, self.w, wd = inner
-        self.dim = dim = DIMENSIONS[len(joint.origin)][0]
+        self.dim = dim = DIMENSIONS[len(joint.origin)]
         self.axis = dim.rotated(joint.rotation, joint.axis[:, None])
         self.inertia, self.ratio = joint.rotor.inertia, joint.rotor.ratio
         speed, change = ((self.axis * x).sum(axis=0) for x in (self.w, wd))

@@ -36,7 +36,7 @@ class Section:
             self.bent = np.tensordot(constants.K0[places], e, 1)
             moved -= 0.5 * np.einsum("pkn,kn->pn", self.bent, e)
         self.place = self.place + moved[:d]
-        self.turning = constants.turning(*(moved[d:],) * 3)  # of its rates none is asked for
+        self.turning = constants.dim.turning(*(moved[d:],) * 3)  # of its rates none is asked for
 
 
 class Posed:

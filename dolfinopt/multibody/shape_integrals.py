@@ -21,15 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.multibody.dimension import DIMENSIONS, components
+
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
     from dolfinopt.fem.geometric_stiffness import UnitLoads
     from dolfinopt.reduction import Basis
-
-# E_c of plane motion: A = wd S - w^2 I, and twice Omega = 2 w S.
-PLANE = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]]])
-# E_ab has a one at (a, b): W_ab = int N_a' N_b.
-SPACE = np.eye(9).reshape(9, 3, 3)
 
 
 @dataclass(frozen=True)
@@ -155,10 +152,7 @@ class ShapeIntegrals:
     @cached_property
     def M(self) -> np.ndarray:
         """Int Phi_k . Phi_l (q, q)."""
-        modes = self.W[:, 1:, 1:]
-        if len(modes) == len(SPACE):  # W_xx + W_yy + W_zz
-            return np.asarray(modes[0] + modes[4] + modes[8])
-        return np.ascontiguousarray(modes[0])
+        return np.tensordot(DIMENSIONS[len(self.w)].trace[:, 0], self.W[:, 1:, 1:], 1)
 
     @cached_property
     def G(self) -> np.ndarray:
@@ -291,21 +285,6 @@ def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.
 # -- from finite elements --------------------------------------------------------------------
 
 
-def augmented(points: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """Return the nodal fields N = [X, V] (n_nodes, d, 1 + q)."""
-    return np.concatenate([points[:, :, None], V], axis=2)
-
-
-def generators(dimension: int) -> np.ndarray:
-    """Return the matrices E_c (g, d, d) of the plane or of space."""
-    return PLANE if dimension == 2 else SPACE
-
-
-def _diagonal(E: np.ndarray) -> np.ndarray:
-    """Return which of E_c have a trace: those whose integrals M is the sum of."""
-    return np.trace(E, axis1=1, axis2=2) != 0.0
-
-
 def by_modal_loads(body: ShapeIntegrals, by: ShapeIntegrals) -> tuple[ShapeIntegrals, np.ndarray]:
     """Return derivatives by integrals without L, and those by the K0 that it is made of.
 
@@ -318,7 +297,7 @@ def by_modal_loads(body: ShapeIntegrals, by: ShapeIntegrals) -> tuple[ShapeInteg
     """
     L, W = body.along_modes, by.W.copy()
     by_K0 = np.linalg.solve(body.M, by.along_modes.reshape(len(L), -1)).reshape(L.shape)
-    diagonal = _diagonal(generators(len(by.w)))
+    diagonal = DIMENSIONS[len(by.w)].trace[:, 0] > 0.0
     W[diagonal, 1:, 1:] -= np.tensordot(by_K0, L, ((1, 2), (1, 2)))
     return replace(by, W=W), by_K0
 
@@ -338,14 +317,14 @@ def shape_integrals(
         loads: of that design, whose stress stiffens the body; None of a linear body.
     """
     q = basis.V.shape[2]
-    E = generators(arm.points.shape[1])
-    mass, w, W = integrated(arm, basis, E)
+    dim = DIMENSIONS[arm.points.shape[1]]
+    mass, w, W = integrated(arm, basis, dim.E)
     K0 = by_modes = by_outboard = np.zeros((0, q, q))
     if loads is not None:
         ends = [loads.num_frame, loads.num_inertial]
         K0, by_modes, by_outboard = np.split(loads.geometric_stiffness(basis.V), ends)
     if len(by_modes):
-        M = W[_diagonal(E), 1:, 1:].sum(axis=0)
+        M = np.tensordot(dim.trace[:, 0], W[:, 1:, 1:], 1)
         by_modes = np.linalg.solve(M, by_modes.reshape(q, -1)).reshape(by_modes.shape)
     return ShapeIntegrals(
         mass=mass,
@@ -402,7 +381,7 @@ def _assembled(
 ) -> np.ndarray:
     """Return W (g, 1 + q, 1 + q) of int X' E_c X, int Phi' E_c X and int Phi' E_c Phi."""
     # The integral with E_c' is the transposed one: exactly, so that rounding goes.
-    partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
+    partners = np.einsum("cab,eba->ce", components(E), E)
     q = first.shape[1]
     W = np.empty((len(E), 1 + q, 1 + q))
     W[:, 0, 0] = 0.5 * (second + partners @ second)
@@ -441,7 +420,7 @@ def mass_partners(points: np.ndarray, V: np.ndarray, by: ShapeIntegrals) -> Mass
         V: (n, d, q) modes.
         by: derivatives by the integrals.
     """
-    N, E = augmented(points, V), generators(points.shape[1])
+    N, E = np.concatenate([points[:, :, None], V], axis=2), DIMENSIONS[points.shape[1]].E
     unit = np.zeros_like(N[:, :, :1])
     unit[:, 0] = 1.0  # m = int 1_x . 1_x
     quadratic = np.einsum("cab,nak,ckl->nbl", E, N, by.W, optimize=True)

@@ -228,7 +228,7 @@ class Joint:
     @cached_property
     def turns(self) -> np.ndarray:
         """A revolute joint's rotation by (1, sin(angle), 1 - cos(angle)) (d, d, 3)."""
-        R, S = self.rotation, DIMENSIONS[len(self.origin)][0].skew(self.axis)
+        R, S = self.rotation, DIMENSIONS[len(self.origin)].skew(self.axis)
         return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
@@ -296,7 +296,7 @@ class Mechanism:
     @property
     def dim(self) -> Dimension:
         """What differs between the plane and space."""
-        return DIMENSIONS[len(self.gravity)][0]
+        return DIMENSIONS[len(self.gravity)]
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:

@@ -16,7 +16,8 @@ from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import LoadFields, element_centres
 from dolfinopt.mesh import compat
-from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
+from dolfinopt.multibody.dimension import SPACE
+from dolfinopt.multibody.shape_integrals import STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BOUND_BATCH_INSTANTS,
@@ -230,7 +231,7 @@ def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[Arm
 
 def load_matrix(body: ShapeIntegrals) -> np.ndarray:
     """Return P = V' L (q, 7 + 2 q), in space (q, 18 + 9 q): every load's part in the modes."""
-    if len(body.W) == len(SPACE):
+    if len(body.W) == SPACE.g:
         q, (of_X, of_modes) = body.num_modes, (body.W[:, 1:, 0], body.W[:, 1:, 1:])
         elastic = of_modes.swapaxes(0, 1).reshape(q, -1)
         return np.hstack([body.C.T, of_X.T, body.outboard.T, elastic])
@@ -311,7 +312,7 @@ def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> Shap
     """Return the derivatives by a body from those by P and K."""
     q = body.num_modes
     w, W = np.zeros_like(body.w), np.zeros_like(body.W)
-    if len(W) == len(SPACE):
+    if len(W) == SPACE.g:
         b = len(body.outboard)
         outboard = by_P[:, 12 : 12 + b].T
         w[:, 1:], W[:, 1:, 0] = by_P[:, :3].T, by_P[:, 3:12].T
