@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Load, Motion, Weights
+from dolfinopt.multibody.body import BodyMotion, Load, Motion
 from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -51,7 +51,7 @@ def body_gradient(
     for i in reversed(tree.order):
         link, own = links[i], zeta[tree.slices[i]]
         by = [_motion_gradient(link.body, moves[i])]
-        outboard: dict[int, Weights] = {}
+        outboard: dict[int, np.ndarray] = {}
         if link.body.is_flexible:
             of_rows = np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
             by.append(_split(link.body, of_rows))
@@ -74,7 +74,7 @@ def body_gradient(
                 both = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
                 outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
                 if (i, s) in by_rotation:
-                    outboard[s].value[link.body.dim.d :] += by_rotation[i, s]
+                    outboard[s][link.body.dim.d :, 0] += by_rotation[i, s]
         by_motion[i] = _sum_motions(by)
         gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
     return [gradient[i] for i in range(len(links))]
@@ -157,8 +157,8 @@ def _interface_weights(
     virtual: Load,
     zeta: np.ndarray,
     displaced: Motion,
-) -> Weights:
-    """Return the derivatives (b, n) by (u, theta), their rates and variation."""
+) -> np.ndarray:
+    """Return the derivatives (b, 4, n) by (u, theta), their rates and variation."""
     # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
     # frame, zeta (q, n) its multipliers; `displaced` are those by (u, theta) and their rates
     # through the interface's motion.
@@ -173,4 +173,4 @@ def _interface_weights(
         turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
     value, rate, second = displaced
     value = value + np.concatenate([-dim.velocity(virtual[1], force), turned])
-    return Weights(value, rate, second, interface.load_coefficients(load))
+    return np.stack([value, rate, second, interface.load_coefficients(load)], axis=1)

@@ -68,8 +68,8 @@ def load_coefficients(mechanism: Mechanism, motion: RigidMotion, rates: Rates) -
     loads = _body_loads(links, inward_pass(mechanism, links).outboard)
     found = []
     for link, p in zip(links, loads, strict=True):
-        elastic = link.body.accelerations(link.body.z)
-        found.append(-np.hstack([p, elastic.reshape(-1, len(p)).T]))
+        elastic = link.body.accelerations.reshape(-1, len(p))
+        found.append(-np.hstack([p, elastic.T]))
     return found
 
 

@@ -115,49 +115,17 @@ class ShapeIntegrals:
 
     def __add__(self, other: ShapeIntegrals) -> ShapeIntegrals:
         """Return the sum of derivatives, integral by integral."""
-        return ShapeIntegrals(*(getattr(self, i.name) + getattr(other, i.name) for i in TABLE))
+        return add_integrals(self, integrals_of(other))
 
     @property
     def is_stiffened(self) -> bool:
         """Whether geometric stiffness is known."""
         return len(self.K0) > 0
 
-    # -- as the equations of plane motion name them ----------------------------------------------
-
-    @cached_property
-    def moment(self) -> np.ndarray:
-        """First moment c = int X (d,), kg m."""
-        return np.ascontiguousarray(self.w[:, 0])
-
-    @cached_property
-    def C(self) -> np.ndarray:
-        """Int Phi (d, q)."""
-        return np.ascontiguousarray(self.w[:, 1:])
-
-    @cached_property
-    def inertia(self) -> float:
-        """J = int X . X, kg m2; plane bodies."""
-        return float(self.W[0, 0, 0])
-
-    @cached_property
-    def j(self) -> np.ndarray:
-        """Int X . Phi_k (q,); plane bodies."""
-        return np.ascontiguousarray(self.W[0, 0, 1:])
-
-    @cached_property
-    def r(self) -> np.ndarray:
-        """Int (S X) . Phi_k (q,); plane bodies."""
-        return np.ascontiguousarray(self.W[1, 1:, 0])
-
     @cached_property
     def M(self) -> np.ndarray:
         """Int Phi_k . Phi_l (q, q)."""
         return np.tensordot(DIMENSIONS[len(self.w)].trace[:, 0], self.W[:, 1:, 1:], 1)
-
-    @cached_property
-    def G(self) -> np.ndarray:
-        """Int Phi_k . (S Phi_l) (q, q), skew; plane bodies."""
-        return np.ascontiguousarray(self.W[1, 1:, 1:])
 
     def inertia_about_centre(self) -> tuple[np.ndarray, np.ndarray]:
         """Return centre (3,), m, and inertia (3, 3) about it, kg m2, undeformed and in space."""
@@ -217,11 +185,10 @@ def plane_body(
 
     K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
     """
-    q = len(K)
-    none = np.zeros((0, q, q))
-    W = np.zeros((2, 1 + q, 1 + q))
-    W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
-    W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
+    none = np.zeros((0, *K.shape))
+    W = np.array(
+        [np.block([[inertia, j], [j[:, None], M]]), np.block([[0.0, 0.0 - r], [r[:, None], G]])]
+    )
     w, K0 = np.column_stack([moment, C]), none if K0 is None else K0
     further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
     return ShapeIntegrals(
@@ -270,16 +237,10 @@ def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.
         if len(value) == 0:
             return np.zeros((0, T.shape[1], T.shape[1]))
         return np.tensordot(np.linalg.pinv(T), _transformed(value, T, 2, first), 1)
-    q = T.shape[1]
-    out = np.empty((*value.shape[:-rank], *(first + q,) * rank))
-    if rank == 1:
-        out[..., :first], out[..., first:] = value[..., :first], value[..., first:] @ T
-        return out
-    out[..., :first, :first] = value[..., :first, :first]
-    out[..., :first, first:] = value[..., :first, first:] @ T
-    out[..., first:, :first] = (value[..., first:, :first].swapaxes(-1, -2) @ T).swapaxes(-1, -2)
-    out[..., first:, first:] = T.T @ value[..., first:, first:] @ T
-    return out
+    every = np.zeros((first + T.shape[0], first + T.shape[1]))
+    every[range(first), range(first)], every[first:, first:] = 1.0, T
+    out = value @ every
+    return out if rank == 1 else every.T @ out
 
 
 # -- from finite elements --------------------------------------------------------------------
@@ -445,12 +406,19 @@ def rigid_body(
         inertia: about it, kg m2.
         outboard_point: (2,) m.
     """
-    none, square = np.zeros(0), np.zeros((0, 0))
-    modes, outboard = np.zeros((2, 0)), np.zeros((3, 0))
-    return plane_body(
-        mass, moment, inertia, modes, none, none, square, square, square, square, outboard,
-        outboard_point,
-    )  # fmt: skip
+    return _rigid(mass, moment, 0.5 * inertia * np.eye(2), outboard_point[None])
+
+
+def _rigid(
+    mass: float, moment: np.ndarray, second: np.ndarray, points: np.ndarray
+) -> ShapeIntegrals:
+    """Return a rigid body of moments int X (d,) and int X X' (d, d), interfaces at `points`."""
+    dim, square, none = DIMENSIONS[len(moment)], np.zeros((0, 0)), np.zeros((0, 0, 0))
+    W = np.einsum("cab,ab->c", dim.E, second)[:, None, None]
+    modes = np.zeros((dim.b * len(points), 0))
+    return ShapeIntegrals(
+        float(mass), moment[:, None], W, square, square, modes, points[0], none, none, points[1:]
+    )
 
 
 def rigid_spatial_body(
@@ -473,19 +441,8 @@ def rigid_spatial_body(
     r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
     # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
     second = 0.5 * np.trace(tensor) * np.eye(3) - tensor + mass * np.outer(r, r)
-    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
-    return ShapeIntegrals(
-        mass=float(mass),
-        w=(mass * r)[:, None],
-        W=second.reshape(9, 1, 1),
-        K=square,
-        D=square,
-        outboard=np.zeros((6 + 6 * len(further), 0)),
-        outboard_point=np.asarray(outboard_point, dtype=float),
-        K0=np.zeros((0, 0, 0)),
-        K0_outboard=np.zeros((0, 0, 0)),
-        further_points=further,
-    )
+    points = np.reshape([outboard_point, *further_points], (-1, 3)).astype(float)
+    return _rigid(mass, mass * r, second, points)
 
 
 def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:
