@@ -30,8 +30,8 @@ from dolfinopt.dynamics.collocation import (
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
-    ADJOINT_CORRECTION_SHARE,
     ADJOINT_CORRECTIONS_LIMIT,
+    ROUNDING,
 )
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, slow_coordinates
 from dolfinopt.dynamics.system import Linearisation
@@ -155,7 +155,7 @@ def _answered(
     found, stages = matrix.solve_transposed(by_a, by_y, after), matrix.stages
     if exact is matrix.tangent:
         return found, _before(stages, by_y + _gradient(stages, exact, found)[1], after)
-    enough = ADJOINT_CORRECTION_SHARE * np.abs(found).max()
+    enough = ROUNDING * np.abs(found).max()
     left, by_first, rest = found, by_y, np.zeros_like(after)
     found = np.zeros_like(left)
     steps: list[tuple[np.ndarray, ...]] = []  # with what they take away, and dJ by first states

@@ -12,9 +12,8 @@ import numpy as np
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
+    FILE_ROUNDING,
     KEPT_INSTANTS_LIMIT,
-    MOTIONS_KEPT,
-    SAME_INSTANT_SHARE,
 )
 from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
 from dolfinopt.errors import InputError
@@ -65,7 +64,7 @@ def _motion_at(scene: Scene, stamp: int, t: np.ndarray) -> RigidMotion:
     return _kept_motion(scene, stamp, np.asarray(t, dtype=float).tobytes())
 
 
-@lru_cache(maxsize=MOTIONS_KEPT)
+@lru_cache(maxsize=16)  # an iteration asks for eight
 def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
     return rigid_motion(np.frombuffer(instants), scene)
 
@@ -176,7 +175,7 @@ def with_ends(
     instants: tuple[float, ...], tables: Iterable[Table], horizon: float
 ) -> tuple[float, ...]:
     """Return the breakpoints, s, and among them the ends of tables, beyond which they are zero."""
-    apart, breakpoints = SAME_INSTANT_SHARE * horizon, list(instants)
+    apart, breakpoints = FILE_ROUNDING * horizon, list(instants)
     for table in tables:
         end = float(table.t[-1])
         if end < horizon and min(abs(end - other) for other in breakpoints) > apart:

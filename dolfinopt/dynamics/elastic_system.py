@@ -11,15 +11,11 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
+from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.measured import (
-    EQUILIBRIUM_ITERATIONS,
-    EQUILIBRIUM_KEPT_CONTRACTION,
-    EQUILIBRIUM_ROUNDING_ERROR,
-    EQUILIBRIUM_STALLED_ERROR,
-    MEAN_MASS_INSTANTS,
     ROUNDING,
 )
-from dolfinopt.dynamics.system import Linearisation, State, System, relative_error
+from dolfinopt.dynamics.system import Linearisation, State
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.gradient import body_gradient
@@ -92,7 +88,13 @@ class ElasticSystem:
     @cached_property
     def _equilibrium(self) -> np.ndarray:
         """That of `initial_state`: every time grid asks for it."""
-        q = static_equilibrium(self)
+        instants, size = self.at(np.zeros(1)), self.num_coordinates
+        rest = np.zeros((1, size))
+        q = equilibrium(
+            lambda q: instants.residual(q[None], rest, rest)[0],
+            lambda q: instants.linearise(q[None], rest, rest).dense()[0, :, :size],
+            rest[0],
+        )
         if q is None:
             bearings = bool(self.mechanism.bearings)
             raise ConvergenceError(
@@ -104,7 +106,7 @@ class ElasticSystem:
                 + "material.young_modulus or interpolation.floor, lower motion.gravity, or let the "
                 "motion begin at rest"
             )
-        return q
+        return q[None]
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return the largest sqrt(q' K q) of every arm, see `System.norm`."""
@@ -172,30 +174,6 @@ class ElasticSystem:
         return body_gradient(self.mechanism, instants.motion, q, qd, qdd, multipliers)
 
 
-def static_equilibrium(system: System) -> np.ndarray | None:
-    """Return q (1, N) at rest at t = 0 by Newton's method, or None."""
-    instants, size = system.at(np.zeros(1)), system.num_coordinates
-    q = rest = np.zeros((1, size))
-    before, kept = np.inf, False
-    for _ in range(EQUILIBRIUM_ITERATIONS):
-        residual = instants.residual(q, rest, rest)
-        if not residual.any():  # mostly at once: nothing loads the arms before they move
-            return q
-        if not kept:
-            stiffness = instants.linearise(q, rest, rest).dense()[0, :, :size]
-        try:
-            step = np.linalg.solve(stiffness, -residual[0])[None]
-        except np.linalg.LinAlgError:
-            return None
-        q = q + step
-        length = relative_error(system, step, q)
-        stalled = 0.5 * before <= length <= EQUILIBRIUM_STALLED_ERROR
-        if length <= EQUILIBRIUM_ROUNDING_ERROR or stalled:
-            return q
-        kept, before = length <= EQUILIBRIUM_KEPT_CONTRACTION * before, length
-    return None
-
-
 # -- coordinates in which the elastic residual is nearly uncoupled: each arm's own vibrations ----
 #
 # The preconditioner of elastic systems, see `system.Preconditioner`: it takes stiffness and mass
@@ -220,6 +198,7 @@ class Modes(Generic[Own]):
     inverses: tuple[np.ndarray, ...]
     frequencies: np.ndarray
     guided = True
+    coupled = False
 
     @cached_property
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -260,8 +239,8 @@ def modes_of(system: Own) -> Modes[Own]:
     the rest. The change of coordinates is exact; only how well they uncouple rests on the mean.
     """
     mechanism, size = system.mechanism, system.num_coordinates
-    instants = system.at(np.linspace(0.0, system.breakpoints[-1], MEAN_MASS_INSTANTS))
-    rest = np.zeros((MEAN_MASS_INSTANTS, size))
+    instants = system.at(np.linspace(0.0, system.breakpoints[-1], 3))  # 1 to 9 are as good
+    rest = np.zeros((3, size))
     mass = instants.linearise(rest, rest, rest).dense()[:, :, 2 * size :].mean(axis=0)
     bodies, transforms, inverses, frequencies = [], [], [], []
     for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):

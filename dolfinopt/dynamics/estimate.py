@@ -26,7 +26,7 @@ from dolfinopt.dynamics.collocation import (
 from dolfinopt.dynamics.measured import (
     COMPARED_STEP_COUNTS,
     ESTIMATE_ANGLE,
-    STABILITY_ROUNDING_ERROR,
+    EXACT,
 )
 from dolfinopt.dynamics.newton_matrix import chunks, factorise, up_to_angle
 from dolfinopt.dynamics.system import State, inverse_size
@@ -176,5 +176,5 @@ def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
     R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)
     j = np.unique(np.geomspace(1.0, steps.max(), COMPARED_STEP_COUNTS).round())
     apart = np.abs(np.exp(z[..., None] * j) - R[..., None] ** j)
-    seen = (j <= steps[:, None, None]) & (apart > STABILITY_ROUNDING_ERROR * j)
+    seen = (j <= steps[:, None, None]) & (apart > EXACT * j)
     return np.where(seen, apart, 0.0).max(axis=-1)

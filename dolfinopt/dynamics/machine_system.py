@@ -27,17 +27,17 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
+from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.measured import (
     CLOSURE_COMPLIANCE_SHARE,
     DEVIATION_ROUNDING,
-    EQUILIBRIUM_ITERATIONS,
-    MACHINE_EQUILIBRIUM_ROUNDING_ERROR,
 )
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.tables import motion_at_stages
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.gradient import body_gradient
+from dolfinopt.multibody.measured import RANK_SHARE
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import complement, least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -344,7 +344,7 @@ class MachineSystem:
                 ahead[:, springs.joints] += springs.friction.force(speeds)
         if pushes is not None:
             ahead += pushes
-        return MachineInstants(self, desired, ahead, winding, self._redundant(desired))
+        return MachineInstants(self, desired, ahead, winding, self.redundant_at(desired))
 
     @property
     def num_redundant(self) -> int:
@@ -352,7 +352,7 @@ class MachineSystem:
         _, moving, last = self.ends
         return last - moving - len(self.drives.dependent)
 
-    def _redundant(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray] | None:
+    def redundant_at(self, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray] | None:
         """Return P (n, k, k) and g_0 = P g (n, k), m, of rigid arms on a desired motion."""
         if self.loops is None or self.num_redundant == 0:
             return None
@@ -366,7 +366,7 @@ class MachineSystem:
 
         (N' G_e K^-1 G_e' N)^-1 N' g_0, N spanning P: it is told, not summed in.
         """
-        found = self._redundant(self.motion(np.zeros(1)))
+        found = self.redundant_at(self.motion(np.zeros(1)))
         if self.loops is None or found is None:
             return 0.0
         P, left = (x[0] for x in found)
@@ -409,36 +409,25 @@ class MachineSystem:
 
     def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return y (1, S) at rest at t = 0 and its multipliers (m,), by Newton's method."""
-        instants, ground = self.at(np.zeros(1)), slice(*self.ends[1:])
-        rest, ydd, some = np.zeros_like(y), np.zeros_like(y), self._at_start
-        load = None
-        for _ in range(EQUILIBRIUM_ITERATIONS):
-            residual = instants.residual(y, rest, ydd)[0, some]
-            if not residual.any():
-                return y, ydd[0, ground]
-            matrix = self._at_rest(instants.linearise(y, rest, ydd).dense()[0])[np.ix_(some, some)]
-            size, x = np.abs(matrix).max(axis=1), np.abs(y + ydd)[0, some]
-            if not size.all():
-                break
-            # Rows of like size; the backward error judges what rounding leaves of each.
-            matrix, residual = matrix / size[:, None], residual / size
-            load = np.abs(residual) if load is None else load
-            rounding = (np.abs(matrix) @ x + load).max()
-            try:
-                step = np.linalg.solve(matrix, -residual)
-            except np.linalg.LinAlgError:
-                break
-            if np.abs(residual).max() <= 10.0 * MACHINE_EQUILIBRIUM_ROUNDING_ERROR * rounding:
-                return y, ydd[0, ground]
-            change = np.zeros(y.shape[1])
-            change[some] = step
-            ydd[0, ground] += change[ground]
-            change[ground] = 0.0
-            y = y + change
-            if np.abs(change).max() <= MACHINE_EQUILIBRIUM_ROUNDING_ERROR * max(
-                1.0, np.abs(y).max()
-            ):
-                return y, ydd[0, ground]
+        instants, some = self.at(np.zeros(1)), self._at_start
+
+        def states(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            whole, ydd = y.copy(), np.zeros_like(y)
+            whole[0, some] = x
+            ground = slice(*self.ends[1:])
+            ydd[:, ground] = whole[:, ground]
+            whole[:, ground] = 0.0
+            return whole, np.zeros_like(y), ydd
+
+        x = equilibrium(
+            lambda x: instants.residual(*states(x))[0, some],
+            lambda x: self._at_rest(instants.linearise(*states(x)).dense()[0])[np.ix_(some, some)],
+            y[0, some],
+            size=1.0,  # rad: nothing may load a machine
+        )
+        if x is not None:
+            y, _, ydd = states(x)
+            return y, ydd[0, slice(*self.ends[1:])]
         limited = bool(self.drives.limited.any())
         raise ConvergenceError(
             "the machine finds no equilibrium at t = 0: the drives are too "
@@ -587,6 +576,17 @@ class MachineModes:
     frequencies: np.ndarray
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
     guided = True
+
+    @cached_property
+    def coupled(self) -> bool:
+        """Whether directions in which closures hold rigid arms too often turn as the machine moves.
+
+        Elastic coordinates then bear what these multipliers would: without their columns Newton's
+        step and the error's estimate are off by the share of compliance that closures have.
+        """
+        t = np.linspace(0.0, self.system.breakpoints[-1], 5)
+        found = self.system.redundant_at(self.system.motion(t))
+        return found is not None and bool(np.ptp(found[0], axis=0).max() > RANK_SHARE)
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., S) of coordinates (..., S)."""

@@ -15,7 +15,6 @@ from dolfinopt.dynamics.collocation import Solution, Stages, radau_iia, stages_o
 from dolfinopt.dynamics.estimate import Estimate, estimate
 from dolfinopt.dynamics.measured import (
     DEFLECTION_LIMIT,
-    FAILED_STEP_RATIO,
     LEAST_STEP_SHARE,
     STEPS_LIMIT,
     WINDOW_STEPS,
@@ -173,7 +172,7 @@ class March:
         steps, self._growth = len(grid) - 1, 1.0
         self._count = max(WINDOW_STEPS[0], steps // 4)
         if steps <= WINDOW_STEPS[0]:
-            self._h = FAILED_STEP_RATIO * (grid[1] - grid[0])
+            self._h = 0.5 * (grid[1] - grid[0])
 
     def _accept(self, stages: Stages, grid: np.ndarray, a: np.ndarray, errors: Estimate) -> None:
         """Keep the steps up to the first poor one, and choose the next ones."""

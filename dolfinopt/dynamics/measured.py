@@ -7,9 +7,7 @@ Each stands with its unit and what was measured.
 
 STEPS_PER_PERIOD = 8.0  # of the slowest vibration, on a first grid
 FIRST_GRID_STEPS = 400  # at most: where eight a period are 9 000, a motion may need 90
-# Error of such steps with four stages, paper's example, and its ratio with one stage more.
-USUAL_ERROR = 1.1e-4
-USUAL_ERROR_RATIO = 1.0 / 35.0
+USUAL_TOLERANCE = 2.8e-4  # that such steps with four stages meet: paper's example
 # Of the tolerance, accepted: the estimate is 0.55 to 1 times the error; and aimed at: it varies by
 # some ten percent from design to design, and a grid that is refined costs more than one too fine.
 ACCEPTED_SHARE = 0.6
@@ -19,8 +17,6 @@ FINER_GRID_RATIOS = (1.15, 2.5, 6.0)
 NEIGHBOURS_RATIO = 3.0  # of the lengths of two steps in succession, at most
 GRIDS_LIMIT = 12
 STEPS_LIMIT = 30_000  # over the horizon
-# An error above this is no estimate: it tells that the steps find another motion than finer ones.
-LOST_MOTION_ERROR = 0.5
 
 # -- Newton's method -------------------------------------------------------------------------
 
@@ -36,7 +32,6 @@ SETTLED_SHARE = 1e-2  # step, of the tolerance, that no matrix shortens: roundin
 
 MARCH_ERROR_SHARE = 0.1  # of the tolerance, that a step may add; with 0.3 one grid more follows
 WINDOW_STEPS = (4, 32)  # solved together, fewest and most
-FAILED_STEP_RATIO = 0.4  # of the steps after a failure
 LEAST_STEP_SHARE = 1e-7  # of the horizon: where shorter ones fail the motion has no continuation
 # Deflection over a body's length beyond which its motion is refused. A cantilever that linear
 # elasticity bends by 0.5 of its length bends by 0.41, and comes 0.11 closer, which a floating frame
@@ -53,12 +48,9 @@ RESTING_GROUP_SHARE = 1e-3
 # and takes half the time of that with all coordinates dense.
 ESTIMATE_ANGLE = 16.0
 COMPARED_STEP_COUNTS = 16  # numbers of steps, about, after which a free vibration is compared
-STABILITY_ROUNDING_ERROR = 1e-14  # of the stability function R, growing with the steps
 
 # -- adjoint ---------------------------------------------------------------------------------
 
-# Of the multipliers, that a correction may have left: their error is a tenth of it or less.
-ADJOINT_CORRECTION_SHARE = 1e-9
 # Steps after which more coordinates are treated densely: of eight arms in space 10, and a matrix
 # that is dense in all of their 48 coordinates costs as much as 50.
 ADJOINT_CORRECTIONS_LIMIT = 20
@@ -66,25 +58,18 @@ ADJOINT_CORRECTIONS_LIMIT = 20
 # -- systems ---------------------------------------------------------------------------------
 
 EQUILIBRIUM_ITERATIONS = 50  # of Newton's method at t = 0: 3 to 6, of machines 3 to 8, or it folds
-# Contraction that keeps the stiffness found at first: of spatial_arm.toml it is 1e-5.
-EQUILIBRIUM_KEPT_CONTRACTION = 1e-3
-EQUILIBRIUM_ROUNDING_ERROR = 1e-14  # relative step at t = 0 below which nothing changes
-MACHINE_EQUILIBRIUM_ROUNDING_ERROR = 1e-13  # the same of machines, beside the coordinates
 # Compliance of closures, over the softest arm's, in directions that no joint which follows moves:
 # 1e-6 moves the deviation of five_bar.toml by 2e-7, 1e-4 by 2e-5.
 CLOSURE_COMPLIANCE_SHARE = 1e-6
-# A relative step below it that is not half of the one before is rounding of an ill-conditioned
-# stiffness.
-EQUILIBRIUM_STALLED_ERROR = 1e-8
 # Relative errors and steps below it that do not fall are rounding; so are T'KT beside the identity
 # and damping beside what is in proportion to the stiffness.
 ROUNDING = 1e-9
+EXACT = 1e-13  # what rounding leaves of a solution, beside its terms
 # rad, or lengths over the reach, of free coordinates: a thousand times their own rounding.
 DEVIATION_ROUNDING = 1e-12
-MEAN_MASS_INSTANTS = 3  # whose mass is averaged: 1 to 9 cost the same iterations
 
-# Between two rows of a table: exact for splines of degree 5 and methods of five stages.
-GAUSS_POINTS = 5
+
+FILE_ROUNDING = 1e-6  # relative, of limits in files, and of instants that are one
 
 # -- build, trajectory -----------------------------------------------------------------------
 
@@ -94,10 +79,7 @@ RESPONSE_INSTANTS_LIMIT = 1_000_000  # at `RESPONSE_INTERVAL`: they take 1 GB an
 # default simulation.tolerance.
 EXTREME_EXCESS_SHARE = 1e-4
 # Desired motions kept, and instants of one: an iteration asks for eight, with up to 3 000 instants.
-MOTIONS_KEPT = 16
 KEPT_INSTANTS_LIMIT = 20_000
-SAME_INSTANT_SHARE = 1e-6  # of the horizon, within which two instants are one
-JOINT_LIMIT_ROUNDING = 1e-6  # relative, of a joint's limit, which files round
 DRIVES_CHUNK = 512  # instants whose matrices are made at once for the drives' derivatives
 
 # -- state_space -----------------------------------------------------------------------------

@@ -43,10 +43,10 @@ def slow_coordinates(stages: Stages, more_than: int = 0) -> np.ndarray:
 def up_to_angle(stages: Stages, limit: float) -> np.ndarray:
     """Return the coordinates that vibrate by an angle w h up to a limit in the median step, rad.
 
-    The slowest one always; all where nothing guides a free coordinate.
+    The slowest one always; all where nothing guides a free coordinate, or closures couple them.
     """
-    angles = stages.angles
-    if not stages.preconditioner.guided:
+    angles, preconditioner = stages.angles, stages.preconditioner
+    if preconditioner.coupled or not preconditioner.guided:
         return np.arange(len(angles))
     return np.flatnonzero(angles <= max(limit, angles.min()))
 

@@ -27,7 +27,6 @@ from dolfinopt.dynamics.measured import (
     AIM,
     FINER_GRID_RATIOS,
     GRIDS_LIMIT,
-    LOST_MOTION_ERROR,
     MARCH_ERROR_SHARE,
     ROUNDING,
     STEPS_LIMIT,
@@ -142,7 +141,7 @@ class _Integration:
             a = None if marching else self._over_horizon()
             marched = a is None
             solution, errors = self.judged(self._marched() if a is None else a)
-            marching = not solution.error <= LOST_MOTION_ERROR
+            marching = not solution.error <= 0.5  # above, finer steps would find another motion
             if marching and marched:
                 break  # finer steps do not find it either
             if marching:

@@ -19,7 +19,7 @@ from dolfinopt.dynamics.march import BEYOND, REMEDY
 from dolfinopt.dynamics.measured import (
     DEFLECTION_LIMIT,
     DRIVES_CHUNK,
-    JOINT_LIMIT_ROUNDING,
+    FILE_ROUNDING,
     MATRIX_BYTES,
 )
 from dolfinopt.dynamics.response_instants import response_instants
@@ -358,7 +358,7 @@ class Trajectory:
                 beyond = [(sign * (q - limit), limit) for limit, sign in ends]
                 over, limit = max(beyond, key=lambda one: float(one[0].max()))
                 at = int(np.argmax(over))
-                met = bool(over[at] <= JOINT_LIMIT_ROUNDING * max(width, abs(limit)))
+                met = bool(over[at] <= FILE_ROUNDING * max(width, abs(limit)))
                 value, instant = float(q[at]), float(self.t[at])
                 yield JointLimit(joint.name, "position", limit, value, instant, length, met)
             for quantity, limit, values, unit in (
@@ -369,7 +369,7 @@ class Trajectory:
                     continue
                 size = np.abs(values[:, k])
                 at = int(np.argmax(size))
-                value, met = float(size[at]), bool(size[at] <= (1.0 + JOINT_LIMIT_ROUNDING) * limit)
+                value, met = float(size[at]), bool(size[at] <= (1.0 + FILE_ROUNDING) * limit)
                 instant = float(self.t[at])
                 yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)
 

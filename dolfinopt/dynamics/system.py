@@ -72,6 +72,7 @@ class Preconditioner(Protocol):
         frequencies: (N,) of every coordinate by itself, rad/s; 0 of what must be treated densely.
         uncoupled: stiffness, damping and mass (N,) of every coordinate by itself.
         guided: whether zero is a guess of the whole motion: then all steps are solved at once.
+        coupled: whether constraints couple fast coordinates: then these are treated densely, too.
     """
 
     @property
@@ -82,6 +83,8 @@ class Preconditioner(Protocol):
     def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
     @property
     def guided(self) -> bool: ...
+    @property
+    def coupled(self) -> bool: ...
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., N) of coordinates q (..., N)."""
@@ -142,6 +145,7 @@ class Unchanged:
     """A system in its own coordinates: all of them are treated densely, and it is marched."""
 
     guided = False
+    coupled = False
 
     def __init__(self, system: System) -> None:
         """Take the system."""

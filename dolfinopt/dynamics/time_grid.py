@@ -13,8 +13,7 @@ from dolfinopt.dynamics.measured import (
     FIRST_GRID_STEPS,
     NEIGHBOURS_RATIO,
     STEPS_PER_PERIOD,
-    USUAL_ERROR,
-    USUAL_ERROR_RATIO,
+    USUAL_TOLERANCE,
 )
 from dolfinopt.dynamics.system import System
 
@@ -33,8 +32,7 @@ def first_grid(system: System, tolerance: float, stages: int) -> np.ndarray:
     count = max(STEPS_PER_PERIOD * horizon * slowest / (2.0 * np.pi), smooth)
     if count > FIRST_GRID_STEPS:  # stiff arms follow their loads, which may be slow
         count = smooth
-    usual = USUAL_ERROR * USUAL_ERROR_RATIO ** (stages - 4)
-    growth = (usual / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
+    growth = (USUAL_TOLERANCE / tolerance) ** (1.0 / (2 * stages - 1))
     return even_steps(system, int(np.ceil(count * np.clip(growth, 0.6, 1.6))))
 
 
@@ -43,7 +41,7 @@ def known_grid(system: System, guess: Solution, tolerance: float, stages: int) -
     if not np.isin(system.breakpoints, guess.time_grid).all():
         return None
     share = (guess.error / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
-    if share * FINER_GRID_RATIOS[0] > 1.0:
+    if share > 0.8:
         return guess.time_grid
     return spread(np.full(len(guess.a), max(share, 0.5)), guess.time_grid, system)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.motion.measured import NAMED_SHARE
+from dolfinopt.motion.measured import SINGULAR_SHARE
 from dolfinopt.multibody.ranks import rank
 
 
@@ -43,11 +43,11 @@ def counts_of(G: np.ndarray, passive: np.ndarray, driven: np.ndarray, share: flo
     own = G[:, passive]
     followed, every = rank(own, share), rank(G[:, [*passive, *driven]], share)
     left, _, right = np.linalg.svd(own)
-    undetermined = np.abs(right[followed:]).max(axis=0, initial=0.0) > NAMED_SHARE
+    undetermined = np.abs(right[followed:]).max(axis=0, initial=0.0) > SINGULAR_SHARE
     held: tuple[int, ...] = ()
     if followed < every:
         moved = left[:, followed:].T @ G
-        held = tuple(int(k) for k in driven if np.abs(moved[:, k]).max() > NAMED_SHARE)
+        held = tuple(int(k) for k in driven if np.abs(moved[:, k]).max() > SINGULAR_SHARE)
     return Counts(
         redundant=len(G) - every,
         undetermined=tuple(passive[undetermined].tolist()),

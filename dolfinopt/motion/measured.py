@@ -24,13 +24,13 @@ REACHED_SHARE = 1e-9  # above which a pose is not reached; Newton's method leave
 FITS_SHARE = 1e-4
 # Times the misfit of such links: singular values, and gaps along the motion, that it makes.
 MISFIT_FACTOR = 30.0
-NAMED_SHARE = 1e-3  # entry of a null vector, from which its coordinate is named
 START_GUESSES = 10  # the first as stated, the others around it at random
 
 # -- singular --------------------------------------------------------------------------------
 
 # Smallest singular value over that of usual poses, below which a pose is singular: a start at a
-# dead centre is a double root, which closing to 1e-12 tells to 1e-6 at best.
+# dead centre is a double root, which closing to 1e-12 tells to 1e-6 at best. Coordinates are named
+# whose entry of a null vector is larger.
 SINGULAR_SHARE = 1e-3
 
 # -- follower --------------------------------------------------------------------------------

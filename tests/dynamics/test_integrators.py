@@ -515,7 +515,7 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
         iterations.append(solution.iterations)
         slow.append(max(size for _, size in matrices))
         assert len(matrices) <= 8  # of two grids
-    assert max(slow) <= 32  # of 96
+    assert max(slow) <= 40  # of 96
     assert max(iterations) <= 24  # on two grids; 18 to 20, by which coordinates are just fast
 
 
