@@ -161,6 +161,15 @@ class Dimension:
         """Return angular velocities (r, ..., n) in other components; in the plane the same."""
         return w if self.r == 1 else product(R, w)
 
+    def turn(self, R: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return vectors and what follows them, angular velocities, in other components."""
+        out = np.empty_like(x)  # (d + r or d + 2 r, ..., n)
+        for first in range(0, len(x), self.d) if self.r > 1 else (0,):
+            out[first : first + self.d] = product(R, x[first : first + self.d])
+        if self.r == 1:
+            out[self.d :] = x[self.d :]
+        return out
+
     def rotation_vector(self, R: np.ndarray) -> np.ndarray:
         """Return the rotation vectors (r, n) of rotations (d, d, n), at most pi long."""
         from scipy.spatial.transform import Rotation  # takes as long to import as NumPy

@@ -65,17 +65,16 @@ class MotionTransform:
         kept = np.r_[0:d, d + r : d + 2 * r]
         return self.matrix[:, kept[:, None], kept].swapaxes(1, 2)
 
-    def transposed(self, by: Motion) -> Motion:
+    def transposed(self, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the carrying frame's motion from those by the carried one's."""
-        a, w, wd = by
-        back = self.turn.swapaxes(0, 1)
-        to = product(back, a), self.dim.rotated(back, w), self.dim.rotated(back, wd)
-        extra = (1, self.by_w, a), (2, self.by_wd, a), (1, self.turned, wd)
-        found = list(to)
-        for place, block, x in extra:
+        d, s = self.dim.d, self.dim.b  # where w and wd begin; (d + 2 r, n) both
+        back, a, wd = self.turn.swapaxes(0, 1), by[:d], by[s:]
+        found = self.dim.turn(back, by)
+        blocks = (d, s, self.by_w, a), (s, None, self.by_wd, a), (d, s, self.turned, wd)
+        for first, last, block, x in blocks:
             if block is not None:
-                found[place] = found[place] + transposed_product(block, x)
-        return found[0], found[1], found[2]
+                found[first:last] += transposed_product(block, x)
+        return found
 
 
 class Interface:
@@ -227,32 +226,26 @@ class Interface:
             if by_theta is not None:
                 by_e[d + r :] += product(by_theta[2], Bd[d:])
         back = self.turning.R.swapaxes(0, 1)
-        parts = out[:d], out[d : d + r], out[d + r :]
-        return np.concatenate([product(back, parts[0]), *(dim.rotated(back, x) for x in parts[1:])])
+        return dim.turn(back, out)
 
-    def by_displacement(self, by: Motion) -> Motion:
-        """Return derivatives by (u, theta), their rates and second ones, each (b, n).
+    def by_displacement(self, by: np.ndarray) -> np.ndarray:
+        """Return derivatives by (u, theta), their rates and second ones (b, 3, n).
 
-        Those by its motion, in its components, are given; of a flexible body.
+        Those by its motion, in its components (d + 2 r, n), are given; of a flexible body.
         """
         body, dim, turning = self.body, self.dim, self.turning
-        a, w, wd = product(turning.R, by[0]), *(dim.rotated(turning.R, x) for x in by[1:])
+        a, w, wd = np.split(dim.turn(turning.R, by), [dim.d, dim.b])
         own_a, own_w, own_wd = self._unturned
         turn = dim.commutator(w, own_w) + dim.commutator(wd, own_wd) - dim.moment(own_a, a)
-        value, rate, second = (
-            turning.jacobian_transposed(turn),
-            turning.jacobian_transposed(w),
-            turning.jacobian_transposed(wd),
-        )
+        out = np.empty((dim.b, 3, a.shape[1]))
+        out[: dim.d, 0] = dim.applied_transposed(body.alpha, a)
+        out[: dim.d, 1], out[: dim.d, 2] = dim.applied_transposed(body.beta, a), a
+        out[dim.d :] = turning.jacobian_transposed(np.stack([turn, w, wd], axis=1))
         if (by_theta := self._by_theta) is not None:
             of_w, of_wd, of_rate = by_theta
-            value = value + transposed_product(of_w, w) + transposed_product(of_wd, wd)
-            rate = rate + transposed_product(of_rate, wd)
-        return (
-            np.concatenate([dim.applied_transposed(body.alpha, a), value]),
-            np.concatenate([dim.applied_transposed(body.beta, a), rate]),
-            np.concatenate([a, second]),
-        )
+            out[dim.d :, 0] += transposed_product(of_w, w) + transposed_product(of_wd, wd)
+            out[dim.d :, 1] += transposed_product(of_rate, wd)
+        return out
 
     def load_by_rates(self, load: Load, kept: np.ndarray) -> np.ndarray:
         """Return the derivative of `in_body` by those e kept (d + r, k, n); `load` its result."""
@@ -276,8 +269,7 @@ class Interface:
     @cached_property
     def rows_by_own_load(self) -> np.ndarray:
         """Derivative of the rows by a load in its own components (d + r, q, n)."""
-        d = self.dim.d
-        return np.concatenate(self.in_interface((self.rows_by_load[:d], self.rows_by_load[d:])))
+        return self.dim.turn(self.turning.R.swapaxes(0, 1), self.rows_by_load)
 
 
 class MovingJoint:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Load, Motion
-from dolfinopt.multibody.frames import Interface
+from dolfinopt.multibody.body import BodyMotion, Load
+from dolfinopt.multibody.frames import Interface, MovingRotor
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -45,7 +45,7 @@ def body_gradient(
     loads = inward_pass(tree, links)
     zeta = np.ascontiguousarray(multipliers.T)
     moves, ends = _virtual_motion(tree, links, zeta, drives)
-    by_motion: dict[int, Motion] = {}
+    by_motion: dict[int, np.ndarray] = {}
     by_rotation = _by_rotation(tree, links, moves, zeta)
     gradient: dict[int, ShapeIntegrals] = {}
     for i in reversed(tree.order):
@@ -53,8 +53,7 @@ def body_gradient(
         by = [_motion_gradient(link.body, moves[i])]
         outboard: dict[int, np.ndarray] = {}
         if link.body.is_flexible:
-            of_rows = np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
-            by.append(_split(link.body, of_rows))
+            by.append(np.einsum("mqn,qn->mn", link.body.rows_by_motion, own))
         for s, interface in link.interfaces.items():
             parts = [links[k].joint.passage.transposed(by_motion[k]) for k in tree.hanging[i, s]]
             parts += [
@@ -64,9 +63,9 @@ def body_gradient(
             ]
             if s in link.carried:
                 parts.append(_motion_gradient(link.carried[s], ends[i, s]))
-            displaced = (np.zeros((link.body.dim.b, zeta.shape[1])),) * 3
+            displaced = np.zeros((link.body.dim.b, 3, zeta.shape[1]))
             if parts:
-                on_interface = _sum_motions(parts)
+                on_interface = np.sum(parts, axis=0)
                 by.append(interface.passage.transposed(on_interface))
                 if link.body.is_flexible:
                     displaced = interface.by_displacement(on_interface)
@@ -75,7 +74,7 @@ def body_gradient(
                 outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
                 if (i, s) in by_rotation:
                     outboard[s][link.body.dim.d :, 0] += by_rotation[i, s]
-        by_motion[i] = _sum_motions(by)
+        by_motion[i] = np.sum(by, axis=0)
         gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
     return [gradient[i] for i in range(len(links))]
 
@@ -109,28 +108,15 @@ def _by_rotation(
     return found
 
 
-def _motion_gradient(body: BodyMotion, virtual: Load) -> Motion:
-    """Return the derivatives of virtual . (F, T) by a body's motion."""
-    return _split(body, np.einsum("ijn,in->jn", body.load_by_motion, np.concatenate(virtual)))
+def _motion_gradient(body: BodyMotion | MovingRotor, virtual: Load) -> np.ndarray:
+    """Return the derivatives of virtual . (F, T) by a motion (d + 2 r, n)."""
+    return np.asarray(np.einsum("ijn,in->jn", body.load_by_motion, np.concatenate(virtual)))
 
 
-def _rotor_gradient(link: Link, virtual: Load, drive: np.ndarray) -> Motion:
+def _rotor_gradient(link: Link, virtual: Load, drive: np.ndarray) -> np.ndarray:
     """Return the derivatives by the motion of what carries a rotor; `drive` (n,) is its motor's."""
     assert link.rotor is not None
-    by = np.einsum("ijn,in->jn", link.rotor.load_by_motion, np.concatenate(virtual))
-    return _split(link.body, by + link.rotor.force_by_motion[:, None] * drive)
-
-
-def _split(body: BodyMotion, x: np.ndarray) -> Motion:
-    d, r = body.dim.d, body.dim.r
-    return x[:d], x[d : d + r], x[d + r :]
-
-
-def _sum_motions(parts: list[Motion]) -> Motion:
-    a, w, wd = parts[0]
-    for one in parts[1:]:
-        a, w, wd = a + one[0], w + one[1], wd + one[2]
-    return a, w, wd
+    return _motion_gradient(link.rotor, virtual) + link.rotor.force_by_motion[:, None] * drive
 
 
 def _virtual_motion(
@@ -156,7 +142,7 @@ def _interface_weights(
     loads: tuple[Load, Load],
     virtual: Load,
     zeta: np.ndarray,
-    displaced: Motion,
+    displaced: np.ndarray,
 ) -> np.ndarray:
     """Return the derivatives (b, 4, n) by (u, theta), their rates and variation."""
     # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
@@ -171,6 +157,7 @@ def _interface_weights(
     if by_theta is not None:
         theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][dim.d :], zeta)
         turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
-    value, rate, second = displaced
-    value = value + np.concatenate([-dim.velocity(virtual[1], force), turned])
-    return np.stack([value, rate, second, interface.load_coefficients(load)], axis=1)
+    weights = np.concatenate([displaced, interface.load_coefficients(load)[:, None]], axis=1)
+    weights[: dim.d, 0] -= dim.velocity(virtual[1], force)
+    weights[dim.d :, 0] += turned
+    return weights

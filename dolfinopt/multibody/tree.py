@@ -39,8 +39,9 @@ def saturated(wanted: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.nda
 
     Args:
         wanted: w (..., R), N, N m.
-        limit: L > 0 (R,), finite.
+        limit: L > 0 (R,); inf without.
     """
+    limit = np.minimum(limit, np.finfo(float).max)
     width = 2.0 * (1.0 - LINEAR_DRIVE_SHARE)
     x = np.clip((np.abs(wanted) / limit - LINEAR_DRIVE_SHARE) / width, 0.0, 1.0)
     bent = LINEAR_DRIVE_SHARE + width * (x - x**4 * (2.5 - 3.0 * x + x * x))
@@ -140,31 +141,21 @@ class Drives:
 
     def force(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return u (n, R) from u_ff, q - q_d and its rate, each (n, R)."""
-        wanted = ahead - self.stiffness * error - self.damping * rate
-        if not self.limited.any():
-            return wanted
-        u = wanted.copy()
-        limits = self.limits[self.limited]
-        u[:, self.limited] = saturated(wanted[:, self.limited], limits)[0]
-        return u
+        return self._saturated(ahead, error, rate)[0]
 
     def passing(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return du / d(wanted force) (n, R): 1 within the limits, 0 beyond."""
-        wanted = ahead - self.stiffness * error - self.damping * rate
-        out = np.ones_like(wanted)
-        limits = self.limits[self.limited]
-        out[:, self.limited] = saturated(wanted[:, self.limited], limits)[1]
-        return out
+        return self._saturated(ahead, error, rate)[1]
+
+    def _saturated(
+        self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return saturated(ahead - self.stiffness * error - self.damping * rate, self.limits)
 
     @property
     def dependent(self) -> np.ndarray:
         """Rigid coordinates that follow from a closed loop."""
         return self.free[~self.driven]
-
-    @cached_property
-    def limited(self) -> np.ndarray:
-        """Where there is a limit (R,)."""
-        return np.isfinite(self.limits)
 
 
 # -- few instants: the same bits wherever arrays lie in memory
