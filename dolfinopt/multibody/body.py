@@ -405,16 +405,11 @@ class BodyMotion:
             outboard: derivatives (b, 4, n) by the interfaces' (u, theta), by number: by their
                 values, rates, second derivatives, and variations by the multipliers.
         """
-        constants, body, dim = self.constants, self.constants.body, self.dim
-        (p, phi), zeta, P = virtual, multipliers, len(constants.T)
-        d, ends = dim.d, dim.d + dim.g
+        constants, body, (p, phi), zeta = self.constants, self.constants.body, virtual, multipliers
+        d, ends, P = self.dim.d, self.dim.d + self.dim.g, len(constants.T)
+        turned = self.dim.turned(phi, self._pushes)
         every = np.zeros((P, 4, zeta.shape[1]))
-        every[:d, 0] = dim.applied_transposed(self.alpha, p) - dim.velocity(phi, self.a)
-        every[:d, 1], every[:d, 2] = dim.applied_transposed(self.beta, p), p
-        turned = dim.turned(phi, self._pushes)
-        every[d:ends, :3] = dim.transposed(turned)
-        every[d:ends, 0] += turned[:, 0]
-        every[:d, 3], every[d:ends, 3] = self.a, self.alpha
+        every[:ends] = self._by_conjugates(p, phi, turned)
         for s, one in outboard.items():
             every[constants.outboard(s)] = one
         x = np.concatenate([self.rates, zeta[:, None]], axis=1)
@@ -428,7 +423,7 @@ class BodyMotion:
             if constants.L is not None:
                 every = np.concatenate([every, self._by_z(turned, pushed)])
             bent = self._by_bending(every, x)
-            inertial[dim.loads] = bent[:ends]
+            inertial[self.dim.loads] = bent[:ends]
         return ShapeIntegrals(
             mass=float((p * self.a).sum()),
             w=np.column_stack([every[:d, 0].sum(axis=1), by_T[:d]]),
@@ -442,6 +437,16 @@ class BodyMotion:
             further_points=np.zeros_like(body.further_points),
             along_modes=bent[P:].reshape(body.along_modes.shape),
         )
+
+    def _by_conjugates(self, p: np.ndarray, phi: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """Return the derivatives by the conjugates of a and alpha (d + g, 4, n)."""
+        dim, d = self.dim, self.dim.d
+        out = np.empty((d + dim.g, 4, p.shape[1]))
+        out[:d, 0] = dim.applied_transposed(self.alpha, p) - dim.velocity(phi, self.a)
+        out[:d, 1], out[:d, 2], out[:d, 3] = dim.applied_transposed(self.beta, p), p, self.a
+        out[d:, :3], out[d:, 3] = dim.transposed(turned), self.alpha
+        out[d:, 0] += turned[:, 0]
+        return out
 
     @property
     def accelerations(self) -> np.ndarray:

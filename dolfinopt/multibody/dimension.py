@@ -163,11 +163,10 @@ class Dimension:
 
     def turn(self, R: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return vectors and what follows them, angular velocities, in other components."""
-        out = np.empty_like(x)  # (d + r or d + 2 r, ..., n)
-        for first in range(0, len(x), self.d) if self.r > 1 else (0,):
-            out[first : first + self.d] = product(R, x[first : first + self.d])
         if self.r == 1:
-            out[self.d :] = x[self.d :]
+            return np.concatenate([product(R, x[:2]), x[2:]])
+        rows = x.reshape(-1, 3, *x.shape[1:])
+        out: np.ndarray = np.einsum("ij...,kj...->ki...", R, rows).reshape(x.shape)
         return out
 
     def rotation_vector(self, R: np.ndarray) -> np.ndarray:

@@ -58,14 +58,18 @@ def is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
     return any(p.any() for p in body_loads(mechanism, motion, (rest, rest, rest)))
 
 
-def load_coefficients(mechanism: Mechanism, motion: RigidMotion, rates: Rates) -> list[np.ndarray]:
+def load_coefficients(
+    mechanism: Mechanism, motion: RigidMotion, rates: Rates, pull: Mapping[Site, Load] = NOTHING
+) -> list[np.ndarray]:
     """Return c (n, P + g q) of every body: what loads its nodes, as inertia acts.
 
+    In the plane (n, 7 + 2 q), in space (n, 18 + 9 q); m/s2, 1/s2, N, N m and modes per s2.
+
     c = -(p, alpha_c z + beta_c z' + trace_c z''), p of `body_loads`, c before the modes, z being
-    the displacement along them, see `body_motion`. See `dynamics.simulation`.
+    the displacement along them, see `body`. `pull` is that of `body_loads`.
     """
-    links = outward_pass(mechanism, motion, rates)
-    loads = _body_loads(links, inward_pass(mechanism, links).outboard)
+    links = outward_pass(mechanism, motion, rates, pull)
+    loads = _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
     found = []
     for link, p in zip(links, loads, strict=True):
         elastic = link.body.accelerations.reshape(-1, len(p))
