@@ -2,7 +2,7 @@
 
 The instants are the last axis, see `dimension`. Motions are triples (a, w, wd): acceleration of a
 frame's origin less gravity (d, n), angular velocity and acceleration (r, n), in the components of
-that frame. Loads are pairs (force (d, n), moment (r, n)).
+that frame. Loads are (d + r, n), force and moment.
 
 All that loads a body's elastic rows is linear in P numbers, its pushes: the frame's acceleration a,
 the entries alpha_c of A, and the force and moment on every outboard interface. Each has a conjugate
@@ -41,7 +41,6 @@ from dolfinopt.multibody.dimension import DIMENSIONS, product
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
-Load = tuple[np.ndarray, np.ndarray]
 
 
 class Constants:
@@ -252,19 +251,18 @@ class BodyMotion:
     # -- forces ------------------------------------------------------------------------------
 
     @cached_property
-    def load(self) -> Load:
-        """Inertia force F and moment T about the frame's origin, N and N m."""
-        dim = self.dim
+    def load(self) -> np.ndarray:
+        """Inertia force F and moment T about the frame's origin (d + r, n), N and N m."""
+        dim, force = self.dim, self.constants.mass * self.a
         if self.constants.is_point:
-            moment = dim.torque(self.alpha, self.constants.W_rest)
-            return self.constants.mass * self.a, moment
+            return np.concatenate([force, dim.torque(self.alpha, self.constants.W_rest)])
         (s, sd, sdd), (G, H, second) = self.moments, self.second_moments
-        force = self.constants.mass * self.a + dim.apply(self.alpha, s)
+        force = force + dim.apply(self.alpha, s)
         moment = dim.moment(s, self.a) + dim.torque(self.alpha, G)
         if self.is_flexible:
             force = force + dim.apply(self.beta, sd) + sdd
             moment = moment + dim.torque(self.beta, H) + dim.axial(second)
-        return force, moment
+        return np.concatenate([force, moment])
 
     @cached_property
     def _pushes(self) -> np.ndarray:
@@ -395,18 +393,19 @@ class BodyMotion:
     # -- gradient ----------------------------------------------------------------------------
 
     def integral_gradient(
-        self, virtual: Load, multipliers: np.ndarray, outboard: dict[int, np.ndarray]
+        self, virtual: np.ndarray, multipliers: np.ndarray, outboard: dict[int, np.ndarray]
     ) -> ShapeIntegrals:
         """Return the derivative of the virtual work of F, T and the rows by the integrals.
 
         Args:
-            virtual: displacement of the frame's origin and rotation, multiplies (F, T).
+            virtual: displacement of the frame's origin and rotation (d + r, n), multiplies (F, T).
             multipliers: (q, n) of the rows.
             outboard: derivatives (b, 4, n) by the interfaces' (u, theta), by number: by their
                 values, rates, second derivatives, and variations by the multipliers.
         """
-        constants, body, (p, phi), zeta = self.constants, self.constants.body, virtual, multipliers
+        constants, body, zeta = self.constants, self.constants.body, multipliers
         d, ends, P = self.dim.d, self.dim.d + self.dim.g, len(constants.T)
+        p, phi = virtual[:d], virtual[d:]
         turned = self.dim.turned(phi, self._pushes)
         every = np.zeros((P, 4, zeta.shape[1]))
         every[:ends] = self._by_conjugates(p, phi, turned)

@@ -30,7 +30,6 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body import Load
 from dolfinopt.multibody.dimension import Dimension
 from dolfinopt.multibody.kinematics import Posed, SiteMotion, no_gradient
 from dolfinopt.multibody.ranks import least_norm
@@ -284,16 +283,16 @@ class ClosedLoops:
         J = self.jacobian[:, :, dependent]
         return least_norm(J.swapaxes(1, 2), forces[:, dependent])
 
-    def interface_loads(self, multipliers: np.ndarray) -> dict[Site, Load]:
+    def interface_loads(self, multipliers: np.ndarray) -> dict[Site, np.ndarray]:
         """Return what interfaces give to the closures, force and moment in their components."""
-        found: dict[Site, Load] = {}
+        found: dict[Site, np.ndarray] = {}
         for sites, loads in zip(self._sites, self._loads(multipliers), strict=True):
             for site, load in zip(sites, np.split(loads, 2), strict=True):
                 if not site.way:
                     continue
-                force, moment = site.load_on(*self.posed.interface(*site.way[-1]), -load)
-                other = found.get(site.way[-1], (0.0, 0.0))
-                found[site.way[-1]] = force + other[0], moment + other[1]
+                end = site.way[-1]
+                own = site.load_on(*self.posed.interface(*end), -load)
+                found[end] = own + found[end] if end in found else own
         return found
 
     def _loads(

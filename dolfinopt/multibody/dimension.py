@@ -36,7 +36,7 @@ from dolfinopt.multibody.measured import SERIES_LIMIT, SERIES_TERMS
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return A B (i, ..., n) of matrices (i, j, n), or one (i, j), and (j, ..., n)."""
     if A.ndim == 2:
-        return (A @ B.reshape(len(B), -1)).reshape(len(A), *B.shape[1:])
+        return A.dot(B.reshape(len(B), -1)).reshape(len(A), *B.shape[1:])  # faster than @
     out: np.ndarray = np.einsum("ijn,j...n->i...n", A, B)
     return out
 
@@ -60,7 +60,7 @@ def _bilinear(T: np.ndarray) -> Bilinear:
     rows, by_x = len(flat), flat.swapaxes(1, 2).reshape(-1, j)
 
     def function(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        matrix = product(by_x, x).reshape(rows, k, *x.shape[1:])
+        matrix = by_x.dot(x.reshape(j, -1)).reshape(rows, k, *x.shape[1:])
         out: np.ndarray = np.einsum("ij...,j...->i...", matrix, y)
         return out.reshape(*T.shape[:-2], *out.shape[1:])
 
@@ -130,7 +130,7 @@ class Dimension:
 
     def alpha(self, w: np.ndarray, wd: np.ndarray) -> np.ndarray:
         """Return the entries (g, n) of A."""
-        return self._square(w, w) + self._spin @ wd
+        return self._square(w, w) + self._spin.dot(wd)
 
     def beta(self, w: np.ndarray) -> np.ndarray:
         """Return the entries (g, n) of 2 Omega."""
@@ -167,6 +167,12 @@ class Dimension:
             return np.concatenate([product(R, x[:2]), x[2:]])
         rows = x.reshape(-1, 3, *x.shape[1:])
         out: np.ndarray = np.einsum("ij...,kj...->ki...", R, rows).reshape(x.shape)
+        return out
+
+    def shifted(self, p: np.ndarray, load: np.ndarray) -> np.ndarray:
+        """Return a load (d + r, n) at p about the origin."""
+        out = load.copy()
+        out[self.d :] += self.moment(p, load[: self.d])
         return out
 
     def rotation_vector(self, R: np.ndarray) -> np.ndarray:

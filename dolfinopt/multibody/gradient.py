@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Load
+from dolfinopt.multibody.body import BodyMotion
 from dolfinopt.multibody.frames import Interface, MovingRotor
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -80,7 +80,7 @@ def body_gradient(
 
 
 def _by_rotation(
-    tree: Mechanism, links: list[Link], moves: dict[int, Load], zeta: np.ndarray
+    tree: Mechanism, links: list[Link], moves: dict[int, np.ndarray], zeta: np.ndarray
 ) -> dict[Site, np.ndarray]:
     """Return the derivatives by every interface's theta (r, n) through forces of the world."""
     # What turns a body turns such a force the other way in the body's components.
@@ -101,19 +101,19 @@ def _by_rotation(
                 found[i, s] = interface.turning.jacobian_transposed(turned)
             total += turned
             if s in link.applied:
-                p, phi = interface.virtual(moves[i], own)
-                force, moment = link.applied[s].in_world
-                total -= dim.moment(force, p) + dim.commutator(moment, phi)
+                given, moved = link.applied[s].in_world, interface.virtual(moves[i], own)
+                total -= dim.moment(given[: dim.d], moved[: dim.d])
+                total -= dim.commutator(given[dim.d :], moved[dim.d :])
         of_bodies[i] = total
     return found
 
 
-def _motion_gradient(body: BodyMotion | MovingRotor, virtual: Load) -> np.ndarray:
+def _motion_gradient(body: BodyMotion | MovingRotor, virtual: np.ndarray) -> np.ndarray:
     """Return the derivatives of virtual . (F, T) by a motion (d + 2 r, n)."""
-    return np.asarray(np.einsum("ijn,in->jn", body.load_by_motion, np.concatenate(virtual)))
+    return np.asarray(np.einsum("ijn,in->jn", body.load_by_motion, virtual))
 
 
-def _rotor_gradient(link: Link, virtual: Load, drive: np.ndarray) -> np.ndarray:
+def _rotor_gradient(link: Link, virtual: np.ndarray, drive: np.ndarray) -> np.ndarray:
     """Return the derivatives by the motion of what carries a rotor; `drive` (n,) is its motor's."""
     assert link.rotor is not None
     return _motion_gradient(link.rotor, virtual) + link.rotor.force_by_motion[:, None] * drive
@@ -121,10 +121,10 @@ def _rotor_gradient(link: Link, virtual: Load, drive: np.ndarray) -> np.ndarray:
 
 def _virtual_motion(
     tree: Mechanism, links: list[Link], zeta: np.ndarray, of_forces: np.ndarray
-) -> tuple[dict[int, Load], dict[Site, Load]]:
+) -> tuple[dict[int, np.ndarray], dict[Site, np.ndarray]]:
     """Return displacement and rotation of every frame and outboard interface, in its components."""
-    moves: dict[int, Load] = {}
-    ends: dict[Site, Load] = {}
+    moves: dict[int, np.ndarray] = {}
+    ends: dict[Site, np.ndarray] = {}
     ground = tree.virtual_ground(of_forces)
     for i in tree.order:
         link, joint = links[i], tree.joints[i]
@@ -132,15 +132,15 @@ def _virtual_motion(
         drive = None if joint.coordinate is None else of_forces[:, joint.coordinate]
         moves[i] = link.joint.virtual(inner, drive)
         for s, interface in link.interfaces.items():
-            p, phi = interface.virtual(moves[i], zeta[tree.slices[i]])
-            ends[i, s] = interface.in_interface((p, phi))
+            moved = interface.virtual(moves[i], zeta[tree.slices[i]])
+            ends[i, s] = interface.in_interface(moved)
     return moves, ends
 
 
 def _interface_weights(
     interface: Interface,
-    loads: tuple[Load, Load],
-    virtual: Load,
+    loads: tuple[np.ndarray, np.ndarray],
+    virtual: np.ndarray,
     zeta: np.ndarray,
     displaced: np.ndarray,
 ) -> np.ndarray:
@@ -148,16 +148,17 @@ def _interface_weights(
     # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
     # frame, zeta (q, n) its multipliers; `displaced` are those by (u, theta) and their rates
     # through the interface's motion.
-    load, (own_force, own_moment) = loads
-    (force, moment), dim, turning = load, interface.dim, interface.turning
-    p, phi = interface.virtual(virtual, zeta)
+    (load, own), dim, turning, d = loads, interface.dim, interface.turning, interface.dim.d
+    moved = interface.virtual(virtual, zeta)
     # The load's lever, its components, and J' of the row.
-    turned = turning.jacobian_transposed(dim.moment(own_force, p) + dim.commutator(own_moment, phi))
-    by_theta = turning.by_theta(moment, -1.0)
+    turned = turning.jacobian_transposed(
+        dim.moment(own[:d], moved[:d]) + dim.commutator(own[d:], moved[d:])
+    )
+    by_theta = turning.by_theta(load[d:], -1.0)
     if by_theta is not None:
-        theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][dim.d :], zeta)
+        theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][d:], zeta)
         turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
     weights = np.concatenate([displaced, interface.load_coefficients(load)[:, None]], axis=1)
-    weights[: dim.d, 0] -= dim.velocity(virtual[1], force)
-    weights[dim.d :, 0] += turned
+    weights[:d, 0] -= dim.velocity(virtual[d:], load[:d])
+    weights[d:, 0] += turned
     return weights

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import Constants, Load
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.dimension import Turning, compose, product
 from dolfinopt.multibody.frames import MovingJoint
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -219,7 +219,7 @@ class SiteMotion:
         found = np.einsum("rkn,rln->nkl", spin, dim.moment(swung, force[:, None]))
         pull = self.interface_load(i, number, load)
         own = self._in_body(i, number, load)
-        by_theta = section.turning.by_theta(own[1], -1.0)
+        by_theta = section.turning.by_theta(own[d:], -1.0)
         if by_theta is not None:
             theta = self.modes(i, number)[d:]
             found += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
@@ -228,13 +228,11 @@ class SiteMotion:
             found -= np.einsum("pn,pkl->nkl", pull, K0)
         return found
 
-    def load_on(self, point: np.ndarray, R: np.ndarray, load: np.ndarray) -> Load:
+    def load_on(self, point: np.ndarray, R: np.ndarray, load: np.ndarray) -> np.ndarray:
         """Return force and moment about a point (d, n) in the components of a frame."""
-        force, back, d = load[: self.dim.d], R.swapaxes(0, 1), self.dim.d
-        moment = load[d:] + self.dim.moment(self.place - point, force)
-        return product(back, force), self.dim.rotated(back, moment)
+        return self.dim.turn(R.swapaxes(0, 1), self.dim.shifted(self.place - point, load))
 
-    def _in_body(self, i: int, number: int, load: np.ndarray) -> Load:
+    def _in_body(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
         """Return force and moment about the interface of body i in its components."""
         return self.load_on(self.posed.interface(i, number)[0], self.posed.body(i)[2], load)
 
@@ -242,8 +240,8 @@ class SiteMotion:
         """Return what works on (u, theta) (b, n) of body i's interface on the way."""
         turning = self.posed.section(i, number).turning
         assert turning is not None
-        force, moment = self._in_body(i, number, load)
-        return np.concatenate([force, turning.jacobian_transposed(moment)])
+        own, d = self._in_body(i, number, load), self.dim.d
+        return np.concatenate([own[:d], turning.jacobian_transposed(own[d:])])
 
     def interface_load_along(
         self, i: int, number: int, load: np.ndarray, change: np.ndarray, virtual: np.ndarray

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dolfinopt.multibody.body import Constants, Load, Motion
+from dolfinopt.multibody.body import Constants, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -430,12 +430,12 @@ class Mechanism:
         still = np.zeros((self.dim.r, len(motion.q)))
         return a, still, still
 
-    def virtual_ground(self, of_forces: np.ndarray) -> Load:
-        """Return its displacement and rotation for virtual rigid coordinates (n, .)."""
-        p = np.zeros((self.dim.d, len(of_forces)))
+    def virtual_ground(self, of_forces: np.ndarray) -> np.ndarray:
+        """Return its displacement and rotation (d + r, n) for virtual coordinates (n, .)."""
+        out = np.zeros((self.dim.b, len(of_forces)))
         if self.cart is not None:
-            p[0] = of_forces[:, 0]
-        return p, np.zeros((self.dim.r, len(of_forces)))
+            out[0] = of_forces[:, 0]
+        return out
 
     # -- how stiff and how large it is -------------------------------------------------------
 

@@ -181,8 +181,8 @@ def test_forces_of_the_file(tmp_path, dimension, stiff, seed):
     force, moment, rows = forces_of_sid(data, s)
     expected = moving(body if dimension == 3 else in_space(body), s)
     size = 10.0 * float(np.abs(rows).max())
-    assert_close(force, expected.load[0][:, 0], size=size)
-    assert_close(moment, expected.load[1][:, 0], size=size)
+    assert_close(force, expected.load[:3, 0], size=size)
+    assert_close(moment, expected.load[3:, 0], size=size)
     assert_close(rows + data.Ke.M0 @ s.q + data.De.M0 @ s.qd, expected.rows({})[:, 0], size=size)
 
 
