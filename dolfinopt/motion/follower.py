@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.measured import SAMPLES
+from dolfinopt.motion.measured import SAMPLES, TURNS_LIMIT
 from dolfinopt.motion.singular import Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached
 from dolfinopt.motion.task import Task
@@ -101,6 +101,13 @@ class Follower:
         target, units = task.target(t), task.constraints.units
         parts = [target.joints[0] / units[task.given], target.place[0] / task.constraints.reach]
         moved = np.abs(np.diff(np.hstack(parts), axis=0)).max(axis=1, initial=0.0)
+        turns = float(moved.sum() / (2.0 * np.pi))
+        if turns > TURNS_LIMIT:
+            raise InputError(
+                f"{task.words.source}: motion: what is prescribed of the closed loops moves by "
+                f"{turns:.3g} turns: expected at most {TURNS_LIMIT}; slow it or shorten "
+                "motion.horizon"
+            )
         way = SAMPLES * np.append(0.0, np.cumsum(moved / (2.0 * np.pi) + 1.0 / len(moved)))
         return np.interp(np.linspace(0.0, way[-1], int(np.ceil(way[-1])) + 1), way, t)
 

@@ -32,3 +32,4 @@ SINGULAR_SHARE = 1e-3
 # -- follower --------------------------------------------------------------------------------
 
 SAMPLES = 12  # of a motion at least, and more for each turn of what is prescribed
+TURNS_LIMIT = 1000  # of what is prescribed, which takes 15 s to follow
