@@ -80,6 +80,8 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     """
     if (every := repeated(len(t))) is not None:
         return rigid_motion(t[every], scene)[: len(t)]
+    if len(t) == 0:
+        return rigid_motion(np.zeros(1), scene)[:0]
     if follows(scene):
         return RigidMotion(*follower(scene).at(t))
     if scene.motion.path in ("joints", "rotation"):
@@ -508,9 +510,8 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
     if len(unknown) > rows:
         what, more = "a pose determines", ""
         if not constraints.turned:
-            what = "x, y and z determine"
             turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
-            more = f"the orientation ({turn}), " if len(unknown) <= 6 else ""  # a pose has six
+            what, more = "x, y and z determine", f"the orientation ({turn}), "
         followed = ", ".join(names[k] for k in unknown)
         raise InputError(
             f"{where}: expected at most {rows} joints, which {what}, found {len(unknown)} "

@@ -133,10 +133,7 @@ def inverse(
     return u
 
 
-@lru_cache
-def bend_of(lengths: tuple[float, ...]) -> Bend:
-    """Return the chain of these arms, m."""
-    return Bend(lengths)
+bend_of = lru_cache(Bend)
 
 
 def chain_on(
