@@ -224,7 +224,7 @@ def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:
     """Return the motion through a table with times that runs straight by the law between stops."""
     table, laws = rows.table, []
     assert table.t is not None
-    for line, i, j in ((table.lines[j], i, j) for i, j in moves(table.rows)):
+    for i, j in moves(table.rows):
         if j - i > 1:
             raise InputError(
                 f"{table.file}: line {table.lines[i + 1]}: a row between two stops with motion.law "
@@ -238,8 +238,8 @@ def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:
         time = float(table.t[j] - table.t[i])
         if time < law.least * (1.0 - SAME_TIME):
             raise InputError(
-                f"{table.file}: line {line}, column {TIME} = {table.t[j]:g}: {time:g} s for this "
-                f"move: {too_short(law)}"
+                f"{table.file}: line {table.lines[j]}, column {TIME} = {table.t[j]:g}: {time:g} s "
+                f"for this move: {too_short(law)}"
             )
         laws.append((i, j, law))
     return curve_by_laws(table, laws)
@@ -310,12 +310,13 @@ def prescribed_joints(scene: Scene) -> tuple[str, ...]:
 
 
 def desired_path(t: np.ndarray, scene: Scene) -> Values:
-    """Return where the end-effector should be in the plane (n, 2), and two derivatives."""
+    """Return what path or table prescribe and two derivatives: the end-effector's place, joints."""
     motion = scene.motion
-    if motion.path != "arc":
-        return _along_table(t, scene)
-    path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
-    return along(path, time_law(motion), t, motion.duration)
+    if motion.path == "arc":
+        path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
+        return along(path, time_law(motion), t, motion.duration)
+    curve, timed = curve_of(scene)
+    return curve(t) if timed else along(curve, time_law(motion), t, motion.duration)
 
 
 def target_of(t: np.ndarray, scene: Scene) -> Target:
@@ -324,20 +325,12 @@ def target_of(t: np.ndarray, scene: Scene) -> Target:
     if scene.motion.path in ("joints", "rotation"):
         free = (np.zeros((len(t), 0)),) * 3
         return Target(_with_fixed(_prescribed(t, scene), [], springs), free)
-    values, start = _along_table(t, scene), rows_of(scene).start
+    values, start = desired_path(t, scene), rows_of(scene).start
     split = [3, 3 if start is None else 6]
     parts = (np.split(x, split, axis=1) for x in values)
     place, vectors, joints = zip(*parts, strict=True)
     turned = None if start is None else turning(start, vectors)
     return Target(_with_fixed(joints, [], springs), place, turned)
-
-
-def _along_table(t: np.ndarray, scene: Scene) -> Values:
-    """Return the curve through the scene's table and two derivatives, in its time or by the law."""
-    curve, timed = curve_of(scene)
-    if timed:
-        return curve(t)
-    return along(curve, time_law(scene.motion), t, scene.motion.duration)
 
 
 def _prescribed(t: np.ndarray, scene: Scene) -> Values:
@@ -347,7 +340,7 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Values:
     """
     motion = scene.motion
     if motion.path == "joints":
-        joints = _along_table(t, scene)
+        joints = desired_path(t, scene)
     else:
         law = time_law(motion)
         joints = plane.rotation(t, law, motion.speed, motion.start_angle, motion.duration)

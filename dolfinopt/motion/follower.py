@@ -66,7 +66,7 @@ class Follower:
         q = task.with_given(table(np.clip(t, 0.0, task.end)), target)
         q = task.newton(q, target)[0]
         off = np.linalg.norm(task.constraints.error(q, target), axis=1)
-        wrong = np.flatnonzero(~(off <= self.start.tolerance(task.constraints.reach)))
+        wrong = np.flatnonzero(~(off <= self.start.tolerance))
         if wrong.size:
             raise self._lost(q[wrong[0]], float(t[wrong[0]]))
         return q, *task.rates(q, target)[:2]
@@ -123,9 +123,9 @@ class Follower:
 
     def _lost(self, before: np.ndarray, t: float) -> InputError:
         """Return why there is no pose at t near one (R,): out of reach, or a singular position."""
-        task, reach = self.task, self.task.constraints.reach
+        task = self.task
         # Steps of 1e-5 leave less than their square.
-        rough = 1e-8 * reach + self.start.tolerance(reach)
+        rough = 1e-8 * task.constraints.reach + self.start.tolerance
         for instant in (min(t + 0.01 * task.end, task.end), t):
             target = task.target(np.array([instant]))
             q = task.with_given(before[None], target)[0]
