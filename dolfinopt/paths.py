@@ -372,17 +372,19 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
     from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
 
     assert table.t is not None
-    found = []
+    found, degree = [], 5
     for i, j in moves(table.rows):
         t, rows = table.t[i : j + 1], table.rows[i : j + 1]
         rates = np.zeros((2, 2, rows.shape[1]))  # first and last instant; speed, acceleration
         if moving:
-            own = make_interp_spline(t, rows, k=5 if len(t) > 5 else 3 if len(t) > 3 else 1)
+            own = make_interp_spline(
+                t, rows, k=degree if len(t) > degree else 3 if len(t) > 3 else 1
+            )
             free = [i == 0, j == len(table.t) - 1]
             for order in range(1, min(own.k, 2) + 1):
                 rates[free, order - 1] = own(t[[0, -1]], order)[free]
         ends = tuple([(1, first), (2, second)] for first, second in rates)
-        found.append((i, j, _values_of(make_interp_spline(t, rows, k=5, bc_type=ends))))
+        found.append((i, j, _values_of(make_interp_spline(t, rows, k=degree, bc_type=ends))))
     return _in_time(table, found, (), moving)
 
 

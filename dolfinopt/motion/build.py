@@ -204,7 +204,7 @@ def curve_of(scene: Scene) -> tuple[Curve, bool]:
     if table.t is None:
         return curve_by_chord(table, rows.measured), False
     last = table.t[-1]
-    if abs(last - motion.duration) > 1e-9 * motion.duration:
+    if abs(last - motion.duration) > SAME_TIME * motion.duration:
         raise InputError(
             f"{table.file}: line {table.lines[-1]}, column t = {last:g}: expected "
             f"motion.duration = {motion.duration:g} [s] in the last row; set motion.duration = "
