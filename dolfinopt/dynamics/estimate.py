@@ -26,9 +26,9 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.measured import (
     COMPARED_STEP_COUNTS,
-    ESTIMATE_ANGLE,
     EXACT,
     KEPT_CONTRACTION,
+    SLOW_ANGLES,
 )
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, matrix_of, up_to_angle
 from dolfinopt.dynamics.system import State, inverse_size
@@ -71,7 +71,7 @@ def estimate(
     richer = stages_of(stages.preconditioner, method, time_grid)
     begin = step_beginnings(stages, state, a)
     values = lagrange_integrals(stages.method.c, method.c)[0]
-    slow, b = up_to_angle(richer, ESTIMATE_ANGLE), values @ a
+    slow, b = up_to_angle(richer, SLOW_ANGLES[0]), values @ a
     corrections = None
     if matrix is not None:
         keep = np.searchsorted(matrix.slow, slow)
