@@ -54,7 +54,8 @@ class Law:
     Attributes:
         starts: (k,) where pieces begin, shares of the duration up to 1/2; the first is the rest
             before the motion.
-        pieces: (k, m) coefficients of the integral of s in powers of u - start.
+        pieces: (4, k, m) coefficients in powers of u - start of the integral of s, of s, and of its
+            two derivatives by u.
         least: shortest duration, s; 0 without limits.
     """
 
@@ -77,15 +78,18 @@ class Law:
         knots = np.unique([*self.starts[2:], *(1.0 - self.starts[2:])])
         return knots[(knots > SAME) & (knots < 1.0 - SAME)]
 
-    def _derivatives(self, u: np.ndarray) -> list[np.ndarray]:
-        """Return the integral of s, s, ds/du and d2s/du2 (n,)."""
+    def _derivatives(self, u: np.ndarray) -> np.ndarray:
+        """Return the integral of s, s, ds/du and d2s/du2 (4, n)."""
         late = u > 0.5
         v = np.where(late, 1.0 - u, u)
         k = np.searchsorted(self.starts[1:], v + np.where(late, SAME, -SAME))
-        h, c = np.maximum(v - self.starts[k], 0.0), self.pieces[k].T
-        found = [polyval(h, polyder(c, order), tensor=False) for order in range(4)]
+        h = np.maximum(v - self.starts[k], 0.0)
+        found = (self.pieces[:, k] * np.vander(h, self.pieces.shape[2], increasing=True)).sum(
+            axis=2
+        )
         turned = u - 0.5 + found[0], 1.0 - found[1], found[2], -found[3]
-        return [np.where(late, b, a) for a, b in zip(found, turned, strict=True)]
+        values: np.ndarray = np.where(late, turned, found)
+        return values
 
 
 def law_for(name: str, length: float, limits: Limits, share: float) -> Law:
@@ -126,7 +130,8 @@ def law_for(name: str, length: float, limits: Limits, share: float) -> Law:
         sqrt(length * a / limits.acceleration),
         np.cbrt(length * j / limits.jerk) if limits.jerk < inf else 0.0,
     )
-    return Law(np.array([0.0, 0.0, *ends[:-1]]), c, float(least))
+    orders = [np.pad(polyder(c, k, axis=1), ((0, 0), (0, k))) for k in range(4)]
+    return Law(np.array([0.0, 0.0, *ends[:-1]]), np.array(orders), float(least))
 
 
 def _largest(values: Polynomial, end: float) -> float:
@@ -367,17 +372,19 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
     from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
 
     assert table.t is not None
-    found = []
+    found, degree = [], 5
     for i, j in moves(table.rows):
         t, rows = table.t[i : j + 1], table.rows[i : j + 1]
         rates = np.zeros((2, 2, rows.shape[1]))  # first and last instant; speed, acceleration
         if moving:
-            own = make_interp_spline(t, rows, k=5 if len(t) > 5 else 3 if len(t) > 3 else 1)
+            own = make_interp_spline(
+                t, rows, k=degree if len(t) > degree else 3 if len(t) > 3 else 1
+            )
             free = [i == 0, j == len(table.t) - 1]
             for order in range(1, min(own.k, 2) + 1):
                 rates[free, order - 1] = own(t[[0, -1]], order)[free]
         ends = tuple([(1, first), (2, second)] for first, second in rates)
-        found.append((i, j, _values_of(make_interp_spline(t, rows, k=5, bc_type=ends))))
+        found.append((i, j, _values_of(make_interp_spline(t, rows, k=degree, bc_type=ends))))
     return _in_time(table, found, (), moving)
 
 

@@ -80,6 +80,8 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
     """
     if (every := repeated(len(t))) is not None:
         return rigid_motion(t[every], scene)[: len(t)]
+    if len(t) == 0:
+        return rigid_motion(np.zeros(1), scene)[:0]
     if follows(scene):
         return RigidMotion(*follower(scene).at(t))
     if scene.motion.path in ("joints", "rotation"):
@@ -202,7 +204,7 @@ def curve_of(scene: Scene) -> tuple[Curve, bool]:
     if table.t is None:
         return curve_by_chord(table, rows.measured), False
     last = table.t[-1]
-    if abs(last - motion.duration) > 1e-9 * motion.duration:
+    if abs(last - motion.duration) > SAME_TIME * motion.duration:
         raise InputError(
             f"{table.file}: line {table.lines[-1]}, column t = {last:g}: expected "
             f"motion.duration = {motion.duration:g} [s] in the last row; set motion.duration = "
@@ -222,7 +224,7 @@ def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:
     """Return the motion through a table with times that runs straight by the law between stops."""
     table, laws = rows.table, []
     assert table.t is not None
-    for line, i, j in ((table.lines[j], i, j) for i, j in moves(table.rows)):
+    for i, j in moves(table.rows):
         if j - i > 1:
             raise InputError(
                 f"{table.file}: line {table.lines[i + 1]}: a row between two stops with motion.law "
@@ -236,8 +238,8 @@ def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:
         time = float(table.t[j] - table.t[i])
         if time < law.least * (1.0 - SAME_TIME):
             raise InputError(
-                f"{table.file}: line {line}, column {TIME} = {table.t[j]:g}: {time:g} s for this "
-                f"move: {too_short(law)}"
+                f"{table.file}: line {table.lines[j]}, column {TIME} = {table.t[j]:g}: {time:g} s "
+                f"for this move: {too_short(law)}"
             )
         laws.append((i, j, law))
     return curve_by_laws(table, laws)
@@ -308,12 +310,13 @@ def prescribed_joints(scene: Scene) -> tuple[str, ...]:
 
 
 def desired_path(t: np.ndarray, scene: Scene) -> Values:
-    """Return where the end-effector should be in the plane (n, 2), and two derivatives."""
+    """Return what path or table prescribe and two derivatives: the end-effector's place, joints."""
     motion = scene.motion
-    if motion.path != "arc":
-        return _along_table(t, scene)
-    path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
-    return along(path, time_law(motion), t, motion.duration)
+    if motion.path == "arc":
+        path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
+        return along(path, time_law(motion), t, motion.duration)
+    curve, timed = curve_of(scene)
+    return curve(t) if timed else along(curve, time_law(motion), t, motion.duration)
 
 
 def target_of(t: np.ndarray, scene: Scene) -> Target:
@@ -322,20 +325,12 @@ def target_of(t: np.ndarray, scene: Scene) -> Target:
     if scene.motion.path in ("joints", "rotation"):
         free = (np.zeros((len(t), 0)),) * 3
         return Target(_with_fixed(_prescribed(t, scene), [], springs), free)
-    values, start = _along_table(t, scene), rows_of(scene).start
+    values, start = desired_path(t, scene), rows_of(scene).start
     split = [3, 3 if start is None else 6]
     parts = (np.split(x, split, axis=1) for x in values)
     place, vectors, joints = zip(*parts, strict=True)
     turned = None if start is None else turning(start, vectors)
     return Target(_with_fixed(joints, [], springs), place, turned)
-
-
-def _along_table(t: np.ndarray, scene: Scene) -> Values:
-    """Return the curve through the scene's table and two derivatives, in its time or by the law."""
-    curve, timed = curve_of(scene)
-    if timed:
-        return curve(t)
-    return along(curve, time_law(scene.motion), t, scene.motion.duration)
 
 
 def _prescribed(t: np.ndarray, scene: Scene) -> Values:
@@ -345,7 +340,7 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Values:
     """
     motion = scene.motion
     if motion.path == "joints":
-        joints = _along_table(t, scene)
+        joints = desired_path(t, scene)
     else:
         law = time_law(motion)
         joints = plane.rotation(t, law, motion.speed, motion.start_angle, motion.duration)
@@ -508,9 +503,8 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
     if len(unknown) > rows:
         what, more = "a pose determines", ""
         if not constraints.turned:
-            what = "x, y and z determine"
             turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
-            more = f"the orientation ({turn}), " if len(unknown) <= 6 else ""  # a pose has six
+            what, more = "x, y and z determine", f"the orientation ({turn}), "
         followed = ", ".join(names[k] for k in unknown)
         raise InputError(
             f"{where}: expected at most {rows} joints, which {what}, found {len(unknown)} "

@@ -1,7 +1,8 @@
 """Joints of rigid links that follow closures and a path, at any instant, in plane and space.
 
-From the start samples are followed by a predictor of second order and Newton's method; four times
-as many by Newton's method from their Hermite spline, which singular positions are looked for in.
+From the start samples are followed by a predictor of second order and Newton's method; steps that
+go astray or pass a singular position are halved. Four times as many samples, by Newton's method
+from their Hermite spline, show positions that only touch a singular one.
 At any instant Newton's method sets out from the spline; rates solve the differentiated equations.
 """
 
@@ -66,7 +67,7 @@ class Follower:
         q = task.with_given(table(np.clip(t, 0.0, task.end)), target)
         q = task.newton(q, target)[0]
         off = np.linalg.norm(task.constraints.error(q, target), axis=1)
-        wrong = np.flatnonzero(~(off <= self.start.tolerance(task.constraints.reach)))
+        wrong = np.flatnonzero(~(off <= self.start.tolerance))
         if wrong.size:
             raise self._lost(q[wrong[0]], float(t[wrong[0]]))
         return q, *task.rates(q, target)[:2]
@@ -115,24 +116,24 @@ class Follower:
         self, guess: np.ndarray, t: float, before: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
         """Return pose (R,), rates, accelerations and G at t, or None where the step is too long."""
-        task = self.task
+        task, enough = self.task, 1e-5
         target = task.target(np.array([t]))
         near = task.with_given(guess[None], target)
         try:
-            q, last = task.newton(near, target, 1e-5)
+            q, last = task.newton(near, target, enough)
             qd, qdd, G = task.rates(q, target)
         except np.linalg.LinAlgError:
             return None
         off = np.abs((q - near) / task.constraints.units).max()
         # Not a number is not good.
-        good = np.abs(last).max() < 1e-5 and off <= 0.5 / SAMPLES
+        good = np.abs(last).max() < enough and off <= 0.5 / SAMPLES
         return (q[0], qd, qdd, G) if good and self._regularity.on_one_side(before, G) else None
 
     def _lost(self, before: np.ndarray, t: float) -> InputError:
         """Return why there is no pose at t near one (R,): out of reach, or a singular position."""
-        task, reach = self.task, self.task.constraints.reach
+        task = self.task
         # Steps of 1e-5 leave less than their square.
-        rough = 1e-8 * reach + self.start.tolerance(reach)
+        rough = 1e-8 * task.constraints.reach + self.start.tolerance
         for instant in (min(t + 0.01 * task.end, task.end), t):
             target = task.target(np.array([instant]))
             q = task.with_given(before[None], target)[0]

@@ -14,7 +14,7 @@ DENSE_INSTANTS = 2001
 # With more rows a table's corners are many and small; the integrator's steps need not end there.
 TABLE_CORNERS_LIMIT = 20
 
-# -- constraints, counts, start --------------------------------------------------------------
+# -- constraints, start ----------------------------------------------------------------------
 
 REACHED_SHARE = 1e-9  # above which a pose is not reached; Newton's method leaves 1e-15
 # By which links that are held more often than needed may leave a loop open: it is told.

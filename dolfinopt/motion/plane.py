@@ -133,10 +133,7 @@ def inverse(
     return u
 
 
-@lru_cache
-def bend_of(lengths: tuple[float, ...]) -> Bend:
-    """Return the chain of these arms, m."""
-    return Bend(lengths)
+bend_of = lru_cache(Bend)
 
 
 def chain_on(
@@ -195,8 +192,10 @@ def one_arm_on(
     p, pd, pdd = path
     above = p[:, 1] - height
     for side, distance in (("above", above), ("below", -above)):
-        what = f"{side} the shoulder, upright or out of reach: one arm of {length:g} m needs less"
-        _check_reach(t, distance - (1.0 - SINGULAR_DISTANCE_SHARE) * length, distance, what, words)
+        beyond = distance - (1.0 - SINGULAR_DISTANCE_SHARE) * length
+        if not (beyond <= 0.0).all():
+            need = f"upright or out of reach: one arm of {length:g} m needs less"
+            raise _unreached(t, beyond, distance, f"{side} the shoulder, {need}", words)
     lean = np.arcsin(above / length)
     alpha = lean if elbow == 1 else np.pi - lean
     c, z = length * np.cos(alpha), length * np.sin(alpha)
@@ -213,33 +212,26 @@ def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, words: Word
     """Raise when the shoulder's distance to the path leaves the reach of the arms."""
     margin = SINGULAR_DISTANCE_SHARE * max(bend.lengths)
     near, far = bend.reach
-    arms = " and ".join(", ".join(f"{a:g} m" for a in bend.lengths).rsplit(", ", 1))
-    bent = ", all elbows bent alike," if len(bend.lengths) > 2 else ""
     for beyond, word in (
-        (distance - far, "stretched or out of reach"),
-        (near - distance, "folded or too near"),
+        (distance - far + margin, "stretched or out of reach"),
+        (near + margin - distance, "folded or too near"),
     ):
-        _check_reach(
-            t,
-            beyond + margin,
-            distance,
-            f"from the shoulder, {word}: arms of {arms}{bent} need a distance between {near:g} m "
-            f"and {far:g} m",
-            words,
-        )
+        if not (beyond <= 0.0).all():  # not a number, from an overflow, is beyond
+            arms = " and ".join(", ".join(f"{a:g} m" for a in bend.lengths).rsplit(", ", 1))
+            bent = ", all elbows bent alike," if len(bend.lengths) > 2 else ""
+            need = f"arms of {arms}{bent} need a distance between {near:g} m and {far:g} m"
+            raise _unreached(t, beyond, distance, f"from the shoulder, {word}: {need}", words)
 
 
-def _check_reach(
+def _unreached(
     t: np.ndarray, beyond: np.ndarray, distance: np.ndarray, what: str, words: Words
-) -> None:
-    """Raise with the worst instant where the path is beyond the reach, m."""
-    wrong = np.flatnonzero(~(beyond <= 0.0))  # not a number, from an overflow, is beyond
-    if wrong.size:
-        worst = wrong[np.argmax(beyond[wrong])]
-        raise InputError(
-            f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
-            f"{distance[worst]:.6g} m {what}; change {words.motion}"
-        )
+) -> InputError:
+    """Return where the path is farthest beyond the reach, m."""
+    worst = np.argmax(beyond)
+    return InputError(
+        f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
+        f"{distance[worst]:.6g} m {what}; change {words.motion}"
+    )
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dolfinopt.motion.measured import (
     REACHED_SHARE,
     SINGULAR_SHARE,
 )
-from dolfinopt.motion.task import Task, widest
+from dolfinopt.motion.task import Task
 from dolfinopt.multibody.closures import Distance
 from dolfinopt.multibody.measured import RANK_SHARE
 from dolfinopt.multibody.ranks import rank
@@ -35,16 +35,14 @@ class Start:
         usual: (R,) a closed pose nearby that is not singular, unless all are.
         redundant: number of closures' equations that follow from the others for rigid links.
         misfit: by which links leave the closures open at best, m; 0 by rounding.
+        tolerance: distance up to which a pose counts as reached, m.
     """
 
     q: np.ndarray
     usual: np.ndarray
     redundant: int
     misfit: float
-
-    def tolerance(self, reach: float) -> float:
-        """Return the distance up to which a pose counts as reached, m."""
-        return REACHED_SHARE * reach + MISFIT_FACTOR * self.misfit
+    tolerance: float
 
 
 def nearest(
@@ -109,9 +107,11 @@ def start_of(task: Task) -> Start:
     G = constraints.at(usual[None]).rows()[0]
     _check(task, G[:count], share)
     redundant = count - rank(G[:count, task.moving], share)
-    fits = not redundant or misfit <= REACHED_SHARE * reach
-    start = Start(q, usual, redundant, 0.0 if fits else misfit)
-    if off > start.tolerance(reach):
+    tolerance = REACHED_SHARE * reach
+    if not redundant or misfit <= tolerance:
+        misfit = 0.0
+    tolerance += MISFIT_FACTOR * misfit
+    if off > tolerance:
         raise unreached(task, 0.0, q, target)
     if len(null := _null_vectors(G[:, task.unknown])):
         idle = _called(task, task.unknown, null)
@@ -119,7 +119,7 @@ def start_of(task: Task) -> Start:
             f"{task.words.source}: motion: path and closures leave {len(null)} of the joints "
             f"undetermined ({idle}); prescribe one of them by a column of the table"
         )
-    return start
+    return Start(q, usual, redundant, misfit, tolerance)
 
 
 def _nearest_of_many(task: Task, target: Target) -> tuple[np.ndarray, float]:
@@ -215,10 +215,12 @@ def unreached(task: Task, t: float, q: np.ndarray, target: Target) -> InputError
     reach, k = task.constraints.reach, task.constraints.loops.count
     joints, start = task.called(task.unknown), f"{words.start}, " if t == 0.0 else ""
     if k and np.abs(error[:k]).max() > 0.1 * np.abs(error).max():
-        name, far = widest(task, error)
+        gaps = task.constraints.loops.by_tie(error[:k])
+        worst = int(np.argmax(gaps))
+        name = task.constraints.loops.ties[worst].name
         return InputError(
             f"{words.source}: closures: at t = {t:.4g} s the loop of {name} cannot be closed: the "
-            f"joints that follow ({joints}) leave it open by {far:.4g} m at best; change "
+            f"joints that follow ({joints}) leave it open by {gaps[worst]:.4g} m at best; change "
             f"{start}its point, the arms' lengths, or {words.motion}"
         )
     own = error[k:]

@@ -100,11 +100,3 @@ class Task:
 
         qd = solved(1, self.constraints.right(target, 1))
         return qd, solved(2, self.constraints.right(target, 2) - here.acceleration(qd)), G
-
-
-def widest(task: Task, error: np.ndarray) -> tuple[str, float]:
-    """Return the closure that equations' errors (k,) leave farthest open, and by how much, m."""
-    loops = task.constraints.loops
-    sizes = loops.by_tie(error[: loops.count])
-    worst = int(np.argmax(sizes))
-    return loops.ties[worst].name, sizes[worst]
