@@ -16,6 +16,7 @@ from dolfinopt.dynamics.estimate import Estimate, estimate
 from dolfinopt.dynamics.measured import (
     DEFLECTION_LIMIT,
     LEAST_STEP_SHARE,
+    MARCH_ITERATIONS,
     STEPS_LIMIT,
     WINDOW_STEPS,
 )
@@ -126,7 +127,8 @@ class March:
         horizon = self._system.breakpoints[-1]
         for end in self._system.breakpoints[1:]:
             while self.t < end:
-                if self._h < LEAST_STEP_SHARE * horizon or len(self._ends) > STEPS_LIMIT:
+                too_many = self._iterations > MARCH_ITERATIONS or len(self._ends) > STEPS_LIMIT
+                if too_many or self._h < LEAST_STEP_SHARE * horizon:
                     raise GivenUp(
                         f"the simulation gets no further than t = {self.t:.4g} s with "
                         f"{len(self._ends) - 1} time steps: the motion changes too fast for arms "

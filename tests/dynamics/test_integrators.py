@@ -551,7 +551,7 @@ def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
     for a, b in zip(again, slopes, strict=True):
         # Rounding of stiffnesses that lie eight decades apart.
         assert_close(a.K, b.K, 1e-9)
-        assert_close(a.M, b.M, 1e-9)
+        assert_close(a.W, b.W, 1e-9)
 
 
 @pytest.mark.parametrize("limit", [20.0, 1e-3])
@@ -568,7 +568,7 @@ def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit: fl
     assert (max(size for _, size in matrices) == 16) == (limit < 1.0)
     slow_up_to(monkeypatch)
     for a, b in zip(found, Adjoint(problem, solution).gradient(t, by_q), strict=True):
-        for name in ("C", "M", "G", "K", "outboard"):
+        for name in ("w", "W", "K", "outboard"):
             # Multipliers are corrected to 1e-8, largest component.
             assert_close(getattr(a, name), getattr(b, name), 1e-8)
 
