@@ -92,6 +92,35 @@ class Tangent:
             blocks.append(replace(one, left=left, right=one.right[part]))
         return replace(self, blocks=tuple(blocks), count=last - first)
 
+    def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Tangent:
+        """Return it by some of the coordinates, at further instants between those of every step.
+
+        Args:
+            weights: (m, s) of s instants in turn, for m others.
+            keep: ascending places among the S coordinates.
+        """
+        size = len(self.own)
+        places = np.arange(size)[self.order]  # of every coordinate
+        kept = np.zeros(size, dtype=bool)
+        kept[places[keep]] = True
+        before = np.append(0, np.cumsum(kept))
+        m, s = weights.shape
+        count = self.count // s
+
+        def between(x: np.ndarray) -> np.ndarray:
+            found: np.ndarray = weights @ x.reshape(count, s, x[0].size)
+            return found.reshape(count * m, *x.shape[1:])
+
+        blocks = []
+        for one in self.blocks:
+            first, last = one.columns.start // 3, one.columns.stop // 3
+            columns = slice(3 * before[first], 3 * before[last])
+            right = between(one.right[:, :, np.repeat(kept[first:last], 3)])
+            left = None if one.left is None else between(one.left)
+            blocks.append(Block(one.rows, columns, left, right))
+        order = before[places[keep]]
+        return Tangent(tuple(blocks), self.own[keep], order, count * m)
+
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
         size = len(self.own)
