@@ -82,13 +82,12 @@ class Interface:
 
     Attributes:
         body: as it moves.
-        number: which of its interfaces.
         place: reference point from the body's origin (d, n), m.
     """
 
     def __init__(self, body: BodyMotion, number: int = 0) -> None:
         """Take the body, and which of its interfaces it is."""
-        self.body, self.number, self.dim = body, number, body.dim
+        self.body, self.dim = body, body.dim
         self.places = body.constants.outboard(number)
         point = body.constants.points[number][:, None]
         if body.is_flexible:
@@ -129,10 +128,6 @@ class Interface:
     def in_body(self, load: np.ndarray) -> np.ndarray:
         """Return a load on the interface, in its components, in those of the body."""
         return self.dim.turn(self.turning.R, load) if self.body.is_flexible else load
-
-    def at_origin(self, load: np.ndarray) -> np.ndarray:
-        """Return a load on the interface, in the body's components, about the body's origin."""
-        return self.dim.shifted(self.place, load)
 
     def load_coefficients(self, load: np.ndarray) -> np.ndarray:
         """Return what works on (u, theta) (b, n): force and J' moment, of `in_body`."""

@@ -65,7 +65,7 @@ def body_gradient(
                 parts.append(_motion_gradient(link.carried[s], ends[i, s]))
             displaced = np.zeros((link.body.dim.b, 3, zeta.shape[1]))
             if parts:
-                on_interface = np.sum(parts, axis=0)
+                on_interface = sum(parts[1:], parts[0])
                 by.append(interface.passage.transposed(on_interface))
                 if link.body.is_flexible:
                     displaced = interface.by_displacement(on_interface)
@@ -74,7 +74,7 @@ def body_gradient(
                 outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
                 if (i, s) in by_rotation:
                     outboard[s][link.body.dim.d :, 0] += by_rotation[i, s]
-        by_motion[i] = np.sum(by, axis=0)
+        by_motion[i] = sum(by[1:], by[0])
         gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
     return [gradient[i] for i in range(len(links))]
 

@@ -241,7 +241,8 @@ class SiteMotion:
         turning = self.posed.section(i, number).turning
         assert turning is not None
         own, d = self._in_body(i, number, load), self.dim.d
-        return np.concatenate([own[:d], turning.jacobian_transposed(own[d:])])
+        own[d:] = turning.jacobian_transposed(own[d:])
+        return own
 
     def interface_load_along(
         self, i: int, number: int, load: np.ndarray, change: np.ndarray, virtual: np.ndarray
@@ -262,17 +263,16 @@ class SiteMotion:
         inner, own = ((self.order >= 0) & (self.order < k) for k in (outer, outer + 1))
         spin, shifted = self.along(virtual * inner)[d:], self.along(virtual * own)
         moved = (self.along(virtual) - shifted)[:d] + dim.velocity(shifted[d:], lever)
-        about = load[d:] + dim.moment(lever, force)
-        back = self.posed.body(i)[2].swapaxes(0, 1)
-        by_force = product(back, change[:d] - dim.velocity(spin, force))
-        changed = change[d:] + dim.moment(moved, force) + dim.moment(lever, change[:d])
-        by_moment = dim.rotated(back, changed - dim.commutator(spin, about))
-        by = section.turning.jacobian_transposed(by_moment)
-        by_theta = section.turning.by_theta(dim.rotated(back, about), -1.0)
+        about, back = dim.shifted(lever, load), self.posed.body(i)[2].swapaxes(0, 1)
+        turned = np.concatenate([dim.velocity(spin, force), dim.commutator(spin, about[d:])])
+        turned[d:] -= dim.moment(moved, force)
+        by = self._in_body(i, number, change) - dim.turn(back, turned)
+        by[d:] = section.turning.jacobian_transposed(by[d:])
+        by_theta = section.turning.by_theta(dim.turn(back, about)[d:], -1.0)
         if by_theta is not None:
             theta = np.einsum("rkn,nk->rn", self.modes(i, number)[d:], virtual[:, columns])
-            by = by + np.einsum("abn,bn->an", by_theta, theta)
-        return np.concatenate([by_force, by])
+            by[d:] += np.einsum("abn,bn->an", by_theta, theta)
+        return by
 
     def add_gradient(
         self,

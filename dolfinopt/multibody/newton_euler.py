@@ -188,8 +188,8 @@ def inward_pass(
                 loads.append(link.applied[s].load)
             outboard[i][s] = sum(loads[1:], loads[0])
         if felt:
-            parts = [link.interfaces[s].at_origin(load) for s, load in outboard[i].items()]
-            joints[i] = sum(parts, link.body.load)
+            places = ((link.interfaces[s].place, load) for s, load in outboard[i].items())
+            joints[i] = sum((tree.dim.shifted(*one) for one in places), link.body.load)
     return Loads(outboard, joints)
 
 

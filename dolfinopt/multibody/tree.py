@@ -20,7 +20,7 @@ import numpy as np
 from dolfinopt.multibody.body import Constants, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body, rigid_spatial_body
 
 if TYPE_CHECKING:
     from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -605,23 +605,17 @@ def bearing_body(stiffness: np.ndarray, damping: np.ndarray, dimension: int) -> 
             spring it is rigid in that direction.
         dimension: 2 or 3.
     """
-    d, g = (2, 2) if dimension == 2 else (3, 9)
     directions = np.array(IN_PLANE if dimension == 2 else range(6))
     k, c = np.asarray(stiffness)[directions], np.asarray(damping)[directions]
     springs = np.flatnonzero(k)
-    q = len(springs)
-    return ShapeIntegrals(
-        mass=0.0,
-        w=np.zeros((d, 1 + q)),
-        W=np.zeros((g, 1 + q, 1 + q)),
+    massless = rigid_spatial_body(0.0, np.zeros(3), np.zeros(6))
+    if dimension == 2:
+        massless = rigid_body(0.0, np.zeros(2), 0.0, np.zeros(2))
+    return replace(
+        massless.in_basis(np.zeros((0, len(springs)))),
         K=np.diag(k[springs]),
         D=np.diag(c[springs]),
         outboard=np.eye(len(k))[:, springs],
-        outboard_point=np.zeros(d),
-        K0=np.zeros((0, q, q)),
-        K0_outboard=np.zeros((0, q, q)),
-        further_points=np.zeros((0, d)),
-        along_modes=np.zeros((0, q, q)),
     )
 
 
