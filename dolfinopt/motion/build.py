@@ -92,7 +92,7 @@ def follows(scene: Scene) -> bool:
 
 def has_loops(scene: Scene) -> bool:
     """Return whether closures close loops."""
-    return scene.closure is not None or bool(scene.closures)
+    return bool(scene.closures)
 
 
 def check_path(scene: Scene) -> None:
@@ -468,7 +468,7 @@ def _follower(scene: Scene, stamp: int) -> Follower:
                 {"line": "motion.start, motion.end", "rotation": "motion.start_angle"}.get(
                     motion.path, "the table motion.file"
                 ),
-                "closure.side" if scene.closure is not None else "motion.initial_joints",
+                "motion.initial_joints" if scene.is_spatial else "closures.side",
             ),
         )
     )
@@ -492,10 +492,11 @@ def _guess(scene: Scene) -> tuple[np.ndarray, float]:
     if stated is not None:
         found[first : first + len(stated)] = stated
         return found, 0.1
-    if (closure := scene.closure) is not None:
+    if scene.closures and not scene.is_spatial:
+        (closure,) = scene.closures
         base = complex(scene.motion.base_position, scene.motion.joint_height)
-        direction = complex(*closure.direction) if closure.kind == "slider" else None
-        tied = plane.Tied(complex(*closure.point), direction, closure.side)
+        direction = None if closure.axis is None else complex(*closure.axis[:2])
+        tied = plane.Tied(complex(*closure.point[:2]), direction, closure.side)
         joints = _prescribed(np.zeros(1), scene)[0][0, 1:]
         lengths = np.array([arm.length for arm in scene.arms])
         found[1:] = plane.branch_guess(joints, lengths, base, tied)

@@ -349,7 +349,7 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
         if name in free:
             row.insert(0, (f"{name}: error", units[name], {"": error[:, k]}))
         rows.append(row)
-    for name, sizes in trajectory.closure_sizes.items() if scene.closures else ():
+    for name, sizes in trajectory.closure_sizes.items() if scene.is_spatial else ():
         words = {"N": "force", "N m": "moment"}
         row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
         rows += [row] if name not in scene.driven else []  # a driven rod's is its drive's
