@@ -95,7 +95,7 @@ def test_two_arms_that_cannot_be(make, told):
         ("slider", {"scenarios": [{"changes": ["control.stiffness=[1e3, 1.0]"]}],
                     "control": {"stiffness": [2e3], "damping": [20.0]}}, ["1 number, for crank"]),
         ("slider", {"closure": {"kind": "pin"}}, ['closure.kind = "pin"', "at least 3 arms"]),
-        ("slider", {"closure": {"direction": [0.0, 0.0]}}, ["closure.direction = [0.0, 0.0]", "length zero"]),
+        ("slider", {"closure": {"direction": [0.0, 0.0]}}, ["closure.direction", "length zero"]),
         ("slider", {"closure": {"side": 0}}, ["closure.side = 0", "-1 | 1"]),
         ("pin", {"closure": {"force": 3.0}}, ["closure.force = 3.0", "0.0, the default, with"]),
         ("pin", {"closure": {"direction": [0.0, 1.0]}}, ["closure.direction", "the default, with"]),
@@ -166,12 +166,8 @@ def test_scenarios_change_gains_and_closures():
     first, second = pose_scenarios(loop(control=gains, scenarios=changes))
     assert first.control.stiffness == (1e3,) and not first.forces
     (force,) = second.forces
-    assert (force.name, force.arm, force.force, force.factor) == (
-        "closure",
-        "rod",
-        (1.0, 0.0),
-        10.0,
-    )
+    assert (force.name, force.arm, force.factor) == ("closure", "rod", 10.0)
+    assert force.force == (1.0, 0.0)
 
 
 FORK_PUSH = {"arm": "link", "force": [0.0, 0.0, 1.0]}
@@ -190,7 +186,7 @@ FORK_PUSH = {"arm": "link", "force": [0.0, 0.0, 1.0]}
         ({"arm": "arm1", "force": [1.0, 2.0], "frame": "tip"}, ["frame", '"world" | "arm"']),
         ({"arm": "arm1", "force": [1.0, 2.0], "feed_forward": False},
          ["forces.0.feed_forward = false", "the default", "[control]"]),
-        ({"arm": "arm1", "force": [1.0, 2.0], "factor": 1e13}, ["forces.0.factor", "<= 1000000000000"]),
+        ({"arm": "arm1", "force": [1.0, 2.0], "factor": 1e13}, ["forces.0.factor", "<= 1e+12"]),
         ({"arm": "arm1", "table": "nowhere.csv"}, ['forces.0.table = "nowhere.csv"', "a file"]),
         ({**FORK_PUSH, "force": [1.0, 2.0]}, ["forces.0.force", "three numbers", "[[joints]]"]),
         ({**FORK_PUSH, "moment": 2.0}, ["forces.0.moment", "array of three numbers"]),
@@ -337,8 +333,8 @@ def test_both_spellings_of_a_loaded_slider_are_the_same():
     ("tree", "changes", "words"),
     [
         (loop_tree(), ["closure.side=0"], ("--set closure.side=0", "closure.side = 0", "-1 | 1")),
-        (loop_tree(), ["closure.sides=1"], ("unknown key closure.sides", "closures.side?")),
-        (loop_tree(), ["closure.force=1e13"], ("closure.force", "a number", "1000000000000")),
+        (loop_tree(), ["closure.sides=1"], ("unknown key closure.sides", "closures.0.side?")),
+        (loop_tree(), ["closure.force=1e13"], ("closure.force", "a number", "<= 1e+12")),
         (loop_tree(), ["closure.force=much"], ('closure.force = "much"', "a number")),
         (loop_tree(), ["closure=3"], ("closure = 3", "[[closures]]")),
         (loop_tree() | {"closure": 3}, [], ("closure = 3", "[[closures]]")),
