@@ -22,7 +22,7 @@ def response_instants(
     """Return the instants (n,) of all extremes and integrals over time, s.
 
     They lie evenly from 0 to the horizon, both included, at most 1 ms apart (of a horizon above
-    1000 s a millionth of it), and closer where the elastic deflection is so fast
+    1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
     that it could exceed two neighbouring instants by more than
     `EXTREME_EXCESS_SHARE` of its largest value: between instants d apart by max |qdd| d^2 / 8 at
     most. More than two for each stage of a step say nothing new of a polynomial.
@@ -35,7 +35,8 @@ def response_instants(
         least: number of intervals that are wanted at least.
     """
     count = max(1, int(np.ceil(horizon / RESPONSE_INTERVAL * (1.0 - 1e-9))))
-    count = min(count, RESPONSE_INSTANTS_LIMIT)
+    if count > RESPONSE_INSTANTS_LIMIT:
+        count = RESPONSE_INSTANTS_LIMIT // 10
     largest = _largest(solution.q[:, elastic], stiffness)
     wanted = float(least)
     if largest > 0.0:

@@ -41,7 +41,7 @@ def known_grid(system: System, guess: Solution, tolerance: float, stages: int) -
     if not np.isin(system.breakpoints, guess.time_grid).all():
         return None
     share = (guess.error / (AIM * tolerance)) ** (1.0 / (2 * stages - 1))
-    if share * FINER_GRID_RATIOS[0] > 1.0:
+    if share > 0.8:
         return guess.time_grid
     return spread(np.full(len(guess.a), max(share, 0.5)), guess.time_grid, system)
 

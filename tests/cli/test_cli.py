@@ -119,9 +119,11 @@ def test_history_ends_in_the_summary(optimised):
     best = lines[1 + summary["best_iteration"]]
     last = dict(zip(header.split(","), map(float, best.split(",")), strict=True))
     assert last["objective"] == min(float(line.split(",")[1]) for line in lines[1:])
-    assert last["objective"] == pytest.approx(summary["compliance"], rel=1e-9)
-    for key in ("objective", "max_deviation", "grayness", "kkt"):
-        assert last[key] == pytest.approx(summary[key], rel=1e-9)
+    # Simulated again, from another motion: to a tenth of simulation.tolerance.
+    assert last["objective"] == pytest.approx(summary["compliance"], rel=1e-5)
+    for key in ("objective", "max_deviation", "kkt"):
+        assert last[key] == pytest.approx(summary[key], rel=1e-5)
+    assert last["grayness"] == pytest.approx(summary["grayness"], rel=1e-9)
     assert summary["iterations"] == 3 and summary["converged"] is False
     assert "max_iterations" in summary["stop_reason"]
     assert 1e-2 < summary["kkt"] < 1.0  # far from an optimum after three iterations

@@ -146,7 +146,6 @@ def test_motions_are_compared_at_the_same_instants():
         (["reduction.method=krylov", "reduction.shifts=[0.0,20.0]"], 1e-3),
         (["reduction.method=balanced"], 1e-2),
         (["reduction.method=modal"], 0.4),
-        (["simulation.integrator=generalized-alpha"], 1e-3),
     ],
 )
 def test_fewest_that_meet_the_tolerance(overrides, tolerance):

@@ -36,7 +36,6 @@ def rates(test: TaylorTest) -> dict[str, float]:
     ("key", "value", "remedy"),
     [
         ("reduction.method", "balanced", "craig-bampton"),
-        ("simulation.integrator", "generalized-alpha", '"radau"'),
     ],
 )
 def test_nothing_to_check(key: str, value: str, remedy: str) -> None:
