@@ -170,18 +170,10 @@ def loops_of(scene: Scene) -> Loops | None:
     for one in scene.closures:
         a, b = (closing_site(scene, one, which) for which in (0, 1))
         assert a is not None
-        own = _equations(one, reach, places.get(one.name)) if d == 3 else _plane_equations(one)
-        point, rotation = np.array(one.point, dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]
-        ties.append(Tie(one.name, a, b, point, rotation, own))
+        equations = _equations(one, d, reach, places.get(one.name))
+        point, rotation = np.array(one.point[:d], dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]
+        ties.append(Tie(one.name, a, b, point, rotation, equations))
     return Loops(tuple(ties))
-
-
-def _plane_equations(one: Closures) -> tuple[Equation, ...]:
-    """Return those of a slider in the plane, across its line, or of a pin, along x and y."""
-    if one.axis is None:
-        return tuple(map(Along, np.eye(2)))
-    x, y = _unit(one.axis)
-    return (Along(np.array([-y, x])),)
 
 
 def reach_of(mechanism: Mechanism) -> float:
@@ -193,14 +185,16 @@ def reach_of(mechanism: Mechanism) -> float:
     return total + float(np.linalg.norm(point)) or 1.0
 
 
-def _equations(one: Closures, reach: float, place: int | None) -> tuple[Equation, ...]:
-    """Return a closure's equations in space; vectors of the second frame are in the joint's."""
+def _equations(one: Closures, d: int, reach: float, place: int | None) -> tuple[Equation, ...]:
+    """Return a closure's equations; vectors of the second frame are in the joint's."""
     if one.kind == "rod":
         return (Distance(0.0 if place is not None else one.length or 0.0, place),)
-    together: tuple[Equation, ...] = tuple(map(Along, ONE))
-    if one.kind == "ball":
+    together: tuple[Equation, ...] = tuple(map(Along, np.eye(d)))
+    if one.kind == "ball" or (one.kind == "pin" and d == 2):
         return together
     axis = _unit(one.axis)
+    if d == 2:
+        return (Along(np.array([-axis[1], axis[0]])),)
     if one.kind == "universal":
         return (*together, Facing(_unit(one.cross_axis), axis, reach))
     across = _unit(np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))

@@ -55,7 +55,6 @@ from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, s
 from dolfinopt.scene.tables.closures import (
     OLD,
     Closures,
-    complete_closures,
     read_old_closure,
     take_old_keys,
 )
@@ -159,7 +158,6 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _resolve_files(tree, source, changes)
     _drop_sizes(tree, sizes)
     _measure_bodies(tree, inherited)
-    complete_closures(tree, source)
     derived = complete(tree, source, changes)
     try:
         scene = Scene.model_validate({key: tree[key] for key in tree if key != OLD})

@@ -210,15 +210,14 @@ class Closures(Table):
                 (*at, "kind"),
                 ("arms",),
             )
-        for key in ("point", "axis"):
-            if self.kind == "pin" and key == "axis" and self.axis is not None:
-                raise Refusal(
-                    "expected [0, 0, 1], the default, with a pin without [[joints]]",
-                    (*at, key),
-                    (*at, "kind"),
-                )
-            if len(getattr(self, key) or ()) == 3:
-                raise Refusal("expected an array of two numbers without [[joints]]", (*at, key))
+        if any(self.point[2:]):
+            raise Refusal("expected an array of two numbers without [[joints]]", (*at, "point"))
+        axis = self.axis or (0.0, 0.0, 1.0)
+        if any(axis[:2] if self.kind == "pin" else axis[2:]):
+            expected = (
+                "[0, 0, 1], the default," if self.kind == "pin" else "an array of two numbers"
+            )
+            raise Refusal(f"expected {expected} without [[joints]]", (*at, "axis"))
         if len(scene.arms) <= scene.dependent_joints:
             raise Refusal(
                 f'expected kind = "{self.kind}" with at least {scene.dependent_joints + 1} arms, '
@@ -307,84 +306,56 @@ def closing_site(scene: Scene, one: Closures, which: int) -> tuple[int, int] | N
     return k, interface_number(scene.arms[k], interface) or 0
 
 
-# -- `[closure]`, an older word, and shorter ways to state closures in the plane -------------------
+# -- `[closure]`, an older word -------------------------------------------------------------------
 #
 # The tree is the scene as read, before it is validated: values of any type may stand in it.
 
 OLD = "closure"  # the table, and the name of what it states among [[closures]] and [[forces]]
-ALONG = "along the axis"  # stands for the direction of a force until the axis is known
 
 
 def read_old_closure(tree: dict[str, Any], source: str) -> None:
     """Put [closure] of a scene in its places; `direction` is another word for `axis`.
 
     Raises:
-        InputError: it is no table, or stands beside [[closures]].
+        InputError: it is no table, or stands beside [[closures]] or [[joints]].
     """
     for one in _rows(tree, "closures"):
         if "direction" in one and "axis" not in one:
             one["axis"] = one.pop("direction")
-    if (table := tree.pop(OLD, None)) is None:
+    table = tree.pop(OLD, None)
+    if table is None:
         return
-    if not isinstance(table, dict):
-        raise input_error(source, f"{OLD} = {shown(table)}: expected [[closures]]")
-    if tree.get("closures"):
-        raise input_error(source, "closure: expected [[closures]] alone, whose older word it is")
+    if not isinstance(table, dict) or tree.get("closures") or tree.get("joints"):
+        raise input_error(
+            source, f"closure = {shown(table)}: expected [[closures]], of which it is an older word"
+        )
     take_old_keys(tree, table)
 
 
 def take_old_keys(tree: dict[str, Any], table: Mapping[str, Any]) -> None:
     """Put keys of [closure] in their places: of [[closures]], and `force` of [[forces]]."""
     tree[OLD] = True  # messages name its keys
-    tree["closures"] = tree.get("closures") or [{"name": OLD}]
-    tree["forces"] = tree.get("forces") or []
-    forces = [force for force in _rows(tree, "forces") if force.get("name") == OLD]
-    for one in _rows(tree, "closures")[:1]:
-        if "direction" in table and forces and forces[0].get("force") == _unit(one.get("axis")):
-            forces[0]["force"] = ALONG
-        keys = {key: value for key, value in table.items() if key != "force"}
-        one.update({"axis" if key == "direction" else key: x for key, x in keys.items()})
-    if not forces and table.get("force", 0.0) != 0.0:
-        forces = [{"name": OLD}]
-        tree["forces"] = [*tree["forces"], *forces]
-    if forces and "force" in table:
-        forces[0].update(force=ALONG, factor=table["force"])
-
-
-def complete_closures(tree: dict[str, Any], source: str) -> None:
-    """Complete what [closure] states; cut points and axes in the plane to two numbers.
-
-    Raises:
-        InputError: [closure] stands beside [[joints]].
-    """
-    if tree.get("joints"):
-        if OLD in tree:
-            raise input_error(source, "closure: expected no [closure] with [[joints]]: in space "
-                              "loops are closed by [[closures]]")  # fmt: skip
-        return
-    for one in _rows(tree, "closures"):
-        one.setdefault("point", [0.0, 0.0])
-        if OLD in tree:
-            _complete_old(tree, one)
-        for key in ("point", "axis"):
-            if _is_vector(one.get(key)) and one[key][2] == 0.0:
-                one[key] = one[key][:2]
-        if one.get("kind") == "pin" and _is_vector(one.get("axis")) and one["axis"][:2] == [0, 0]:
-            del one["axis"]  # about the plane's normal
-
-
-def _complete_old(tree: dict[str, Any], one: dict[str, Any]) -> None:
-    """Give what [closure] states its ends and defaults, and its force a direction."""
     last = [arm.get("name") for arm in _rows(tree, "arms")][-1:]
-    one.setdefault("between", [*last, GROUND])
-    if one.get("kind") == "slider":
-        one.setdefault("axis", [1.0, 0.0])
-    elif one.get("axis") == [1.0, 0.0]:
-        del one["axis"]
-    for force in _rows(tree, "forces"):
-        if force.get("force") == ALONG:
-            force["force"] = _unit(one.get("axis"))
-            force.setdefault("arm", *last)
+    tree["closures"] = tree.get("closures") or [{"name": OLD, "between": [*last, GROUND]}]
+    for one in _rows(tree, "closures")[:1]:
+        before = _unit(one.get("axis"))
+        one.update({"axis" if key == "direction" else key: x for key, x in table.items()})
+        load = one.pop("force", None)
+        if one.get("kind") == "slider":
+            one.setdefault("axis", [1.0, 0.0])
+        elif one.get("axis") == [1.0, 0.0]:
+            del one["axis"]  # the default of a line
+        if load and not _old_forces(tree):
+            tree["forces"] = [*(tree.get("forces") or []), {"name": OLD, "arm": last[0]}]
+        for force in _old_forces(tree):
+            if load is not None:
+                force["factor"] = load
+            if load is not None or force.get("force") == before:
+                force["force"] = _unit(one.get("axis"))
+
+
+def _old_forces(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return [force for force in _rows(tree, "forces") if force.get("name") == OLD]
 
 
 def _rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
@@ -396,14 +367,10 @@ def _rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
 def _unit(axis: Any) -> list[float]:
     """Return an axis of the plane of length 1; along x where it is none, which is refused."""
     try:
-        x, y = axis
-        return [x / math.hypot(x, y), y / math.hypot(x, y)]
-    except (TypeError, ValueError, ZeroDivisionError):
+        size = math.hypot(*axis[:2])
+        return [axis[0] / size, axis[1] / size]
+    except (TypeError, IndexError, ZeroDivisionError):
         return [1.0, 0.0]
-
-
-def _is_vector(x: Any) -> bool:
-    return isinstance(x, list) and len(x) == 3
 
 
 def as_written(loc: Loc, tree: Mapping[str, Any]) -> Loc:
@@ -413,7 +380,7 @@ def as_written(loc: Loc, tree: Mapping[str, Any]) -> Loc:
     table, number, *key = loc
     if table == "closures":
         return (OLD, "direction" if key == ["axis"] else key[0], *key[1:])
-    if table == "forces" and _rows(tree, table)[number].get("name") == OLD:
+    if table == "forces" and tree[table][number] in _old_forces(tree):
         return (OLD, "force")
     return loc
 
