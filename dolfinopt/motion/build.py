@@ -496,10 +496,10 @@ def _guess(scene: Scene) -> tuple[np.ndarray, float]:
         (closure,) = scene.closures
         base = complex(scene.motion.base_position, scene.motion.joint_height)
         direction = complex(*(closure.axis or ())[:2]) if closure.kind == "slider" else None
-        tied = plane.Tied(complex(*closure.point[:2]), direction, closure.side)
+        away = complex(*closure.point[:2]) - base
         joints = _prescribed(np.zeros(1), scene)[0][0, 1:]
         lengths = np.array([arm.length for arm in scene.arms])
-        found[1:] = plane.branch_guess(joints, lengths, base, tied)
+        found[1:] = plane.branch_guess(joints, lengths, away, direction, closure.side)
         return found, 0.1
     return found, 1.5
 

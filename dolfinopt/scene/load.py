@@ -421,9 +421,7 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
         raise input_error(where, "expected key.path=value, for example payload.mass=4.0")
     if parts[0] == OLD:
         given = _parse_value(value.strip())
-        if len(parts) == 1 and not isinstance(given, dict):
-            raise input_error(where, f"{OLD} = {shown(given)}: expected [[closures]]")
-        take_old_keys(tree, given if len(parts) == 1 else {parts[1]: given})
+        take_old_keys(tree, given if len(parts) == 1 else {parts[1]: given}, where)
         return Override(text, (parts,))
     locs = _override_locs(tree, parts, where)
     for loc in locs:

@@ -236,9 +236,10 @@ def _found(loc: Loc, tree: dict[str, Any]) -> str:
 
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:
     """Return the TOML spelling of a path, with the name of the arm it belongs to."""
-    text = ".".join(map(key_text, as_written(loc, tree)))
+    loc = as_written(loc, tree)
+    text = ".".join(map(key_text, loc))
     named = loc[0] in ("arms", "joints", "closures", "forces") and len(loc) > 1
-    name = arm_name(tree, loc[1], loc[0]) if named and text.startswith(loc[0]) else None
+    name = arm_name(tree, loc[1], loc[0]) if named else None
     return f"{text} ({name})" if name and loc[2:] != ("name",) else text
 
 

@@ -25,7 +25,7 @@ from dolfinopt.scene.tables.machine import (
     Gain,
     check_joint_name,
 )
-from dolfinopt.scene.tables.objective import need_of
+from dolfinopt.scene.tables.objective import asked, need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -214,10 +214,8 @@ class Closures(Table):
             raise Refusal("expected an array of two numbers without [[joints]]", (*at, "point"))
         axis = self.axis or (0.0, 0.0, 1.0)
         if any(axis[:2] if self.kind == "pin" else axis[2:]):
-            expected = (
-                "[0, 0, 1], the default," if self.kind == "pin" else "an array of two numbers"
-            )
-            raise Refusal(f"expected {expected} without [[joints]]", (*at, "axis"))
+            expected = "[0, 0, 1], the default" if self.kind == "pin" else "two numbers"
+            raise Refusal(f"expected {expected}, without [[joints]]", (*at, "axis"))
         if len(scene.arms) <= scene.dependent_joints:
             raise Refusal(
                 f'expected kind = "{self.kind}" with at least {scene.dependent_joints + 1} arms, '
@@ -241,16 +239,15 @@ class Closures(Table):
     def _check_springs(self, scene: Scene, at: Loc) -> None:
         """Refuse springs between drive and arm at joints of the plane that have no drive."""
         first = len(scene.arms) - scene.dependent_joints
-        for index in range(first, len(scene.arms)):
+        for index, arm in enumerate(scene.arms):
             for key in ("joint_stiffness", "gear_stiffness"):
-                if getattr(scene.arms[index], key) > 0.0:
+                if index >= first and getattr(arm, key) > 0.0:
                     raise Refusal(
-                        f"expected 0: the joint of {scene.arms[index].name} follows from the "
-                        "others in the closed loop and has no drive",
+                        f"expected 0: the joint of {arm.name} follows from the others in the "
+                        "closed loop and has no drive",
                         ("arms", index, key),
                         (*at, "kind"),
                     )
-        for index, arm in enumerate(scene.arms):
             if arm.bearing_stiffness is not None:
                 raise Refusal(
                     "expected none with [[closures]] without [[joints]]: state [[joints]] about "
@@ -263,20 +260,16 @@ class Closures(Table):
         """Refuse responses of the deviation of an end that a pin holds, and forces along a line."""
         for n, force in enumerate(scene.forces):
             if force.name == OLD:
-                raise Refusal(
-                    "expected 0.0, the default, with a pin: its end does not move",
-                    ("forces", n, "factor"),
-                    (*at, "kind"),
-                )
-        for where in (("objective", "kind"), *(("constraints", key) for key in OF_THE_END)):
-            value = getattr(getattr(scene, where[0]), where[1], None)
-            if value in OF_THE_END if where[1] == "kind" else value is not None:
-                raise Refusal(
-                    "expected another response with a pin: the end of the last arm is held, it "
-                    "deviates from nothing; take the compliance",
-                    where,
-                    (*at, "kind"),
-                )
+                reason = "expected 0.0, the default, with a pin: its end does not move"
+                raise Refusal(reason, ("forces", n, "factor"), (*at, "kind"))
+        for key in set(OF_THE_END).intersection(asked(scene)):
+            place = ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
+            raise Refusal(
+                "expected another response with a pin: the end of the last arm is held, it "
+                "deviates from nothing; take the compliance",
+                place,
+                (*at, "kind"),
+            )
 
     def _check_ends(self, scene: Scene, at: Loc) -> None:
         where, names = (*at, "between"), [arm.name for arm in scene.arms]
@@ -322,18 +315,19 @@ def read_old_closure(tree: dict[str, Any], source: str) -> None:
     for one in _rows(tree, "closures"):
         if "direction" in one and "axis" not in one:
             one["axis"] = one.pop("direction")
-    table = tree.pop(OLD, None)
-    if table is None:
-        return
-    if not isinstance(table, dict) or tree.get("closures") or tree.get("joints"):
-        raise input_error(
-            source, f"closure = {shown(table)}: expected [[closures]], of which it is an older word"
-        )
-    take_old_keys(tree, table)
+    if (table := tree.pop(OLD, None)) is not None:
+        others = tree.get("closures") or tree.get("joints")
+        take_old_keys(tree, None if others else table, source)
 
 
-def take_old_keys(tree: dict[str, Any], table: Mapping[str, Any]) -> None:
-    """Put keys of [closure] in their places: of [[closures]], and `force` of [[forces]]."""
+def take_old_keys(tree: dict[str, Any], table: Any, source: str) -> None:
+    """Put keys of [closure] in their places: of [[closures]], and `force` of [[forces]].
+
+    Raises:
+        InputError: it is no table.
+    """
+    if not isinstance(table, dict):
+        raise input_error(source, "closure: expected [[closures]], of which it is an older word")
     tree[OLD] = True  # messages name its keys
     last = [arm.get("name") for arm in _rows(tree, "arms")][-1:]
     tree["closures"] = tree.get("closures") or [{"name": OLD, "between": [*last, GROUND]}]
@@ -375,13 +369,10 @@ def _unit(axis: Any) -> list[float]:
 
 def as_written(loc: Loc, tree: Mapping[str, Any]) -> Loc:
     """Return the path of a key as [closure] has it, where the scene states that."""
-    if OLD not in tree or len(loc) < 3:
-        return loc
-    table, number, *key = loc
-    if table == "closures":
-        return (OLD, "direction" if key == ["axis"] else key[0], *key[1:])
-    if table == "forces" and tree[table][number] in _old_forces(tree):
-        return (OLD, "force")
+    if OLD in tree and len(loc) > 2 and loc[0] == "closures":
+        return (OLD, *("direction" if part == "axis" else part for part in loc[2:]))
+    if OLD in tree and len(loc) > 2 and loc[0] == "forces":
+        return (OLD, "force") if tree["forces"][loc[1]].get("name") == OLD else loc
     return loc
 
 
@@ -390,6 +381,5 @@ def in_new_words(key: str) -> str:
     table, _, rest = key.partition(".")
     if table != OLD:
         return key
-    if rest == "force":
-        return f"forces.{OLD}.factor"
-    return f"closures.0.{'axis' if rest == 'direction' else rest}"
+    known = {"force": f"forces.{OLD}.factor", "direction": "closures.0.axis"}
+    return known.get(rest, f"closures.0.{rest}")
