@@ -87,12 +87,7 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 
 def follows(scene: Scene) -> bool:
     """Return whether joints follow from equations: closed loops, or a path in space."""
-    return has_loops(scene) or (scene.is_spatial and scene.motion.path != "joints")
-
-
-def has_loops(scene: Scene) -> bool:
-    """Return whether closures close loops."""
-    return bool(scene.closures)
+    return bool(scene.closures) or (scene.is_spatial and scene.motion.path != "joints")
 
 
 def check_path(scene: Scene) -> None:
@@ -420,7 +415,7 @@ def _words(scene: Scene) -> Words:
     elif len(scene.arms) > 1:
         keys.append("motion.cart_follow")
     moved = f"{', '.join(keys)}, motion.joint_height or the arms' length"
-    return Words(scene.source, moved, "")
+    return Words(scene.source, moved)
 
 
 # -- joints that follow ----------------------------------------------------------------------
@@ -468,7 +463,6 @@ def _follower(scene: Scene, stamp: int) -> Follower:
                 {"line": "motion.start, motion.end", "rotation": "motion.start_angle"}.get(
                     motion.path, "the table motion.file"
                 ),
-                "motion.initial_joints" if scene.is_spatial else "closures.side",
             ),
         )
     )
@@ -537,7 +531,7 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
 
 def loop_start(scene: Scene) -> dict[str, float]:
     """Return the joints that follow in closed loops at t = 0, rad, m: the branch."""
-    if not has_loops(scene):
+    if not scene.closures:
         return {}
     task, q = follower(scene).task, follower(scene).start.q
     return {task.names[k]: float(q[k]) for k in task.unknown}
@@ -545,7 +539,7 @@ def loop_start(scene: Scene) -> dict[str, float]:
 
 def misfit(scene: Scene) -> float:
     """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
-    return follower(scene).start.misfit if has_loops(scene) else 0.0
+    return follower(scene).start.misfit if scene.closures else 0.0
 
 
 def forced_rest(scene: Scene) -> str | None:

@@ -22,11 +22,10 @@ def part_of(values: Derivatives, columns: slice | None) -> Derivatives:
 
 @dataclass(frozen=True)
 class Words:
-    """What messages name: where the motion is stated, and the keys that change it and its start."""
+    """What messages name: where the motion is stated, and the keys that change it."""
 
     source: str
     motion: str
-    start: str
 
 
 def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:

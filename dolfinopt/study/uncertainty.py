@@ -509,8 +509,7 @@ def parse_input(scene: Scene, text: str) -> Input:
             )
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
-        several = parts[0] in ("arms", "forces", "closures")
-        field = field_at((parts[0], 0, parts[-1]) if several else tuple(parts))
+        field = field_at((parts[0], parts[-1]))
         try:
             return Input(named, nominal_value(scene, key), distribution.within(*_range(field)))
         except InputError as error:
@@ -519,22 +518,17 @@ def parse_input(scene: Scene, text: str) -> Input:
 
 def nominal_value(scene: Scene, key: str) -> object:
     """Return the scene's value of a key, None where arms differ in it."""
-    parts = in_new_words(key).split(".")
-    if parts[0] in ("forces", "closures"):
-        every = getattr(scene, parts[0])
-        if len(parts) == 3:
-            every = [one for i, one in enumerate(every) if parts[1] in (str(i), one.name)]
-        found = {getattr(one, parts[-1], None) for one in every}
-        return found.pop() if len(found) == 1 else None
-    if parts[0] != "arms":
-        return getattr(getattr(scene, parts[0]), parts[1], None)
-    count = len(scene.arms)
-    names = [*map(str, range(count)), *(arm.name for arm in scene.arms)]
-    places = [names.index(parts[1]) % count] if len(parts) == 3 else range(count)
+    table, *which, name = in_new_words(key).split(".")
+    rows = getattr(scene, table)
+    if not isinstance(rows, tuple):
+        return getattr(rows, name, None)
     values = set()
-    for i in places:
-        own = getattr(scene.arms[i], parts[-1])
-        values.add(getattr(scene.material_of(i), parts[-1], None) if own is None else own)
+    for i, row in enumerate(rows):
+        own = getattr(row, name, None)
+        if own is None and table == "arms":
+            own = getattr(scene.material_of(i), name, None)
+        if not which or which[0] in (str(i), row.name):
+            values.add(own)
     return values.pop() if len(values) == 1 else None
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from dolfinopt.scene.tables.base import (
     Length,
@@ -17,11 +17,18 @@ from dolfinopt.scene.tables.base import (
     input_error,
     shown,
 )
-from dolfinopt.scene.tables.joints import OUTBOARD, interface_number, refuse_unknown
+from dolfinopt.scene.tables.joints import (
+    OUTBOARD,
+    Components,
+    check_direction,
+    interface_number,
+    refuse_unknown,
+)
 from dolfinopt.scene.tables.machine import (
     GROUND,
     Angle,
     Component,
+    Direction,
     Gain,
     check_joint_name,
 )
@@ -30,8 +37,8 @@ from dolfinopt.scene.tables.objective import asked, need_of
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
+Line = tuple[Component, Component]
 Kind = Literal["ball", "pin", "slider", "universal", "rod"]
-Direction = tuple[Component, Component, Component]
 # Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
 OF_THE_END = ("deviation", "settling")
 # What is positive of every equation's force, in the joint's frame, and its unit; in the plane and
@@ -72,7 +79,7 @@ class Closures(Table):
         description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; at zero the "
         "first interface's frame lies like it [rad]",
     )
-    axis: tuple[Component, Component] | Direction | None = Field(
+    axis: Line | tuple[Component, Component, Component] | None = Field(
         default=None,
         description="of a pin in space, a slider, or the universal joint's axis on the second "
         "interface, in the joint's frame, of any length [-]",
@@ -121,6 +128,11 @@ class Closures(Table):
         arm, _, interface = self.between[which].partition(".")
         return arm, interface or OUTBOARD
 
+    @field_validator("axis")
+    @classmethod
+    def _check_axis(cls, axis: Components | None) -> Components | None:
+        return axis if axis is None else check_direction(axis)
+
     @model_validator(mode="after")
     def _check_kind(self) -> Closures:
         self.refuse_unused(self.kind == "rod", "kind", "length", "stiffness", "damping")
@@ -130,15 +142,9 @@ class Closures(Table):
         self.refuse_unused(self.is_spring, "stiffness", "damping")
         needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
         for key in needed.get(self.kind, ()):
-            value = getattr(self, key)
-            if value is None:
-                raise Refusal(
-                    f"expected an array of three numbers with a {self.kind}", (key,), ("kind",)
-                )
-        for key in ("axis", "cross_axis"):
-            value = getattr(self, key)
-            if value is not None and math.hypot(*value) < 1e-9:
-                raise Refusal("expected a direction, not of length zero", (key,))
+            if getattr(self, key) is None:
+                reason = f"expected an array of three numbers with a {self.kind}"
+                raise Refusal(reason, (key,), ("kind",))
         if self.kind == "universal":
             self._check_cross()
         return self
@@ -163,7 +169,7 @@ class Closures(Table):
 
     def _check_in_space(self, scene: Scene, at: Loc) -> None:
         """Refuse what is of the plane, and what a loop in space cannot be combined with."""
-        if self.side != type(self).model_fields["side"].default:
+        if self.side != 1:
             raise Refusal(
                 "expected 1, the default, with [[joints]]: motion.initial_joints says which way "
                 "the loop is assembled",
@@ -198,12 +204,9 @@ class Closures(Table):
 
     def _check_in_plane(self, scene: Scene, at: Loc) -> None:
         """Refuse all but one pin or slider at the chain's end, and what it rules out."""
-        free = [self.kind not in IN_PLANE, len(scene.closures) > 1, any(self.rpy)]
-        if (
-            any(free)
-            or closing_site(scene, self, 0) != (len(scene.arms) - 1, 0)
-            or (self.between[1] != GROUND)
-        ):
+        ends = [closing_site(scene, self, which) for which in (0, 1)]
+        alone = ends == [(len(scene.arms) - 1, 0), None] and len(scene.closures) == 1
+        if not alone or self.kind not in IN_PLANE or any(self.rpy):
             raise Refusal(
                 "expected one pin or slider between the last arm and the ground without "
                 "[[joints]]: more is closed in space, with [[joints]] about the plane's normal",

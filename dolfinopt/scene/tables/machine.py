@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -21,6 +20,7 @@ from dolfinopt.scene.tables.joints import (
     GearStiffness,
     Inertia,
     Ratio,
+    check_direction,
     check_parts,
     check_used,
     joint_parts,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 Component = Annotated[float, Field(ge=-1e6, le=1e6)]
+Direction = Annotated[tuple[Component, Component, Component], AfterValidator(check_direction)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
 Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
@@ -66,7 +67,7 @@ class Joint(Table):
         description="name of the parent's interface that it sits on, one of arms.interfaces [-]",
     )
     child: str = Field(description="name of the arm that it holds, whose frame is the joint's [-]")
-    axis: tuple[Component, Component, Component] | None = Field(
+    axis: Direction | None = Field(
         default=None,
         description="axis in the joint's frame, of any length; of revolute and prismatic ones [-]",
     )
@@ -151,8 +152,6 @@ class Joint(Table):
             )
         if self.axis is not None and not self.moves:
             raise Refusal("expected none with a fixed joint", ("axis",), ("type",))
-        if self.axis is not None and math.hypot(*self.axis) < 1e-9:
-            raise Refusal("expected a direction, not of length zero", ("axis",))
         return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
