@@ -489,7 +489,7 @@ def _guess(scene: Scene) -> tuple[np.ndarray, float]:
     if scene.closures and not scene.is_spatial:
         (closure,) = scene.closures
         base = complex(scene.motion.base_position, scene.motion.joint_height)
-        direction = complex(*(closure.axis or ())[:2]) if closure.kind == "slider" else None
+        direction = complex(*(closure.axis or ())[:2])
         away = complex(*closure.point[:2]) - base
         joints = _prescribed(np.zeros(1), scene)[0][0, 1:]
         lengths = np.array([arm.length for arm in scene.arms])

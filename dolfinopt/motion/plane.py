@@ -255,7 +255,7 @@ def _check_height(t: np.ndarray, height: np.ndarray, length: float, words: Words
 
 
 def branch_guess(
-    joints: np.ndarray, lengths: np.ndarray, away: complex, direction: complex | None, side: int
+    joints: np.ndarray, lengths: np.ndarray, away: complex, direction: complex, side: int
 ) -> np.ndarray:
     """Return joint angles (arms,) near those that close a loop at its start, by `side`.
 
@@ -265,14 +265,14 @@ def branch_guess(
         joints: angles of the first arms, which are given, rad.
         lengths: of all arms, m.
         away: a pin, or a point of a line, from the first joint, m.
-        direction: of the line; None of a pin.
+        direction: of the line; 0 of a pin.
         side: sign of the last joint's angle at the start.
     """
     angles = np.cumsum(joints)
     own = lengths[: len(joints)]
     away -= (own * np.exp(1j * angles)).sum()
     before = float(angles[-1])
-    if direction is None:
+    if not direction:
         a, b = lengths[-2:]
         cosine = (abs(away) ** 2 - a * a - b * b) / (2.0 * a * b)
         beta = side * np.arccos(np.clip(cosine, -1.0, 1.0))

@@ -365,8 +365,8 @@ def _unit(axis: Any) -> list[float]:
     """Return an axis of the plane of length 1; along x where it is none, which is refused."""
     try:
         size = math.hypot(*axis[:2])
-        return [axis[0] / size, axis[1] / size]
-    except (TypeError, IndexError, ZeroDivisionError):
+        return [x / size for x in axis[:2]]
+    except (TypeError, ZeroDivisionError):
         return [1.0, 0.0]
 
 
