@@ -311,8 +311,7 @@ class FrozenTree:
         none, units = np.zeros((1, 0)), np.eye(6)[:, :, None]
         found = []
         for link in outward_pass(self.mechanism, self.motion, (none, none, none)):
-            loads = link.joint.at_interface((units[:3], units[3:]))
-            found.append(np.concatenate(loads)[:, :, 0].T)
+            found.append(link.joint.at_interface(units)[:, :, 0].T)
         return found
 
     def _shift(self, body: int, interface: int) -> np.ndarray:

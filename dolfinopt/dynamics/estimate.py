@@ -14,6 +14,7 @@ import numpy as np
 from dolfinopt.dynamics.collocation import (
     Collocation,
     Stages,
+    at_stages,
     lagrange_derivatives,
     lagrange_integrals,
     radau_iia,
@@ -25,10 +26,11 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.measured import (
     COMPARED_STEP_COUNTS,
-    ESTIMATE_ANGLE,
     EXACT,
+    KEPT_CONTRACTION,
+    SLOW_ANGLES,
 )
-from dolfinopt.dynamics.newton_matrix import chunks, factorise, up_to_angle
+from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, matrix_of, up_to_angle
 from dolfinopt.dynamics.system import State, inverse_size
 
 
@@ -52,6 +54,7 @@ def estimate(
     time_grid: np.ndarray,
     state: State,
     a: np.ndarray,
+    matrix: NewtonMatrix | None,
     size: np.ndarray | None = None,
 ) -> Estimate:
     """Return the error of accelerations a (n, s, N) on the steps of a grid (n + 1,).
@@ -61,14 +64,21 @@ def estimate(
         time_grid: their ends, s.
         state: q, qd (1, N) that they begin with.
         a: what was found.
+        matrix: Newton's, of all steps, whose tangent serves between its stages; or None.
         size: (groups,) of a longer motion of which this is a part, or None.
     """
     system, method = stages.preconditioner.system, radau_iia(len(stages.method.c) + 1)
     richer = stages_of(stages.preconditioner, method, time_grid)
     begin = step_beginnings(stages, state, a)
-    a = lagrange_integrals(stages.method.c, method.c)[0] @ a
-    q, _ = stage_values(richer, *begin, a)
-    every, alone = _corrections(richer, begin, a)
+    values = lagrange_integrals(stages.method.c, method.c)[0]
+    slow, b = up_to_angle(richer, SLOW_ANGLES[0]), values @ a
+    corrections = None
+    if matrix is not None:
+        keep = np.searchsorted(matrix.slow, slow)
+        nearby = matrix_of(richer, matrix.tangent.interpolated(values, keep), slow)
+        corrections = _corrected(nearby, begin, b)
+    every, alone = corrections or _corrections(richer, begin, b, slow)
+    q, _ = stage_values(richer, *begin, b)
     reached = system.norm(q.reshape(-1, q.shape[2]))
     size = reached if size is None else np.maximum(size, reached)
     scale = inverse_size(size)
@@ -76,10 +86,28 @@ def estimate(
     return Estimate(float(largest.max()), (system.norm(alone) * scale).max(axis=-1), size)
 
 
-def _corrections(richer: Stages, begin: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@np.errstate(all="ignore")  # of what diverges
+def _corrected(
+    matrix: NewtonMatrix, begin: State, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return what `_corrections` does in two steps by a matrix made nearby; None: they do not."""
+    steps, before = matrix.stages, np.zeros((2, a.shape[2]))
+    q, qd = stage_values(steps, *begin, a)
+    residual = residual_at(steps, q, qd, a)
+    change, shift = matrix.solve(residual, before)
+    _, alone = matrix.solve(residual, before, alone=True)
+    start = (begin[0][:1], begin[1][:1])
+    q, qd = at_stages(steps, start, a + change)
+    _, more = matrix.solve(residual_at(steps, q, qd, a + change), before)
+    contracts = steps.relative(more, q) <= KEPT_CONTRACTION * steps.relative(shift, q)
+    return (shift + more, alone) if contracts else None
+
+
+def _corrections(
+    richer: Stages, begin: State, a: np.ndarray, slow: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return Newton's change of q (n, s + 1, N), over all steps and of each by itself."""
     # Chunk by chunk: of long horizons the blocks have no room.
-    slow = up_to_angle(richer, ESTIMATE_ANGLE)
     before, every, alone = np.zeros((2, a.shape[2])), np.empty_like(a), np.empty_like(a)
     for part in chunks(richer, slow):
         steps, b = richer.window(part.start, part.stop), a[part]

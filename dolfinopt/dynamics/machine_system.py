@@ -428,7 +428,7 @@ class MachineSystem:
         if x is not None:
             y, _, ydd = states(x)
             return y, ydd[0, slice(*self.ends[1:])]
-        limited = bool(self.drives.limited.any())
+        limited = bool(np.isfinite(self.drives.limits).any())
         raise ConvergenceError(
             "the machine finds no equilibrium at t = 0: the drives are too "
             + ("weak or soft" if limited else "soft")

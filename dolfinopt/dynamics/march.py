@@ -146,7 +146,7 @@ class March:
         if not found.converged:
             self._shorten(grid)
             return
-        errors = estimate(stages, grid, self.state, found.a, self.size)
+        errors = estimate(stages, grid, self.state, found.a, found.matrix, self.size)
         self._accept(stages, grid, found.a, errors)
 
     def _next_steps(self, end: float, horizon: float) -> np.ndarray:

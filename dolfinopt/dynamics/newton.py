@@ -47,11 +47,13 @@ class Iterate:
         a: (n, s, N) accelerations.
         converged: whether they solve the residual.
         iterations: spent.
+        matrix: the last one, made near a; None of none, or of several chunks.
     """
 
     a: np.ndarray
     converged: bool
     iterations: int
+    matrix: NewtonMatrix | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +101,13 @@ def newton(
         if share == 0.0:
             if fresh and len(slow) == a.shape[2]:
                 settled = max(SETTLED_SHARE * tolerance, ROUNDING)  # nothing is left but that
-                return Iterate(at.a, step.length <= settled, iteration)
+                return Iterate(at.a, step.length <= settled, iteration, matrix)
             slow = slow_coordinates(stages, len(slow)) if fresh else slow
             step = None
             continue
         at, rate = there, following.length / step.length if step.length > 0.0 else 0.0
         if share == 1.0 and rate * following.length <= limits.goal * tolerance:
-            return Iterate(at.a + following.change, True, iteration)
+            return Iterate(at.a + following.change, True, iteration, matrix)
         if share == 1.0 and rate <= KEPT_CONTRACTION:
             step = following
             continue
@@ -157,4 +159,5 @@ def newton_in_chunks(
             return Iterate(pieces, False, spent)
         q, qd = step_ends(window, state, found.a)
         state = (q[-1:], qd[-1:])
-    return Iterate(pieces, True, round(spent / len(parts)))
+    matrix = found.matrix if len(parts) == 1 else None
+    return Iterate(pieces, True, round(spent / len(parts)), matrix)

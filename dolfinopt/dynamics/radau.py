@@ -32,6 +32,7 @@ from dolfinopt.dynamics.measured import (
     STEPS_LIMIT,
 )
 from dolfinopt.dynamics.newton import Limits, newton_in_chunks
+from dolfinopt.dynamics.newton_matrix import NewtonMatrix
 from dolfinopt.dynamics.system import Preconditioner, System
 from dolfinopt.dynamics.time_grid import finer, first_grid, known_grid
 from dolfinopt.dynamics.work import GivenUp
@@ -132,6 +133,7 @@ class _Integration:
         self._iterations, self._stalled, self._unresolved = 0, 0, 0.0
         self._progress = SlowWork("simulation")
         self._kept: tuple[np.ndarray, Stages] | None = None
+        self._matrix: NewtonMatrix | None = None
 
     def run(self) -> Solution:
         """Return the solution whose error is small enough."""
@@ -213,6 +215,7 @@ class _Integration:
 
     def marched_on_grid(self) -> np.ndarray:
         """Return accelerations on the present steps, found some steps after the others."""
+        self._matrix = None
         return march_on_grid(self._steps(), self._state, self._tolerance, HORIZON_LIMITS)
 
     def first_guess(self) -> np.ndarray:
@@ -226,13 +229,13 @@ class _Integration:
         """Return the accelerations by Newton's method, and whether it has converged."""
         stages = self._steps()
         found = newton_in_chunks(stages, self._state, guess, self._tolerance, HORIZON_LIMITS)
-        self._iterations += found.iterations
+        self._iterations, self._matrix = self._iterations + found.iterations, found.matrix
         return found.a, found.converged
 
     def judged(self, a: np.ndarray) -> tuple[Solution, np.ndarray]:
         """Return the solution with its estimated error, and the errors (n,) that steps add."""
         stages = self._steps()
-        found = estimate(stages, self.time_grid, self._state, a)
+        found = estimate(stages, self.time_grid, self._state, a, self._matrix)
         self._unresolved = unresolved(stages, self.time_grid, self._state, a)
         error = found.error + self._unresolved
         begin, c = step_beginnings(stages, self._state, a), stages.method.c

@@ -28,6 +28,7 @@ from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Along, Loops, Tie
+from dolfinopt.multibody.dimension import SPACE
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
     deviation,
@@ -36,11 +37,11 @@ from dolfinopt.multibody.kinematics import (
     end_rotation,
     lengths,
 )
-from dolfinopt.multibody.loads import load_coefficients as coefficients_of
+from dolfinopt.multibody.loads import load_coefficients
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import SPACE, Rates, ShapeIntegrals, add_integrals
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.profiling import Profile
@@ -199,10 +200,17 @@ class Trajectory:
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
         """What loads every body (n, 7 + 2 q), in space (n, 18 + 9 q), see the function."""
+        pull = {}
         if self.loops is not None:
-            return load_coefficients(self.problem, self.t, self.unknowns)
+            here = self.loops.at(self.mechanism, self.motion.q, self.q_e)
+            pull = here.interface_loads(self._multipliers)
         q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
-        return coefficients_of(self.mechanism, self.motion, (q, qd, qdd))
+        return load_coefficients(self.mechanism, self.motion, (q, qd, qdd), pull)
+
+    @property
+    def _multipliers(self) -> np.ndarray:
+        assert isinstance(self.problem, MachineSystem)
+        return self.unknowns[2][:, slice(*self.problem.ends[1:])]
 
     @property
     def is_machine(self) -> bool:
@@ -229,8 +237,7 @@ class Trajectory:
         """
         if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
-        multipliers = self.unknowns[2][:, slice(*self.problem.ends[1:])]
-        return self.loops.reactions(multipliers)
+        return self.loops.reactions(self._multipliers)
 
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
@@ -696,21 +703,6 @@ def load_counts(body: ShapeIntegrals) -> LoadCounts:
     return LoadCounts(d + g, len(body.outboard), g * body.num_modes)
 
 
-def load_coefficients(system: Problem, t: np.ndarray, rates: Rates) -> list[np.ndarray]:
-    """Return c (n, 7 + 2 q) of every body, see above; m/s2, 1/s2, N, N m and modes per s2.
-
-    In space they are 18 + 9 q: a, A_ab, force, moment, and A_ab q + 2 Omega_ab qd + delta_ab qdd.
-
-    Args:
-        system: what moves.
-        t: (n,) instants, s.
-        rates: its unknowns and their derivatives there, each (n, S).
-    """
-    probe = _Probe(system)
-    rows = probe.system.at(t).residual(*(probe.spread(x) for x in rates))
-    return [-rows[:, part] for part in probe.places]
-
-
 @dataclass(frozen=True, eq=False)
 class LoadGradient:
     """Derivatives of a function of the load coefficients.
@@ -733,7 +725,9 @@ def load_gradient(
     """Differentiate a function of `load_coefficients`, given its derivatives by them.
 
     Args:
-        system, t, rates: as there.
+        system: what moves.
+        t: (n,) instants, s.
+        rates: its unknowns and their derivatives there, each (n, S).
         by_coefficients: (n, 7 + 2 q or 18 + 9 q) of every body.
     """
     probe = _Probe(system)
@@ -788,7 +782,7 @@ def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     wide = body.in_basis(np.eye(q, q + more))
     w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
     k = 1 + q + np.arange(more)  # beside the reference position and the modes
-    if len(body.W) == len(SPACE):
+    if len(body.W) == SPACE.g:
         _probe_space(w, W, outboard, k)
         K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
         return replace(wide, w=w, W=W, outboard=outboard, K=K)

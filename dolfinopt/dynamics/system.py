@@ -34,6 +34,9 @@ class Linearisation(Protocol):
     def window(self, first: int, last: int) -> Linearisation:
         """Return it at the instants first..last - 1."""
 
+    def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Linearisation:
+        """Return it by coordinates `keep` of the S, at m instants between every s by (m, s)."""
+
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
 

@@ -38,9 +38,10 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
     w[:2], point[:2] = body.w, body.outboard_point
     if W is None:
         bar = np.zeros((3, 3, 1 + q, 1 + q))
-        bar[0, 0, 0], bar[0, 0, 1:, 0] = body.W[0, 0], body.j
-        bar[0, 1, 0, 1:] = bar[1, 0, 1:, 0] = body.r
-        bar[0, 1, 1:, 1:], bar[1, 0, 1:, 1:] = -0.5 * body.G, 0.5 * body.G
+        bar[0, 0, 0], bar[0, 0, 1:, 0] = body.W[0, 0], body.W[0, 0, 1:]
+        bar[0, 1, 0, 1:] = bar[1, 0, 1:, 0] = body.W[1, 1:, 0]
+        bar[1, 0, 1:, 1:] = 0.5 * body.W[1, 1:, 1:]
+        bar[0, 1, 1:, 1:] = -bar[1, 0, 1:, 1:]
         bar[1, 1, 1:, 1:] = body.M
         W = bar.reshape(9, 1 + q, 1 + q)
     if body.is_stiffened:

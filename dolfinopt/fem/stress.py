@@ -1,6 +1,6 @@
 """Stress of one arm by mode acceleration: the static fields of all loads, not the modes alone.
 
-With the loads L c of an instant (`dynamics.load_coefficients`) the displacement is
+With the loads L c of an instant (`multibody.loads.load_coefficients`) the displacement is
 
     u = V q + (Z - V K_r^-1 P) c,   K Z = L,   P = V' L,
 

@@ -1,6 +1,6 @@
 """What moves the rigid coordinates: time laws and tables, paths, inverse kinematics on a tree.
 
-`curves` (through tables) and `plane` (paths and chains of the plane); `poses` (paths in space);
-`constraints` (closures and path as equations) -> `counts` -> `start` -> `singular` -> `follower`.
+`plane` (paths and chains of the plane); `poses` (paths in space);
+`constraints` (closures and path as equations) -> `start` -> `singular` -> `follower`.
 `build` alone knows the scene.
 """

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import lru_cache, partial, wraps
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion import plane
 from dolfinopt.motion.constraints import Constraints, Target
-from dolfinopt.motion.curves import (
-    Derivatives,
-    Words,
-    along,
-    curve_by_chord,
-    curve_by_laws,
-    inverse,
-    part_of,
-)
 from dolfinopt.motion.measured import (
     DENSE_INSTANTS,
-    LEAST_ROWS,
-    REST_ACCELERATION_RATIO,
     TABLE_CORNERS_LIMIT,
 )
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
+from dolfinopt.motion.task import Words
 from dolfinopt.multibody.build import loops_of, skeleton
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -37,7 +28,11 @@ from dolfinopt.paths import (
     Curve,
     Limits,
     Table,
+    Values,
+    along,
     column_names,
+    curve_by_chord,
+    curve_by_laws,
     curve_in_time,
     moves,
     read_table,
@@ -58,6 +53,13 @@ if TYPE_CHECKING:
     from dolfinopt.motion.follower import Follower
 
 CART = "cart"  # first column of a table of joints
+Result = TypeVar("Result")
+
+
+def _kept(function: Callable[[Scene], Result]) -> Callable[[Scene], Result]:
+    """Keep results of scenes until their table is written anew: motions are asked for often."""
+    kept = lru_cache(lambda scene, stamp: function(scene))
+    return wraps(function)(lambda scene: kept(scene, file_stamp(scene.motion)))
 
 
 def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
@@ -115,8 +117,9 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
         curve, timed = curve_of(scene)
         corners = np.array(curve.kinks)
     if not timed:
-        rows = _when(corners, motion) if 0 < len(corners) <= TABLE_CORNERS_LIMIT else []
-        corners = np.concatenate([rows, time_law(motion).knots * motion.duration])
+        few = corners if len(corners) <= TABLE_CORNERS_LIMIT else corners[:0]
+        knots = time_law(motion).knots * motion.duration
+        corners = np.concatenate([_when(few, motion), knots])
     instants = np.sort(np.append(corners, motion.duration))
     apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
     apart &= instants < motion.horizon * (1.0 - SAME_TIME)
@@ -129,8 +132,7 @@ def table_rows(scene: Scene) -> np.ndarray:
     if motion.path not in ("points", "joints"):
         return np.zeros(0)
     curve, timed = curve_of(scene)
-    t = rows_of(scene).table.t
-    return t if timed and t is not None else np.array(_when(np.array(curve.kinks), motion))
+    return curve.u if timed else _when(curve.u[1:-1], motion)
 
 
 def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
@@ -163,11 +165,10 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
     return tuple((begin + delay, end) for begin, end in joined)
 
 
-def _when(s: np.ndarray, motion: Motion) -> list[float]:
+def _when(s: np.ndarray, motion: Motion) -> np.ndarray:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration
-    instants = inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
-    return [float(t) for t in instants]
+    return plane.inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
 
 
 # -- tables ----------------------------------------------------------------------------------
@@ -188,18 +189,9 @@ class Rows:
     measured: int | None = None
 
 
+@_kept
 def curve_of(scene: Scene) -> tuple[Curve, bool]:
     """Return the curve through the scene's table, and whether its parameter is time."""
-    return _curve(scene, file_stamp(scene.motion))
-
-
-def rows_of(scene: Scene) -> Rows:
-    """Return the rows of the scene's table; of a line in space its two ends."""
-    return _rows(scene, file_stamp(scene.motion))
-
-
-@lru_cache(maxsize=64)  # the integrator asks for the motion dozens of times
-def _curve(scene: Scene, stamp: int) -> tuple[Curve, bool]:
     motion, rows = scene.motion, rows_of(scene)
     table = rows.table
     if table.t is None:
@@ -246,8 +238,9 @@ def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:
     return curve_by_laws(table, laws)
 
 
-@lru_cache(maxsize=64)
-def _rows(scene: Scene, stamp: int) -> Rows:
+@_kept
+def rows_of(scene: Scene) -> Rows:
+    """Return the rows of the scene's table; of a line its two ends."""
     motion = scene.motion
     if motion.path == "line":
         ends = np.array([motion.start, motion.end], dtype=float)
@@ -272,9 +265,10 @@ def _rows(scene: Scene, stamp: int) -> Rows:
     table = read_table(motion.file, (*SPACE_POINT, *kind, *joints))
     if not kind:
         return Rows(table, None, 3)
-    found, values = orientations(kind, table.rows[:, 3:6]), table.rows.copy()
-    values[:, 3:6] = relative_vectors(found)
-    return Rows(replace(table, rows=values), found[0], 3)
+    place, angles, others = np.split(table.rows, [3, 6], axis=1)
+    R = orientations(kind, angles)
+    rows = np.hstack([place, relative_vectors(R), others])
+    return Rows(replace(table, rows=rows), R[0], 3)
 
 
 def _orientation(scene: Scene) -> tuple[str, ...]:
@@ -297,49 +291,49 @@ def columns_of(scene: Scene) -> tuple[str, ...]:
 
 
 def prescribed_joints(scene: Scene) -> tuple[str, ...]:
-    """Return the names of the joints that are columns of the scene's table."""
-    if scene.motion.path in ("line", "rotation"):
-        return scene.driven if scene.motion.path == "rotation" else ()
-    if scene.motion.path == "joints":
+    """Return the names of the joints that are columns of the scene's table, or that rotate."""
+    motion = scene.motion
+    if motion.path in ("joints", "rotation"):
         return scene.driven
-    names = column_names(scene.motion.file or "")
+    names = column_names(motion.file) if motion.file else []
     return tuple(name for name in scene.driven if name in names)
 
 
 # -- what the scene prescribes: paths, joints ------------------------------------------------
 
 
-def desired_path(t: np.ndarray, scene: Scene) -> Derivatives:
+def desired_path(t: np.ndarray, scene: Scene) -> Values:
     """Return where the end-effector should be in the plane (n, 2), and two derivatives."""
     motion = scene.motion
-    if motion.path == "points":
+    if motion.path != "arc":
         return _along_table(t, scene)
-    values = time_law(motion)(t, motion.duration)
-    if motion.path == "arc":
-        return plane.arc(values, motion.radius, motion.flattening)
-    return plane.line(values, np.array(motion.start), np.array(motion.end))
+    path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
+    return along(path, time_law(motion), t, motion.duration)
 
 
 def target_of(t: np.ndarray, scene: Scene) -> Target:
     """Return what the scene prescribes of joints that others follow, and of the end-effector."""
-    free = (np.zeros((len(t), 0)),) * 3
+    springs = [one.length or 0.0 for one in scene.rods if not one.driven]
     if scene.motion.path in ("joints", "rotation"):
-        return Target(_with_springs(_prescribed(t, scene), scene), free)
+        free = (np.zeros((len(t), 0)),) * 3
+        return Target(_with_fixed(_prescribed(t, scene), [], springs), free)
     values, start = _along_table(t, scene), rows_of(scene).start
-    first = 3 if start is None else 6
-    turned = None if start is None else turning(start, part_of(values, slice(3, 6)))
-    joints = _with_springs(part_of(values, slice(first, None)), scene)
-    return Target(joints, part_of(values, slice(3)), turned)
+    split = [3, 3 if start is None else 6]
+    parts = (np.split(x, split, axis=1) for x in values)
+    place, vectors, joints = zip(*parts, strict=True)
+    turned = None if start is None else turning(start, vectors)
+    return Target(_with_fixed(joints, [], springs), place, turned)
 
 
-def _along_table(t: np.ndarray, scene: Scene) -> Derivatives:
+def _along_table(t: np.ndarray, scene: Scene) -> Values:
     """Return the curve through the scene's table and two derivatives, in its time or by the law."""
     curve, timed = curve_of(scene)
-    law = None if timed else time_law(scene.motion)
-    return along(curve, law, t, scene.motion.duration)
+    if timed:
+        return curve(t)
+    return along(curve, time_law(scene.motion), t, scene.motion.duration)
 
 
-def _prescribed(t: np.ndarray, scene: Scene) -> Derivatives:
+def _prescribed(t: np.ndarray, scene: Scene) -> Values:
     """Return the coordinates that a table or a rotation prescribes, and two derivatives.
 
     In the plane on a fixed base its constant place before them.
@@ -348,90 +342,87 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Derivatives:
     if motion.path == "joints":
         joints = _along_table(t, scene)
     else:
-        turned = plane.rotation(
-            t, time_law(motion), motion.speed, motion.start_angle, motion.duration
-        )
-        joints = part_of(turned, None)
+        law = time_law(motion)
+        joints = plane.rotation(t, law, motion.speed, motion.start_angle, motion.duration)
     if scene.is_spatial or motion.base == "cart":
         return joints
-    places = (motion.base_position, 0.0, 0.0)
-    q, qd, qdd = (np.insert(x, 0, at, axis=1) for x, at in zip(joints, places, strict=True))
-    return q, qd, qdd
+    return _with_fixed(joints, [motion.base_position], [])
 
 
-def _with_springs(joints: Derivatives, scene: Scene) -> Derivatives:
-    """Return given coordinates and, behind them, the lengths of springs, which stay at rest."""
-    lengths = [one.length for one in scene.rods if not one.driven]
-    still = np.tile(np.array(lengths, dtype=float), (len(joints[0]), 1))
-    q, qd, qdd = (np.hstack([x, k * still]) for x, k in zip(joints, (1.0, 0.0, 0.0), strict=True))
+def _with_fixed(joints: Values, before: Sequence[float], behind: Sequence[float]) -> Values:
+    """Return coordinates with others before and behind them that stay where they are."""
+    q, qd, qdd = joints
+    places = [np.tile(x, (len(q), 1)) for x in (before, behind)]
+    rest = [np.zeros_like(x) for x in places]
+    around = (places, q), (rest, qd), (rest, qdd)
+    q, qd, qdd = (np.hstack([first, x, last]) for (first, last), x in around)
     return q, qd, qdd
 
 
 # -- chains of the plane ---------------------------------------------------------------------
 
 
-def _chain(t: np.ndarray, scene: Scene) -> Derivatives:
+def _chain(t: np.ndarray, scene: Scene) -> Values:
     """Return cart and joints (n, 1 + arms) of a chain in the plane on its path."""
     motion, path = scene.motion, desired_path(t, scene)
     if len(scene.arms) == 1:
         length, height = scene.arms[0].length, motion.joint_height
-        return plane.one_arm_on(t, path, length, height, motion.elbow, _words(scene))
+        return plane.one_arm_on(
+            t, path, length, height, motion.elbow, Words(scene.source, _keys(scene))
+        )
     found = _bare_chain(t, path, scene)
     # Both angles of a direction, whole turns apart, are right; the dense motion tells which.
-    times, reference = _continuous_shoulder(scene, file_stamp(motion))
+    times, reference = _continuous_shoulder(scene)
     turns = np.round((np.interp(t, times, reference) - found[0][:, 1]) / (2.0 * np.pi))
     found[0][:, 1] += 2.0 * np.pi * turns
     return found
 
 
-def _bare_chain(t: np.ndarray, path: Derivatives, scene: Scene) -> Derivatives:
+def _bare_chain(t: np.ndarray, path: Values, scene: Scene) -> Values:
     """Return cart and joints of two and more arms, the first angle up to whole turns."""
     motion, bend = scene.motion, plane.bend_of(tuple(arm.length for arm in scene.arms))
     p, v, a = (motion.cart_follow * np.array([1.0, 0.0]) * x for x in path)
     if motion.base == "fixed":
         p, v, a = np.tile([motion.base_position, 0.0], (len(t), 1)), 0.0 * v, 0.0 * a
     base = p + np.array([0.0, motion.joint_height]), v, a
-    return plane.chain_on(t, path, base, bend, motion.elbow, _words(scene))
+    return plane.chain_on(t, path, base, bend, motion.elbow, Words(scene.source, _keys(scene)))
 
 
-@lru_cache(maxsize=64)
-def _continuous_shoulder(scene: Scene, stamp: int) -> tuple[np.ndarray, np.ndarray]:
+@_kept
+def _continuous_shoulder(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return dense instants and the first arm's angle there without jumps, rad."""
     t = np.linspace(0.0, scene.motion.duration, DENSE_INSTANTS)
     alpha = _bare_chain(t, desired_path(t, scene), scene)[0][:, 1]
     return t, np.unwrap(alpha)
 
 
-def _words(scene: Scene) -> Words:
-    """Return the keys that move the path or the shoulder."""
+def _keys(scene: Scene) -> str:
+    """Return the keys that move the path, or the shoulder of a chain."""
     motion = scene.motion
     keys = {
-        "arc": ["motion.radius", "motion.flattening"],
-        "line": ["motion.start", "motion.end"],
-        "points": ["the table motion.file"],
-    }[motion.path]
+        "arc": "motion.radius, motion.flattening",
+        "line": "motion.start, motion.end",
+        "rotation": "motion.start_angle",
+    }.get(motion.path, "the table motion.file")
+    if follows(scene):
+        return keys
     if motion.base == "fixed":
-        keys.append("motion.base_position")
+        keys += ", motion.base_position"
     elif len(scene.arms) > 1:
-        keys.append("motion.cart_follow")
-    moved = f"{', '.join(keys)}, motion.joint_height or the arms' length"
-    return Words(scene.source, moved)
+        keys += ", motion.cart_follow"
+    return f"{keys}, motion.joint_height or the arms' length"
 
 
 # -- joints that follow ----------------------------------------------------------------------
 
 
+@_kept
 def follower(scene: Scene) -> Follower:
     """Return what follows the scene's path or closes its loops.
 
     Raises:
         InputError: the path does not determine the joints; names them and the remedy.
     """
-    return _follower(scene, file_stamp(scene.motion))
-
-
-@lru_cache(maxsize=32)
-def _follower(scene: Scene, stamp: int) -> Follower:
     from dolfinopt.motion.follower import Follower
     from dolfinopt.motion.task import Task
 
@@ -442,10 +433,12 @@ def _follower(scene: Scene, stamp: int) -> Follower:
     unknown = [k for k in range(len(names)) if k not in given]
     slides = np.array([unit == "m" for unit in scene.rigid_units.values()])
     has_path = motion.path not in ("joints", "rotation")
-    constraints = Constraints(skeleton(scene), loops_of(scene) or Loops(), slides, has_path)
+    turned = has_path and rows_of(scene).start is not None
+    constraints = Constraints(skeleton(scene), loops_of(scene) or Loops(), slides, has_path, turned)
     if not constraints.loops.ties:
         _check_joints(scene, constraints, unknown)
     guess, width = _guess(scene)
+    num_rows = 0 if motion.path == "rotation" else len(rows_of(scene).table.rows)
     return Follower(
         Task(
             constraints=constraints,
@@ -457,12 +450,10 @@ def _follower(scene: Scene, stamp: int) -> Follower:
             guess=guess,
             width=width,
             end=motion.horizon if motion.path == "rotation" else motion.duration,
-            resolution=max(DENSE_INSTANTS, 2 * _num_rows(scene)),
+            resolution=max(DENSE_INSTANTS, 2 * num_rows),
             words=Words(
                 scene.source,
-                {"line": "motion.start, motion.end", "rotation": "motion.start_angle"}.get(
-                    motion.path, "the table motion.file"
-                ),
+                _keys(scene),
             ),
         )
     )
@@ -473,10 +464,6 @@ def passive_coordinates(scene: Scene) -> list[int]:
     if scene.joints:
         return [k for k, joint in enumerate(scene.movable) if joint.passive]
     return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
-
-
-def _num_rows(scene: Scene) -> int:
-    return 0 if scene.motion.path == "rotation" else len(rows_of(scene).table.rows)
 
 
 def _guess(scene: Scene) -> tuple[np.ndarray, float]:
@@ -512,10 +499,10 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
         )
     if not unknown:
         raise InputError(f"{where}: its table prescribes all joints; give {tables}, instead")
-    rows = 3 if rows_of(scene).start is None else 6
+    rows = 6 if constraints.turned else 3
     if len(unknown) > rows:
         what, more = "a pose determines", ""
-        if rows == 3:
+        if not constraints.turned:
             what = "x, y and z determine"
             turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
             more = f"the orientation ({turn}), " if len(unknown) <= 6 else ""  # a pose has six
@@ -548,11 +535,12 @@ def forced_rest(scene: Scene) -> str | None:
     if motion.path not in ("points", "joints") or motion.table_ends == "moving":
         return None
     table = rows_of(scene).table
-    if table.t is None or not _is_free(motion) or len(table.t) < LEAST_ROWS:
+    # Fewer than six rows do not tell their own acceleration: the spline's degree is 5.
+    if table.t is None or not _is_free(motion) or len(table.t) < 6:
         return None
     t = np.linspace(0.0, table.t[-1], max(DENSE_INSTANTS, 4 * len(table.t)))
     forced, own = (np.abs(curve_in_time(table, k)(t)[2]).max(axis=0) for k in (False, True))
-    beyond = forced > REST_ACCELERATION_RATIO * own
+    beyond = forced > 10.0 * own
     if not beyond.any():
         return None
     worst = int(np.argmax(forced * beyond))

@@ -15,11 +15,11 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.motion.curves import Derivatives
 from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.tree import Mechanism
+from dolfinopt.paths import Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ class Target:
             ground's frame; None where it is free.
     """
 
-    joints: Derivatives
-    place: Derivatives
-    turning: Derivatives | None = None
+    joints: Values
+    place: Values
+    turning: Values | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +47,14 @@ class Constraints:
         loops: its closures.
         slides: (R,) which coordinates are lengths.
         has_path: whether the end-effector's place is prescribed.
+        turned: whether its orientation is, too.
     """
 
     mechanism: Mechanism
     loops: Loops
     slides: np.ndarray
     has_path: bool
+    turned: bool
 
     @cached_property
     def reach(self) -> float:
@@ -98,24 +100,24 @@ class Pose:
         parts = [-self.closed.gap]
         if self.end is not None:
             parts.append(target.place[0] - self.end.place.T)
-        if self.end is not None and target.turning is not None:
-            apart = target.turning[0] @ self.end.R.transpose(2, 1, 0)
-            parts.append(self.constraints.reach * Rotation.from_matrix(apart).as_rotvec())
+            if target.turning is not None:
+                apart = target.turning[0] @ self.end.R.transpose(2, 1, 0)
+                parts.append(self.constraints.reach * Rotation.from_matrix(apart).as_rotvec())
         return np.hstack(parts)
 
-    def rows(self, turned: bool) -> np.ndarray:
-        """Return G (n, k, R) without units; whether the end's orientation is prescribed."""
+    def rows(self) -> np.ndarray:
+        """Return G (n, k, R) without units."""
         parts, reach = [self.closed.jacobian], self.constraints.reach
         if self.end is not None:
             parts.append(self.end.by_place.transpose(2, 0, 1))
-        if self.end is not None and turned:
-            parts.append(reach * self.end.by_spin.transpose(2, 0, 1))
+            if self.constraints.turned:
+                parts.append(reach * self.end.by_spin.transpose(2, 0, 1))
         return np.concatenate(parts, axis=1) * (self.constraints.units / reach)
 
-    def acceleration(self, qd: np.ndarray, turned: bool) -> np.ndarray:
+    def acceleration(self, qd: np.ndarray) -> np.ndarray:
         """Return G' qd (n, k), m/s2, at rates qd (n, R)."""
         parts = [self.closed.acceleration(qd)]
         if self.end is not None:
             a, wd = self.end.acceleration(qd)
-            parts += [a.T, self.constraints.reach * wd.T] if turned else [a.T]
+            parts += [a.T, self.constraints.reach * wd.T][: 1 + self.constraints.turned]
         return np.hstack(parts)

@@ -13,9 +13,6 @@ DENSE_INSTANTS = 2001
 
 # With more rows a table's corners are many and small; the integrator's steps need not end there.
 TABLE_CORNERS_LIMIT = 20
-# Times the acceleration within a table that its rest at the ends may need before it is told.
-REST_ACCELERATION_RATIO = 10.0
-LEAST_ROWS = 6  # of a table whose own acceleration a spline of degree 5 tells
 
 # -- constraints, counts, start --------------------------------------------------------------
 
@@ -24,7 +21,6 @@ REACHED_SHARE = 1e-9  # above which a pose is not reached; Newton's method leave
 FITS_SHARE = 1e-4
 # Times the misfit of such links: singular values, and gaps along the motion, that it makes.
 MISFIT_FACTOR = 30.0
-START_GUESSES = 10  # the first as stated, the others around it at random
 
 # -- singular --------------------------------------------------------------------------------
 
@@ -35,5 +31,4 @@ SINGULAR_SHARE = 1e-3
 
 # -- follower --------------------------------------------------------------------------------
 
-SAMPLES = 16  # at least
-TURN_LIMIT = 0.4  # rad, or of the reach, of a coordinate between samples
+SAMPLES = 12  # of a motion at least, and more for each turn of what is prescribed

@@ -1,4 +1,4 @@
-"""Paths of the plane, and the coordinates of a chain of arms that follow them in closed form.
+"""The arc, and the coordinates of a chain of arms that follow a path of the plane in closed form.
 
 Of two and more arms all elbows bend by the same angle; one arm follows the path's height, and its
 cart the rest. Plane vectors are complex numbers, v = v_x + i v_y, where arms are turned.
@@ -6,58 +6,32 @@ cart the rest. Plane vectors are complex numbers, v = v_x + i v_y, where arms ar
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion.curves import Derivatives, Words, inverse
 from dolfinopt.motion.measured import SINGULAR_DISTANCE_SHARE
+from dolfinopt.motion.task import Words
 from dolfinopt.paths import Law, Values
 
-# -- paths: points (n, 2) and two time derivatives -------------------------------------------
 
+def arc(s: np.ndarray, radius: float, flattening: float) -> Values:
+    """Return the flattened semicircle about the origin and two derivatives by s (n, 2).
 
-def arc(values: Values, radius: float, flattening: float) -> Derivatives:
-    """Return the flattened semicircle about the origin, from (-r, 0) over the top to (r, 0).
-
-    p = r (cos phi, flattening sin phi), phi = pi (1 - s).
-
-    Args:
-        values: s (n,) from 0 to 1, and two time derivatives.
-        radius: r, m.
-        flattening: see above.
+    From (-r, 0) over the top to (r, 0), p = r (cos phi, flattening sin phi), phi = pi (1 - s).
     """
-    s, sd, sdd = values
-    phi, phid, phidd = np.pi * (1.0 - s), -np.pi * sd, -np.pi * sdd
-    c, z = np.cos(phi), np.sin(phi)
+    phi = np.pi * (1.0 - s)
     scale = radius * np.array([1.0, flattening])
-    p = np.stack([c, z], axis=1)
-    tangent = np.stack([-z, c], axis=1)
-    pd = tangent * phid[:, None]
-    pdd = tangent * phidd[:, None] - p * (phid**2)[:, None]
-    return scale * p, scale * pd, scale * pdd
+    p = scale * np.column_stack([np.cos(phi), np.sin(phi)])
+    return p, np.pi * scale * np.column_stack([np.sin(phi), -np.cos(phi)]), -(np.pi**2) * p
 
 
-def line(values: Values, start: np.ndarray, end: np.ndarray) -> Derivatives:
-    """Return the straight line p = start + s (end - start), s and derivatives (n,)."""
-    s, sd, sdd = (value[:, None] for value in values)
-    return start + s * (end - start), sd * (end - start), sdd * (end - start)
-
-
-@lru_cache(maxsize=1)
-def _gauss() -> tuple[np.ndarray, np.ndarray]:
-    x, w = np.polynomial.legendre.leggauss(8)  # exact to degree 15, more than any law has
-    return x, w
-
-
-def rotation(
-    t: np.ndarray, law: Law, speed: float, start_angle: float, duration: float
-) -> Derivatives:
-    """Return the angle of a joint that runs up to constant speed, and two derivatives (n,).
+def rotation(t: np.ndarray, law: Law, speed: float, start_angle: float, duration: float) -> Values:
+    """Return the angle of a joint that runs up to constant speed, and two derivatives (n, 1).
 
     The law is that of the speed: speed s(t / duration); for the quintic the angle is
     start + speed duration (2.5 u^4 - 3 u^5 + u^6).
@@ -69,18 +43,8 @@ def rotation(
         start_angle: rad.
         duration: of the run-up, s.
     """
-    s, sd, _ = law(t, duration)
-    x, w = _gauss()
-    knots = np.unique(np.concatenate([[0.0], law.knots, [1.0]])) * duration
-    angle = np.maximum(t - duration, 0.0)  # the speed is 1 from there on
-    for first, last in pairwise(knots):
-        length = np.clip(t - first, 0.0, last - first)
-        nodes = first + 0.5 * length[:, None] * (x + 1.0)
-        angle = angle + 0.5 * length * (law(nodes.ravel(), duration)[0].reshape(nodes.shape) @ w)
-    return start_angle + speed * angle, speed * s, speed * sd
-
-
-# -- chains ----------------------------------------------------------------------------------
+    s, sd, _ = (x[:, None] for x in law(t, duration))
+    return start_angle + speed * law.integral(t, duration)[:, None], speed * s, speed * sd
 
 
 @dataclass(frozen=True)
@@ -96,15 +60,15 @@ class Bend:
     lengths: tuple[float, ...]
 
     @cached_property
-    def series(self) -> np.ndarray:
-        """Coefficients c of |z|^2 (arms,), m2."""
-        products = np.correlate(self.lengths, self.lengths, mode="full")[len(self.lengths) - 1 :]
-        return np.append(products[:1], 2.0 * products[1:])
+    def square(self) -> chebyshev.Chebyshev:
+        """|z|^2 by the cosine of beta, m2."""
+        c = np.correlate(self.lengths, self.lengths, mode="full")[len(self.lengths) - 1 :]
+        return chebyshev.Chebyshev([c[0], *(2.0 * c[1:])])
 
     @cached_property
     def least(self) -> float:
         """Cosine of the angle at the end of the range, -1 for two arms."""
-        roots = chebyshev.chebroots(chebyshev.chebder(self.series))
+        roots = self.square.deriv().roots()
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (np.abs(roots.real) < 1.0)]
         return float(real.max(initial=-1.0))
 
@@ -113,11 +77,7 @@ class Bend:
         """Least and largest distance |z|, m."""
         if len(self.lengths) == 2:
             return abs(self.lengths[0] - self.lengths[1]), sum(self.lengths)
-        return float(np.sqrt(np.maximum(self.square(np.array(self.least)), 0.0))), sum(self.lengths)
-
-    def square(self, u: np.ndarray) -> np.ndarray:
-        """Return |z|^2 by the cosine of beta."""
-        return chebyshev.chebval(u, self.series)
+        return float(np.sqrt(max(self.square(self.least), 0.0))), sum(self.lengths)
 
     @cached_property
     def _guess(self) -> tuple[np.ndarray, np.ndarray]:
@@ -128,32 +88,60 @@ class Bend:
     def cosine(self, square: np.ndarray) -> np.ndarray:
         """Return cos(beta) (n,) where |z|^2 is `square`, within reach, to rounding."""
         if len(self.lengths) == 2:
-            return (square - self.series[0]) / self.series[1]
-        slopes = chebyshev.chebder(self.series)
-
-        def squares(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return self.square(u), chebyshev.chebval(u, slopes)
-
+            own, product = self.square.coef
+            return (square - own) / product
+        slope = self.square.deriv()
         rounding = float(4.0 * np.finfo(float).eps * self.reach[1] ** 2)
         guess = np.interp(square, *self._guess)
-        return inverse(squares, square, guess, (self.least, 1.0), rounding)
+        ends = self.least, 1.0
+        return inverse(lambda u: (self.square(u), slope(u)), square, guess, ends, rounding)
 
-    def lever(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def lever(self, beta: np.ndarray) -> Values:
         """Return z and its two derivatives by beta (n,), complex."""
         order = np.arange(len(self.lengths))
         turned = np.exp(1j * np.outer(beta, order)) * self.lengths
         return turned.sum(axis=1), turned @ (1j * order), turned @ (-1.0 * order**2)
 
 
-@lru_cache(maxsize=64)
+def inverse(
+    function: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    values: np.ndarray,
+    guess: np.ndarray,
+    ends: tuple[float, float],
+    accuracy: float,
+) -> np.ndarray:
+    """Return where an increasing function has these values (n,), all at once.
+
+    Newton's method, halving the bracket instead where a step would leave it.
+
+    Args:
+        function: x (n,) -> values and slopes (n,).
+        values: wanted, within those at the ends.
+        guess: (n,) first x.
+        ends: least and largest x.
+        accuracy: of the values; 0 of x to rounding.
+    """
+    u, low, high = guess, np.full_like(guess, ends[0]), np.full_like(guess, ends[1])
+    for _ in range(60):  # halving alone would need as many
+        found, slope = function(u)
+        excess = found - values
+        if np.abs(excess).max(initial=0.0) <= accuracy:
+            break
+        low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
+        u = u - excess / np.where(slope > 0.0, slope, np.inf)
+        u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
+    return u
+
+
+@lru_cache
 def bend_of(lengths: tuple[float, ...]) -> Bend:
     """Return the chain of these arms, m."""
     return Bend(lengths)
 
 
 def chain_on(
-    t: np.ndarray, path: Derivatives, base: Derivatives, bend: Bend, elbow: int, words: Words
-) -> Derivatives:
+    t: np.ndarray, path: Values, base: Values, bend: Bend, elbow: int, words: Words
+) -> Values:
     """Return cart and joints (n, 1 + arms) of two and more arms, the first angle up to turns.
 
     Args:
@@ -195,8 +183,8 @@ def chain_on(
 
 
 def one_arm_on(
-    t: np.ndarray, path: Derivatives, length: float, height: float, elbow: int, words: Words
-) -> Derivatives:
+    t: np.ndarray, path: Values, length: float, height: float, elbow: int, words: Words
+) -> Values:
     """Return cart and joint (n, 2) of one arm: L sin(alpha) is the path's height over the joint's.
 
     The cosine of alpha has the sign of `elbow`: +1 leans to +x, -1 to -x.
@@ -206,7 +194,9 @@ def one_arm_on(
     """
     p, pd, pdd = path
     above = p[:, 1] - height
-    _check_height(t, above, length, words)
+    for side, distance in (("above", above), ("below", -above)):
+        what = f"{side} the shoulder, upright or out of reach: one arm of {length:g} m needs less"
+        _check_reach(t, distance - (1.0 - SINGULAR_DISTANCE_SHARE) * length, distance, what, words)
     lean = np.arcsin(above / length)
     alpha = lean if elbow == 1 else np.pi - lean
     c, z = length * np.cos(alpha), length * np.sin(alpha)
@@ -223,34 +213,32 @@ def _check_distance(t: np.ndarray, distance: np.ndarray, bend: Bend, words: Word
     """Raise when the shoulder's distance to the path leaves the reach of the arms."""
     margin = SINGULAR_DISTANCE_SHARE * max(bend.lengths)
     near, far = bend.reach
-    if len(distance) == 0 or (distance.min() >= near + margin and distance.max() <= far - margin):
-        return
-    for right, limit, word in (
-        (distance <= far - margin, far, "stretched or out of reach"),
-        (distance >= near + margin, near, "folded or too near"),
+    arms = " and ".join(", ".join(f"{a:g} m" for a in bend.lengths).rsplit(", ", 1))
+    bent = ", all elbows bent alike," if len(bend.lengths) > 2 else ""
+    for beyond, word in (
+        (distance - far, "stretched or out of reach"),
+        (near - distance, "folded or too near"),
     ):
-        if not right.all():  # not a number, from an overflow, is not right
-            wrong = np.flatnonzero(~right)
-            worst = wrong[np.argmax(np.abs(distance[wrong] - limit))]
-            arms = " and ".join(", ".join(f"{a:g} m" for a in bend.lengths).rsplit(", ", 1))
-            bent = ", all elbows bent alike," if len(bend.lengths) > 2 else ""
-            raise InputError(
-                f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
-                f"{distance[worst]:.6g} m from the shoulder, {word}: arms of {arms}{bent} need a "
-                f"distance between {near:g} m and {far:g} m; change {words.motion}"
-            )
+        _check_reach(
+            t,
+            beyond + margin,
+            distance,
+            f"from the shoulder, {word}: arms of {arms}{bent} need a distance between {near:g} m "
+            f"and {far:g} m",
+            words,
+        )
 
 
-def _check_height(t: np.ndarray, height: np.ndarray, length: float, words: Words) -> None:
-    """Raise when the path is higher or lower than one arm reaches."""
-    wrong = np.flatnonzero(~(np.abs(height) <= (1.0 - SINGULAR_DISTANCE_SHARE) * length))
+def _check_reach(
+    t: np.ndarray, beyond: np.ndarray, distance: np.ndarray, what: str, words: Words
+) -> None:
+    """Raise with the worst instant where the path is beyond the reach, m."""
+    wrong = np.flatnonzero(~(beyond <= 0.0))  # not a number, from an overflow, is beyond
     if wrong.size:
-        worst = wrong[np.argmax(np.abs(height[wrong]))]
-        side = "below" if height[worst] < 0.0 else "above"
+        worst = wrong[np.argmax(beyond[wrong])]
         raise InputError(
             f"{words.source}: motion: at t = {t[worst]:.4g} s the end-effector is "
-            f"{abs(height[worst]):.6g} m {side} the shoulder, upright or out of reach: one arm of "
-            f"{length:g} m needs less than {length:g} m; change {words.motion}"
+            f"{distance[worst]:.6g} m {what}; change {words.motion}"
         )
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.motion.curves import Derivatives
 from dolfinopt.multibody.dimension import SpaceTurning
+from dolfinopt.paths import SAME, Values
 
 RPY = ("roll", "pitch", "yaw")
 VECTOR = ("rx", "ry", "rz")
@@ -31,18 +31,15 @@ def relative_vectors(R: np.ndarray) -> np.ndarray:
     vectors: np.ndarray = Rotation.from_matrix(R[0].T @ R).as_rotvec()
     for k in range(1, len(vectors)):
         before, angle = vectors[k - 1], float(np.linalg.norm(vectors[k]))
-        axis = vectors[k] / angle if angle > 1e-12 else before
-        if angle <= 1e-12:
-            length = float(np.linalg.norm(before))
-            if length == 0.0:
-                continue
-            axis, angle = before / length, 0.0
+        # Without a turn its axis may be any: that before.
+        axis = vectors[k] if angle > SAME else before
+        axis = axis / max(float(np.linalg.norm(axis)), SAME)
         turns = np.round((axis @ before - angle) / (2.0 * np.pi))
         vectors[k] = (angle + 2.0 * np.pi * turns) * axis
     return vectors
 
 
-def turning(start: np.ndarray, vectors: Derivatives) -> Derivatives:
+def turning(start: np.ndarray, vectors: Values) -> Values:
     """Return R (n, 3, 3), angular velocity and acceleration (n, 3) in the ground's frame.
 
     Args:

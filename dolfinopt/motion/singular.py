@@ -1,10 +1,10 @@
 """Singular positions: where closures, or a path, leave joints undetermined.
 
 G by the unknowns must keep its rank, and with a path also the closures' G by the passive joints,
-for forces. Its smallest singular value is judged by that of a usual pose. Between samples a, b a
+for forces. Its smallest singular value is judged by that of a usual pose. Between poses a, b a
 transversal passage changes the sign of det(G_a' G_b), which by Cauchy and Binet is that of
-det(Q' G_a) det(Q' G_b), Q a basis of the rows' range, whatever the number of rows; poses that only
-touch one are minima of the singular value.
+det(Q' G_a) det(Q' G_b), Q a basis of the rows' range, whatever the number of rows: no step passes
+it. Poses that only touch one are minima of the singular value.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.optimize import bisect, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion.measured import SINGULAR_SHARE
@@ -22,10 +22,6 @@ from dolfinopt.motion.start import Start
 from dolfinopt.motion.task import Task
 
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray]  # instants (n,), poses and rates (n, R)
-
-
-class BranchLost(Exception):
-    """Samples lie on two branches of a loop: they are too far apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,21 +32,29 @@ class Regularity:
     start: Start
 
     def check(self, samples: Samples) -> None:
-        """Raise where a sample is singular, or the motion passes a singular position between.
+        """Raise where a sample is singular, or a pose between samples.
 
         Raises:
             InputError: names instant, closure, joints and remedy.
-            BranchLost: samples must be closer.
         """
         t, q, _ = samples
-        sizes = self.sizes(q).min(axis=1)
-        if (wrong := np.flatnonzero(sizes < SINGULAR_SHARE)).size:
+        sizes = self.sizes(q)
+        if (wrong := np.flatnonzero(sizes.min(axis=1) < SINGULAR_SHARE)).size:
             raise self.refusal(q[wrong[0]], float(t[wrong[0]]))
-        for i, j, crossed in self._suspects(samples):
-            if crossed:
-                self._check_crossing(samples, i, j)
-            else:
-                self._check_minimum(samples, i, j)
+        for i, j in self._suspects(samples, sizes):
+            near = CubicHermiteSpline(*samples)
+            found = minimize_scalar(
+                lambda t, j=j, near=near: self.sizes(near(t)[None])[0, j],
+                bounds=t[i : i + 2],
+                method="bounded",
+            )
+            if found.fun < SINGULAR_SHARE:
+                raise self.refusal(near(found.x), float(found.x))
+
+    def on_one_side(self, a: np.ndarray, b: np.ndarray) -> bool:
+        """Return whether two poses, by their G (1, k, R), have no singular position between."""
+        pairs = zip(self._matrices(a), self._matrices(b), strict=True)
+        return all(np.linalg.det(one[0].T @ other[0]) > 0.0 for (one, _), (other, _) in pairs)
 
     def sizes(self, q: np.ndarray) -> np.ndarray:
         """Return smallest singular values at poses (n, R) over those of a usual pose (n, m)."""
@@ -61,81 +65,33 @@ class Regularity:
         return self._sizes(self.start.usual[None])[0]
 
     def _sizes(self, q: np.ndarray) -> np.ndarray:
-        every = [np.linalg.svd(G, compute_uv=False)[:, -1] for G, _ in self._matrices(q)]
-        return np.stack(every, axis=1)
+        matrices = self._matrices(self.task.constraints.at(q).rows())
+        return np.stack([np.linalg.svd(G, compute_uv=False)[:, -1] for G, _ in matrices], axis=1)
 
-    def _matrices(self, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the m matrices (n, k, u) that must stay regular, with their columns."""
+    def _matrices(self, G: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the m parts (n, k, u) of G that must stay regular, with their columns."""
         task = self.task
-        G = task.constraints.at(q).rows(self._turned)
         found = [(G[:, :, task.unknown], task.unknown)]
         if task.constraints.has_path and len(task.passive):
             found.append((G[:, : task.constraints.loops.count, task.passive], task.passive))
         return found
 
-    @cached_property
-    def _turned(self) -> bool:
-        return self.task.target(np.zeros(1)).turning is not None
-
     # -- between samples -------------------------------------------------------------------------
 
-    def _suspects(self, samples: Samples) -> list[tuple[int, int, bool]]:
-        """Return samples behind which a singular position may lie, the matrix, if it is passed."""
+    def _suspects(self, samples: Samples, sizes: np.ndarray) -> list[tuple[int, int]]:
+        """Return samples behind which a singular value has a minimum, and which value."""
         t, q, qd = samples
-        matrices, sizes, h = self._matrices(q), self.sizes(q), 1e-4 * np.diff(t)[:, None]
-        crossed = np.stack(
-            [np.linalg.det(G[:-1].swapaxes(1, 2) @ G[1:]) < 0.0 for G, _ in matrices], axis=1
-        )
+        h = 1e-4 * np.diff(t)[:, None]
         falls = self.sizes(q[:-1] + h * qd[:-1]) < sizes[:-1]
         rises = self.sizes(q[1:] - h * qd[1:]) < sizes[1:]
         low = np.minimum(sizes[:-1], sizes[1:]) < 0.3
-        places = np.argwhere(crossed | (falls & rises & low))
-        return [(int(i), int(j), bool(crossed[i, j])) for i, j in places]
-
-    def _check_crossing(self, samples: Samples, i: int, j: int) -> None:
-        """Raise at the passage between samples i and i + 1, told apart from a jump of branch."""
-        t = samples[0]
-        first = self._matrices(samples[1][i : i + 1])[j][0][0]
-
-        def sign(instant: float) -> float:
-            there = self._matrices(self._near(samples, instant)[None])[j][0][0]
-            return 1.0 if np.linalg.det(first.T @ there) > 0.0 else -1.0
-
-        instant = bisect(sign, t[i], t[i + 1], xtol=1e-5 * (t[i + 1] - t[i]), rtol=1e-12)
-        pose = self._near(samples, instant)
-        target = self.task.target(np.array([instant]))
-        apart = np.abs(self.task.constraints.error(pose[None], target)).max()
-        is_open = apart > SINGULAR_SHARE**2 * self.task.constraints.reach + self.start.misfit
-        if is_open or self.sizes(pose[None]).min() > 10.0 * SINGULAR_SHARE:
-            raise BranchLost
-        raise self.refusal(pose, instant)
-
-    def _check_minimum(self, samples: Samples, i: int, j: int) -> None:
-        """Raise where the smallest singular value between samples i and i + 1 is too small."""
-        t = samples[0]
-        found = minimize_scalar(
-            lambda instant: self.sizes(self._near(samples, instant)[None])[0, j],
-            bounds=(t[i], t[i + 1]),
-            method="bounded",
-        )
-        if found.fun < SINGULAR_SHARE:
-            raise self.refusal(self._near(samples, found.x), float(found.x))
-
-    def _near(self, samples: Samples, instant: float) -> np.ndarray:
-        """Return the pose (R,) at an instant, as samples have it where Newton's method fails."""
-        target = self.task.target(np.array([instant]))
-        q = self.task.with_given(CubicHermiteSpline(*samples)(np.array([instant])), target)
-        try:
-            other = self.task.newton(q, target)[0]
-        except np.linalg.LinAlgError:
-            return q[0]
-        moved = np.abs(other - q).max() / self.task.constraints.units.max()
-        return other[0] if moved < 0.05 else q[0]
+        return [(int(i), int(j)) for i, j in np.argwhere(falls & rises & low)]
 
     def refusal(self, q: np.ndarray, t: float) -> InputError:
         """Return which closure leaves which joints undetermined at a pose (R,), and when."""
         task, words = self.task, self.task.words
-        G, columns = self._matrices(q[None])[int(np.argmin(self.sizes(q[None])[0]))]
+        matrices = self._matrices(task.constraints.at(q[None]).rows())
+        G, columns = matrices[int(np.argmin(self.sizes(q[None])[0]))]
         null = np.abs(np.linalg.svd(G[0])[2][-1])
         joints = task.called(columns[null > 0.1 * null.max()])
         loops = task.constraints.loops

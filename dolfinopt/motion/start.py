@@ -1,4 +1,9 @@
-"""The joints at t = 0: least squares from a guess, and whether the right joints are passive."""
+"""The joints at t = 0: least squares from a guess, and whether the right joints are passive.
+
+With G = dg/dq of the closures, p the passive coordinates and R all of them: rank G - rank G_p
+driven coordinates are held, too few are passive; p - rank G_p passive ones are undetermined, too
+many; k - rank G equations follow from the others. Null vectors name the coordinates.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +14,11 @@ from scipy.optimize import least_squares
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion.constraints import Target
-from dolfinopt.motion.counts import Counts, counts_of
 from dolfinopt.motion.measured import (
     FITS_SHARE,
     MISFIT_FACTOR,
     REACHED_SHARE,
     SINGULAR_SHARE,
-    START_GUESSES,
 )
 from dolfinopt.motion.task import Task, widest
 from dolfinopt.multibody.closures import Distance
@@ -30,13 +33,13 @@ class Start:
     Attributes:
         q: (R,) closed pose at t = 0.
         usual: (R,) a closed pose nearby that is not singular, unless all are.
-        counts: of the closures there.
+        redundant: number of closures' equations that follow from the others for rigid links.
         misfit: by which links leave the closures open at best, m; 0 by rounding.
     """
 
     q: np.ndarray
     usual: np.ndarray
-    counts: Counts
+    redundant: int
     misfit: float
 
     def tolerance(self, reach: float) -> float:
@@ -56,7 +59,7 @@ def nearest(
         free: coordinates that move.
         rows: equations that count.
     """
-    constraints, turned = task.constraints, target.turning is not None
+    constraints = task.constraints
     units = constraints.units[free]
 
     def pose(x: np.ndarray) -> np.ndarray:
@@ -71,7 +74,7 @@ def nearest(
         return padded(-constraints.error(pose(x), target)[0, rows] / constraints.reach)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        return padded(constraints.at(pose(x)).rows(turned)[0, rows][:, free])
+        return padded(constraints.at(pose(x)).rows()[0, rows][:, free])
 
     if len(free) == 0:
         off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
@@ -95,14 +98,27 @@ def start_of(task: Task) -> Start:
     Raises:
         InputError: the number of passive joints is wrong, or no pose reaches the path's start.
     """
-    target = task.target(np.zeros(1))
+    target, constraints = task.target(np.zeros(1)), task.constraints
+    reach, count = constraints.reach, constraints.loops.count
     q, off = _nearest_of_many(task, target)
-    usual, counts, misfit = _usual(task, q, target)
-    _check(task, counts)
-    start, reach = Start(q, usual, counts, misfit), task.constraints.reach
+    pose, misfit = nearest(task, q, target, task.moving, slice(count))
+    if misfit > FITS_SHARE * reach:
+        raise unreached(task, 0.0, pose, target)
+    share = max(RANK_SHARE, MISFIT_FACTOR * misfit / reach)
+    usual = _usual(task, pose, target, misfit, share)
+    G = constraints.at(usual[None]).rows()[0]
+    _check(task, G[:count], share)
+    redundant = count - rank(G[:count, task.moving], share)
+    fits = not redundant or misfit <= REACHED_SHARE * reach
+    start = Start(q, usual, redundant, 0.0 if fits else misfit)
     if off > start.tolerance(reach):
         raise unreached(task, 0.0, q, target)
-    _check_path(task, usual, target)
+    if len(null := _null_vectors(G[:, task.unknown])):
+        idle = _called(task, task.unknown, null)
+        raise InputError(
+            f"{task.words.source}: motion: path and closures leave {len(null)} of the joints "
+            f"undetermined ({idle}); prescribe one of them by a column of the table"
+        )
     return start
 
 
@@ -111,7 +127,7 @@ def _nearest_of_many(task: Task, target: Target) -> tuple[np.ndarray, float]:
     guess = task.with_given(_with_lengths(task)[None], target)[0]
     random, best, least = np.random.default_rng(0), guess, np.inf
     units = task.constraints.units[task.unknown]
-    for k in range(START_GUESSES):
+    for k in range(10):  # the first as stated, the others around it at random
         shifted = guess.copy()
         away = random.uniform(-task.width, task.width, len(task.unknown))
         shifted[task.unknown] += (k > 0) * away * units
@@ -135,73 +151,61 @@ def _with_lengths(task: Task) -> np.ndarray:
     return guess
 
 
-def _usual(task: Task, q: np.ndarray, target: Target) -> tuple[np.ndarray, Counts, float]:
-    """Return a closed pose that is not singular, the counts there, and the links' misfit, m.
+def _usual(task: Task, pose: np.ndarray, target: Target, misfit: float, share: float) -> np.ndarray:
+    """Return a closed pose (R,) that is not singular, unless all are.
 
     A special pose would miscount, and so would an open one: the start is moved along the closures,
     with all coordinates free, whatever drives ask for.
     """
-    constraints, turned = task.constraints, target.turning is not None
-    free, k = np.union1d(task.passive, task.driven), constraints.loops.count
-    closing = slice(0, k)
-    pose, misfit = nearest(task, q, target, free, closing)
-    if misfit > FITS_SHARE * constraints.reach:
-        raise unreached(task, 0.0, pose, target)
-
-    def rows(q: np.ndarray) -> np.ndarray:
-        return constraints.at(q[None]).rows(turned)[0]
-
-    share = max(RANK_SHARE, MISFIT_FACTOR * misfit / constraints.reach)
-    G = rows(pose)[closing, free]
-    moves = np.linalg.svd(G)[2][rank(G, max(share, SINGULAR_SHARE)) :]
+    constraints, free, closing = task.constraints, task.moving, slice(task.constraints.loops.count)
+    G = constraints.at(pose[None]).rows()[0]
+    moves = _null_vectors(G[closing, free], max(share, SINGULAR_SHARE))
     random, usual, largest = np.random.default_rng(1), pose, -1.0
-    for size in (0.5, 0.2, 0.1, 0.03):
+    for size in 0.5 ** np.arange(1, 5):
         moved = pose.copy()
         moved[free] += size * constraints.units[free] * (random.uniform(-1, 1, len(moves)) @ moves)
         other, off = nearest(task, moved, target, free, closing)
-        at = rows(other)
+        at = constraints.at(other[None]).rows()[0]
         least = min(_least(at[closing][:, task.passive]), _least(at[:, task.unknown]))
         if off < 2.0 * misfit + REACHED_SHARE * constraints.reach and least > largest:
             usual, largest = other, least
-    counts = counts_of(rows(usual)[closing], task.passive, task.driven, share)
-    fits = not counts.redundant or misfit <= REACHED_SHARE * constraints.reach
-    return usual, counts, 0.0 if fits else misfit
+    return usual
 
 
 def _least(G: np.ndarray) -> float:
     return float(np.linalg.svd(G, compute_uv=False).min(initial=1.0))
 
 
+def _null_vectors(G: np.ndarray, share: float = RANK_SHARE) -> np.ndarray:
+    """Return orthonormal x (m, u) with G x = 0; see `ranks.rank`."""
+    vectors: np.ndarray = np.linalg.svd(G)[2][rank(G, share) :]
+    return vectors
+
+
 # -- what is refused -------------------------------------------------------------------------
 
 
-def _check(task: Task, counts: Counts) -> None:
+def _called(task: Task, places: np.ndarray, vectors: np.ndarray) -> str:
+    """Return names of coordinates that vectors (m, u) move."""
+    return task.called(places[np.abs(vectors).max(axis=0, initial=0.0) > SINGULAR_SHARE])
+
+
+def _check(task: Task, G: np.ndarray, share: float) -> None:
     """Raise where the number of passive joints is wrong; the one check of all paths."""
     ties = ", ".join(tie.name for tie in task.constraints.loops.ties)
     where = f"{task.words.source}: closures ({ties})"
-    if counts.missing:
+    own, driven = G[:, task.passive], np.setdiff1d(task.moving, task.passive)
+    if missing := rank(G[:, task.moving], share) - rank(own, share):
+        held = _called(task, driven, _null_vectors(own.T, share) @ G[:, driven])
         raise InputError(
-            f"{where}: they hold {counts.missing} of the driven coordinates: give "
-            f"{counts.missing} more of the joints passive = true, among "
-            f"{task.called(counts.held)}, or leave out a closure"
+            f"{where}: they hold {missing} of the driven coordinates: give {missing} more of the "
+            f"joints passive = true, among {held}, or leave out a closure"
         )
-    if counts.loose:
+    if len(loose := _null_vectors(own, share)):
         raise InputError(
-            f"{where}: they leave {counts.loose} of the passive joints undetermined: drive "
-            f"{counts.loose} of {task.called(counts.undetermined)}, without passive = true, or "
+            f"{where}: they leave {len(loose)} of the passive joints undetermined: drive "
+            f"{len(loose)} of {_called(task, task.passive, loose)}, without passive = true, or "
             "take another kind of closure"
-        )
-
-
-def _check_path(task: Task, usual: np.ndarray, target: Target) -> None:
-    """Raise where path and closures do not determine the unknowns even at usual poses."""
-    G = task.constraints.at(usual[None]).rows(target.turning is not None)[0, :, task.unknown].T
-    if (found := rank(G)) < len(task.unknown):
-        null = np.abs(np.linalg.svd(G)[2][found:]).max(axis=0)
-        idle = task.called(task.unknown[null > SINGULAR_SHARE])
-        raise InputError(
-            f"{task.words.source}: motion: path and closures leave {len(task.unknown) - found} of "
-            f"the joints undetermined ({idle}); prescribe one of them by a column of the table"
         )
 
 

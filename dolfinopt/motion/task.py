@@ -8,10 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.motion.constraints import Constraints, Target
-from dolfinopt.motion.curves import Words
 from dolfinopt.multibody.ranks import least_norm
 
-NEWTON_STEPS = 5  # from samples that are right to 1e-5, three leave rounding
+
+@dataclass(frozen=True)
+class Words:
+    """What messages name: where the motion is stated, and the keys that change it."""
+
+    source: str
+    motion: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +49,9 @@ class Task:
     words: Words
 
     @property
-    def driven(self) -> np.ndarray:
-        """Places of the coordinates that move and are not passive."""
-        moving = np.union1d(self.unknown, self.given)
-        return np.setdiff1d(moving, self.passive)
+    def moving(self) -> np.ndarray:
+        """Places of the coordinates that are unknown, given or passive."""
+        return np.unique([*self.unknown, *self.given, *self.passive]).astype(int)
 
     def called(self, places: Iterable[int]) -> str:
         """Return names of coordinates."""
@@ -61,8 +65,8 @@ class Task:
 
     def newton(
         self, q: np.ndarray, target: Target, enough: float = 1e-9
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return poses (n, R) by Newton's method, the last steps (n, u) and G (n, k, R) before.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses (n, R) by Newton's method, and the last steps (n, u).
 
         Steps are least squares where there are more equations than unknowns: what they leave is
         the misfit of the links.
@@ -70,39 +74,31 @@ class Task:
         Raises:
             numpy.linalg.LinAlgError: a singular pose.
         """
-        units, before = self.constraints.units[self.unknown], np.inf
-        turned, reach = target.turning is not None, self.constraints.reach
-        for _ in range(NEWTON_STEPS):
+        units = self.constraints.units[self.unknown]
+        for _ in range(5):  # from samples that are right to 1e-5, three leave rounding
             here = self.constraints.at(q)
-            G = here.rows(turned)
-            step = least_norm(G[:, :, self.unknown], here.error(target) / reach)
+            error = here.error(target) / self.constraints.reach
+            step = least_norm(here.rows()[:, :, self.unknown], error)
             q = q.copy()
             q[:, self.unknown] += step * units
-            size = float(np.abs(step).max(initial=0.0))
-            if size < enough or size > 10.0 * before:
+            if np.abs(step).max(initial=0.0) < enough:
                 break
-            before = size
-        return q, step, G
+        return q, step
 
-    def rates(self, q: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray]:
-        """Return rates and accelerations (n, R) of poses on the path, exact to rounding."""
-        here, turned = self.constraints.at(q), target.turning is not None
-        G = here.rows(turned)
-        qd = self.velocity(G, target)
-        right = self.constraints.right(target, 2) - here.acceleration(qd, turned)
-        return qd, self._solved(G, target.joints[2], right)
+    def rates(self, q: np.ndarray, target: Target) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return rates and accelerations (n, R) of poses on the path to rounding, and G there."""
+        here = self.constraints.at(q)
+        G, units = here.rows(), self.constraints.units
 
-    def velocity(self, G: np.ndarray, target: Target) -> np.ndarray:
-        """Return the rates (n, R) by G (n, k, R)."""
-        return self._solved(G, target.joints[1], self.constraints.right(target, 1))
+        def solved(order: int, right: np.ndarray) -> np.ndarray:  # G x = right with x as given
+            x = np.zeros_like(q)
+            x[:, self.given] = target.joints[order]
+            left = right / self.constraints.reach - np.einsum("nkr,nr->nk", G, x / units)
+            x[:, self.unknown] = least_norm(G[:, :, self.unknown], left) * units[self.unknown]
+            return x
 
-    def _solved(self, G: np.ndarray, known: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """Return x (n, R) with G x = right (n, k), in m, and its given entries (n, g)."""
-        units, found = self.constraints.units, np.zeros((len(G), len(self.names)))
-        found[:, self.given] = known
-        left = right / self.constraints.reach - np.einsum("nkr,nr->nk", G, found / units)
-        found[:, self.unknown] = least_norm(G[:, :, self.unknown], left) * units[self.unknown]
-        return found
+        qd = solved(1, self.constraints.right(target, 1))
+        return qd, solved(2, self.constraints.right(target, 2) - here.acceleration(qd)), G
 
 
 def widest(task: Task, error: np.ndarray) -> tuple[str, float]:

@@ -2,7 +2,7 @@
 
 The instants are the last axis, see `dimension`. Motions are triples (a, w, wd): acceleration of a
 frame's origin less gravity (d, n), angular velocity and acceleration (r, n), in the components of
-that frame. Loads are pairs (force (d, n), moment (r, n)).
+that frame. Loads are (d + r, n), force and moment.
 
 All that loads a body's elastic rows is linear in P numbers, its pushes: the frame's acceleration a,
 the entries alpha_c of A, and the force and moment on every outboard interface. Each has a conjugate
@@ -33,7 +33,6 @@ doi:10.1002/nme.1620320818; Featherstone, Rigid Body Dynamics Algorithms (2008),
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -42,7 +41,6 @@ from dolfinopt.multibody.dimension import DIMENSIONS, product
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
-Load = tuple[np.ndarray, np.ndarray]
 
 
 class Constants:
@@ -66,7 +64,7 @@ class Constants:
     def __init__(self, body: ShapeIntegrals) -> None:
         """Take the integrals."""
         self.body, q = body, body.num_modes
-        self.dim, self.turning = DIMENSIONS[len(body.w)]
+        self.dim = DIMENSIONS[len(body.w)]
         self.num_modes = q
         self.T = np.concatenate([body.w[:, 1:], body.W[:, 1:, 0], body.outboard])
         self.K0 = self.L = None
@@ -253,26 +251,30 @@ class BodyMotion:
     # -- forces ------------------------------------------------------------------------------
 
     @cached_property
-    def load(self) -> Load:
-        """Inertia force F and moment T about the frame's origin, N and N m."""
-        dim = self.dim
+    def load(self) -> np.ndarray:
+        """Inertia force F and moment T about the frame's origin (d + r, n), N and N m."""
+        dim, force = self.dim, self.constants.mass * self.a
         if self.constants.is_point:
-            moment = dim.torque(self.alpha, self.constants.W_rest)
-            return self.constants.mass * self.a, moment
+            return np.concatenate([force, dim.torque(self.alpha, self.constants.W_rest)])
         (s, sd, sdd), (G, H, second) = self.moments, self.second_moments
-        force = self.constants.mass * self.a + dim.apply(self.alpha, s)
+        force = force + dim.apply(self.alpha, s)
         moment = dim.moment(s, self.a) + dim.torque(self.alpha, G)
         if self.is_flexible:
             force = force + dim.apply(self.beta, sd) + sdd
             moment = moment + dim.torque(self.beta, H) + dim.axial(second)
-        return force, moment
+        return np.concatenate([force, moment])
+
+    @cached_property
+    def _pushes(self) -> np.ndarray:
+        """Entries of A, 2 Omega and 1 (g, 3, n), that multiply p, p' and p''."""
+        out = np.empty((len(self.alpha), 3, self.alpha.shape[1]), dtype=self.alpha.dtype)
+        out[:, 0], out[:, 1], out[:, 2] = self.alpha, self.beta, self.dim.trace
+        return out
 
     @cached_property
     def modal_inertia(self) -> np.ndarray:
         """alpha_c W_c z + beta_c W_c z' + M z'' (q, n)."""
-        pushes = np.empty((len(self.alpha), 3, self.alpha.shape[1]), dtype=self.alpha.dtype)
-        pushes[:, 0], pushes[:, 1], pushes[:, 2] = self.alpha, self.beta, self.dim.trace
-        return np.asarray(np.einsum("crn,ckrn->kn", pushes, self._Wz))
+        return np.asarray(np.einsum("crn,ckrn->kn", self._pushes, self._Wz))
 
     def load_coefficients(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return all P of them (P, n) from those of the interfaces, by number."""
@@ -356,10 +358,10 @@ class BodyMotion:
         """
         constants, q = self.constants, self.constants.num_modes
         if constants.L is None:
-            by_e, by_ed, by_edd = *self._by_z(kept), constants.M[:, kept]
+            by_e, by_ed, by_edd = *self._modal_tangent(kept), constants.M[:, kept]
             held = self.load_coefficients(outboard)
         else:
-            by_z, by_zd = self._by_z(np.arange(q))
+            by_z, by_zd = self._modal_tangent(np.arange(q))
             assert self.rates_by_e is not None
             P = len(constants.T)
             J, Jd, Jdd = (
@@ -380,7 +382,7 @@ class BodyMotion:
             by_ed += constants.body.D[:, kept]
         return by_e, by_ed, by_edd
 
-    def _by_z(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _modal_tangent(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives of `modal_inertia` by those z and z' kept (n, q, k)."""
         q = self.constants.num_modes
         W = self.constants.W.reshape(-1, q, q)[:, :, kept]
@@ -391,144 +393,87 @@ class BodyMotion:
     # -- gradient ----------------------------------------------------------------------------
 
     def integral_gradient(
-        self, virtual: Load, multipliers: np.ndarray, outboard: dict[int, Weights]
+        self, virtual: np.ndarray, multipliers: np.ndarray, outboard: dict[int, np.ndarray]
     ) -> ShapeIntegrals:
         """Return the derivative of the virtual work of F, T and the rows by the integrals.
 
         Args:
-            virtual: displacement of the frame's origin and rotation, multiplies (F, T).
+            virtual: displacement of the frame's origin and rotation (d + r, n), multiplies (F, T).
             multipliers: (q, n) of the rows.
-            outboard: derivatives by the interfaces' displacements, by number.
+            outboard: derivatives (b, 4, n) by the interfaces' (u, theta), by number: by their
+                values, rates, second derivatives, and variations by the multipliers.
         """
-        constants, body, dim = self.constants, self.constants.body, self.dim
-        (p, phi), zeta = virtual, multipliers
-        weights = self._frame_weights(p, phi)
-        count, d, g = p.shape[1], dim.d, dim.g
-        every = Weights(*np.zeros((4, len(constants.T), count)))
-        for place, one in [
-            (slice(0, d + g), weights),
-            *((constants.outboard(s), one) for s, one in outboard.items()),
-        ]:
-            every.value[place], every.rate[place] = one.value, one.rate
-            every.second[place], every.virtual[place] = one.second, one.virtual
-        by_T = every.linear(self.rates, zeta)
-        by_W = self._by_second_moments(phi, self.rates, zeta)
-        along = np.zeros_like(body.along_modes)
-        if constants.L is not None:
-            pushed = product(self._J, zeta)
-            by_W[:, 1:, 1:] = self._by_second_moments(phi, self.z, pushed)[:, 1:, 1:]
-            along = self._by_L(phi, zeta, pushed)
-        K0 = np.zeros((0, *body.K.shape))
+        constants, body, zeta = self.constants, self.constants.body, multipliers
+        d, ends, P = self.dim.d, self.dim.d + self.dim.g, len(constants.T)
+        p, phi = virtual[:d], virtual[d:]
+        turned = self.dim.turned(phi, self._pushes)
+        every = np.zeros((P, 4, zeta.shape[1]))
+        every[:ends] = self._by_conjugates(p, phi, turned)
+        for s, one in outboard.items():
+            every[constants.outboard(s)] = one
+        x = np.concatenate([self.rates, zeta[:, None]], axis=1)
+        by_T = np.tensordot(every, x, ((1, 2), (1, 2)))
+        pushed = zeta if constants.L is None else product(self._J, zeta)
+        W = np.zeros_like(body.W)
+        W[:, 0, 0], W[:, 1:, 0] = turned[:, 0].sum(axis=1), by_T[d:ends]
+        W[:, 1:, 1:] = self._by_second_moments(phi, pushed)
+        inertial, bent = np.zeros_like(body.K0), np.zeros((0, *body.K.shape))
         if constants.K0 is not None:
-            K0 = every.quadratic(self.rates, zeta)
-        ends = K0[d + g :]
-        by_w = np.column_stack([(weights.value[:d]).sum(axis=1), by_T[:d]])
-        inertial = np.zeros_like(body.K0)
-        if constants.K0 is not None:
-            inertial[dim.loads] = K0[: d + g]
+            if constants.L is not None:
+                every = np.concatenate([every, self._by_z(turned, pushed)])
+            bent = self._by_bending(every, x)
+            inertial[self.dim.loads] = bent[:ends]
         return ShapeIntegrals(
             mass=float((p * self.a).sum()),
-            w=by_w,
-            W=by_W,
+            w=np.column_stack([every[:d, 0].sum(axis=1), by_T[:d]]),
+            W=W,
             K=zeta @ self.rates[:, 0].T,
             D=zeta @ self.rates[:, 1].T,
-            outboard=by_T[d + g :],
+            outboard=by_T[ends:],
             outboard_point=np.zeros(d),
             K0=inertial,
-            K0_outboard=ends,
+            K0_outboard=bent[ends:P],
             further_points=np.zeros_like(body.further_points),
-            along_modes=along,
+            along_modes=bent[P:].reshape(body.along_modes.shape),
         )
 
-    def _frame_weights(self, p: np.ndarray, phi: np.ndarray) -> Weights:
-        """Return the derivatives by the conjugates of a and alpha (d + g, n), see `Weights`."""
-        dim = self.dim
-        turned = [dim.turned(phi, x) for x in (self.alpha, self.beta)]
-        trace = dim.turned(phi, np.broadcast_to(dim.trace, self.alpha.shape))
-        G, H, second = (*turned, trace)
-        value = dim.applied_transposed(self.alpha, p) - dim.velocity(phi, self.a)
-        return Weights(
-            np.concatenate([value, G + dim.transposed(G)]),
-            np.concatenate([dim.applied_transposed(self.beta, p), dim.transposed(H)]),
-            np.concatenate([p, dim.transposed(second)]),
-            np.concatenate([self.a, self.alpha]),
-        )
+    def _by_conjugates(self, p: np.ndarray, phi: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """Return the derivatives by the conjugates of a and alpha (d + g, 4, n)."""
+        dim, d = self.dim, self.dim.d
+        out = np.empty((d + dim.g, 4, p.shape[1]))
+        out[:d, 0] = dim.applied_transposed(self.alpha, p) - dim.velocity(phi, self.a)
+        out[:d, 1], out[:d, 2], out[:d, 3] = dim.applied_transposed(self.beta, p), p, self.a
+        out[d:, :3], out[d:, 3] = dim.transposed(turned), self.alpha
+        out[d:, 0] += turned[:, 0]
+        return out
 
-    def accelerations(self, rates: np.ndarray) -> np.ndarray:
-        """Return alpha_c x + beta_c x' + trace_c x'' (g, q, n) of x and its rates (q, 3, n)."""
-        y = self.alpha[:, None] * rates[:, 0] + self.beta[:, None] * rates[:, 1]
-        y += self.dim.trace[:, :, None] * rates[:, 2]
-        return y
+    @property
+    def accelerations(self) -> np.ndarray:
+        """alpha_c z + beta_c z' + trace_c z'' (g, q, n)."""
+        return np.asarray(np.einsum("crn,krn->ckn", self._pushes, self.z))
 
-    def _by_second_moments(
-        self, phi: np.ndarray, rates: np.ndarray, zeta: np.ndarray
-    ) -> np.ndarray:
-        """Return the derivative of the virtual work by W (g, 1 + q, 1 + q)."""
-        dim, count = self.dim, rates.shape[2]
-        y = np.concatenate([self.alpha[:, None], self.accelerations(rates)], axis=1)
-        t = dim.turned(phi, y)
-        eta = np.concatenate([np.ones((1, count)), rates[:, 0]])
-        moved = np.concatenate([np.zeros((1, count)), zeta])
-        left, right = np.concatenate([moved, eta], axis=1), np.concatenate([y, t], axis=2)
+    def _by_second_moments(self, phi: np.ndarray, pushed: np.ndarray) -> np.ndarray:
+        """Return the derivative of the virtual work by the modes' W (g, q, q)."""
+        y = self.accelerations
+        left = np.concatenate([pushed, self.z[:, 0]], axis=1)
+        right = np.concatenate([y, self.dim.turned(phi, y)], axis=2)
         found: np.ndarray = left @ right.swapaxes(1, 2)  # of N_l' E_c N_k: l, k
         return found
 
-    def _by_L(self, phi: np.ndarray, zeta: np.ndarray, pushed: np.ndarray) -> np.ndarray:
-        """Return the derivative of the virtual work by L (q, q, q)."""
-        constants, dim, q = self.constants, self.dim, len(zeta)
-        W = constants.W.reshape(-1, q, q)
-        of_rows = np.einsum("ckl,kn->cln", W, pushed)  # W_c' times the virtual displacement
-        z, zd, zdd = (self._Wz[:, :, i] for i in range(3))
-        across = dim.transposed(z)
-        of_G, of_H = (dim.turned(phi, x) for x in (self.alpha, self.beta))
-        of_I = dim.turned(phi, np.broadcast_to(dim.trace, self.alpha.shape))
+    def _by_z(self, turned: np.ndarray, pushed: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the virtual work by z, its rates and variation (q, 4, n)."""
+        constants, q = self.constants, len(pushed)
+        of_rows = np.einsum("ckl,kn->cln", constants.W.reshape(-1, q, q), pushed)
+        across = self.dim.transposed(self._Wz[:, :, 0])
+        by_z = np.einsum("crn,ckn->krn", self._pushes, of_rows)
+        by_z += np.einsum("crn,ckn->krn", turned, across)
+        by_z[:, 0] += np.einsum("crn,ckrn->kn", turned, self._Wz)
+        return np.concatenate([by_z, self.modal_inertia[:, None]], axis=1)
 
-        def contracted(pushes: np.ndarray, Y: np.ndarray) -> np.ndarray:
-            out: np.ndarray = np.einsum("cn,ckn->kn", pushes, Y)
-            return out
-
-        by_z = contracted(of_G, z + across) + contracted(of_H, zd) + contracted(of_I, zdd)
-        by_z += contracted(self.alpha, of_rows)
-        by_zd = contracted(of_H, across) + contracted(self.beta, of_rows)
-        by_zdd = contracted(of_I, across) + constants.M @ pushed
-        e, ed, edd = (self.rates[:, i] for i in range(3))
-        by_L = np.zeros((q, q, q))
-        for weight, left, right in (
-            (0.5 * by_z, e, e),
-            (by_zd, e, ed),
-            (by_zdd, e, edd),
-            (by_zdd, ed, ed),
-            (self.modal_inertia, e, zeta),
-        ):
-            by_L -= (weight @ (left[:, None] * right).reshape(q * q, -1).T).reshape(q, q, q)
-        return by_L
-
-
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """Derivatives (P, n) of the virtual work by P conjugates, T_p e - 1/2 e'K0_p e.
-
-    By their values, rates, second derivatives, and variations by the multipliers.
-    """
-
-    value: np.ndarray
-    rate: np.ndarray
-    second: np.ndarray
-    virtual: np.ndarray
-
-    def linear(self, rates: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative (P, q) by T."""
-        every = np.concatenate([self.value, self.rate, self.second, self.virtual], axis=1)
-        q, _, count = rates.shape
-        x = np.concatenate([rates.reshape(q, 3 * count), multipliers], axis=1)
-        out: np.ndarray = every @ x.T
-        return out
-
-    def quadratic(self, rates: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return the derivative (P, q, q) by K0, of which the symmetric part counts."""
-        e, ed, edd = (rates[:, i] for i in range(3))
-        other = self.virtual[:, None] * multipliers + self.value[:, None] * (0.5 * e)
-        other += self.rate[:, None] * ed
-        other += self.second[:, None] * edd
-        out: np.ndarray = other @ e.T + (self.second[:, None] * ed) @ ed.T
-        return -out.swapaxes(1, 2)
+    def _by_bending(self, every: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return the derivative by K0 and L (., q, q), of which the symmetric part counts."""
+        e, ed = x[:, 0], x[:, 1]
+        half = x * np.array([0.5, 1.0, 1.0, 1.0])[:, None]
+        found = e @ np.einsum("prn,krn->pnk", every, half)
+        found += ed @ (every[:, 2, :, None] * ed.T)
+        return np.asarray(-found)

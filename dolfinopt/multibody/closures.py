@@ -30,9 +30,8 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body import Load
-from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, product
-from dolfinopt.multibody.kinematics import Posed, SiteMotion
+from dolfinopt.multibody.dimension import Dimension
+from dolfinopt.multibody.kinematics import Posed, SiteMotion, no_gradient
 from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.tree import Mechanism, Site
 
@@ -41,8 +40,8 @@ from dolfinopt.multibody.tree import Mechanism, Site
 # Changes are those by a displacement (d, ., n) and a rotation (r, ., n) of either frame; trailing
 # axes of directions come before the instants.
 
-Loads = tuple[Load, Load]  # on a and on b
-Moved = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # dp_a, s_a, dp_b, s_b
+# Loads are (2 d + 2 r, ., n), force and moment on a, then those on b; changes dp_a, s_a, dp_b, s_b
+# likewise.
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +54,18 @@ class Along:
         """Return it (n,), m."""
         return (b.turned(self.e) * (a.place - b.place)).sum(axis=0)
 
-    def loads(self, a: SiteMotion, b: SiteMotion) -> Loads:
+    def loads(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return its gradient as loads on both frames."""
         e, apart = b.turned(self.e), a.place - b.place
-        none = np.zeros((a.dim.r, e.shape[1]))
-        return (e, none), (-e, a.dim.moment(e, apart))
+        return np.concatenate([e, np.zeros((a.dim.r, e.shape[1])), -e, a.dim.moment(e, apart)])
 
-    def changes(self, a: SiteMotion, b: SiteMotion, moved: Moved) -> Loads:
+    def changes(self, a: SiteMotion, b: SiteMotion, moved: np.ndarray) -> np.ndarray:
         """Return how these change."""
-        dim, (by_a, _, by_b, spin) = a.dim, moved
+        dim, (by_a, still, by_b, spin) = a.dim, _parts(a.dim, moved)
         e, apart = _before(b.turned(self.e), by_a), _before(a.place - b.place, by_a)
         turned = dim.velocity(spin, e)
         moment = dim.moment(turned, apart) + dim.moment(e, by_a - by_b)
-        return (turned, np.zeros_like(spin)), (-turned, moment)
+        return np.concatenate([turned, np.zeros_like(still), -turned, moment])
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,19 +80,19 @@ class Facing:
         """Return it (n,), m."""
         return self.length * (a.turned(self.u) * b.turned(self.v)).sum(axis=0)
 
-    def loads(self, a: SiteMotion, b: SiteMotion) -> Loads:
+    def loads(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return its gradient as loads on both frames."""
         moment = self.length * a.dim.moment(a.turned(self.u), b.turned(self.v))
         none = np.zeros_like(a.place)
-        return (none, moment), (none, -moment)
+        return np.concatenate([none, moment, none, -moment])
 
-    def changes(self, a: SiteMotion, b: SiteMotion, moved: Moved) -> Loads:
+    def changes(self, a: SiteMotion, b: SiteMotion, moved: np.ndarray) -> np.ndarray:
         """Return how these change."""
-        dim, (by_a, spin_a, _, spin_b) = a.dim, moved
+        dim, (by_a, spin_a, _, spin_b) = a.dim, _parts(a.dim, moved)
         u, v = _before(a.turned(self.u), by_a), _before(b.turned(self.v), by_a)
         moment = dim.moment(dim.velocity(spin_a, u), v) + dim.moment(u, dim.velocity(spin_b, v))
-        none = np.zeros_like(by_a)
-        return (none, self.length * moment), (none, -self.length * moment)
+        none, moment = np.zeros_like(by_a), self.length * moment
+        return np.concatenate([none, moment, none, -moment])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,24 +108,29 @@ class Distance:
         out: np.ndarray = np.linalg.norm(a.place - b.place, axis=0) - length
         return out
 
-    def loads(self, a: SiteMotion, b: SiteMotion) -> Loads:
+    def loads(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return its gradient as loads on both frames."""
         apart = a.place - b.place
         n, none = apart / np.linalg.norm(apart, axis=0), np.zeros((a.dim.r, apart.shape[1]))
-        return (n, none), (-n, none)
+        return np.concatenate([n, none, -n, none])
 
-    def changes(self, a: SiteMotion, b: SiteMotion, moved: Moved) -> Loads:
+    def changes(self, a: SiteMotion, b: SiteMotion, moved: np.ndarray) -> np.ndarray:
         """Return how these change."""
-        by_a, spin, by_b, _ = moved
+        by_a, spin, by_b, _ = _parts(a.dim, moved)
         apart = _before(a.place - b.place, by_a)
         size = np.linalg.norm(apart, axis=0)
         n, by = apart / size, by_a - by_b
         turned = (by - n * (n * by).sum(axis=0)) / size
         none = np.zeros_like(spin)
-        return (turned, none), (-turned, none)
+        return np.concatenate([turned, none, -turned, none])
 
 
 Equation = Along | Facing | Distance
+
+
+def _parts(dim: Dimension, moved: np.ndarray) -> list[np.ndarray]:
+    """Return displacement and rotation of either frame."""
+    return np.split(moved, [dim.d, dim.b, dim.b + dim.d])
 
 
 def _before(x: np.ndarray, like: np.ndarray) -> np.ndarray:
@@ -210,8 +213,8 @@ class ClosedLoops:
     def __init__(self, loops: Loops, posed: Posed) -> None:
         """Take them and the poses."""
         self.loops, self.posed = loops, posed
-        dim: Dimension = DIMENSIONS[len(posed.mechanism.gravity)][0]
-        self.dim, one, none = dim, np.eye(dim.d), np.zeros(dim.d)
+        dim = posed.mechanism.dim
+        one, none = np.eye(dim.d), np.zeros(dim.d)
         self._sites = [
             (
                 SiteMotion(posed, tie.a, none, one),
@@ -245,7 +248,7 @@ class ClosedLoops:
         size = self.posed.mechanism.num_rigid + self.posed.q.shape[1]
         out = np.empty((len(self.posed.q), self.loops.count, size))
         for k, (one, a, b) in enumerate(self._equations):
-            on_a, on_b = one.loads(a, b)
+            on_a, on_b = np.split(one.loads(a, b), 2)
             out[:, k] = a.generalised_force(on_a) + b.generalised_force(on_b)
             if isinstance(one, Distance) and one.coordinate is not None:
                 out[:, k, one.coordinate] -= 1.0
@@ -266,23 +269,21 @@ class ClosedLoops:
         J = self.jacobian[:, :, dependent]
         return least_norm(J.swapaxes(1, 2), forces[:, dependent])
 
-    def interface_loads(self, multipliers: np.ndarray) -> dict[Site, Load]:
+    def interface_loads(self, multipliers: np.ndarray) -> dict[Site, np.ndarray]:
         """Return what interfaces give to the closures, force and moment in their components."""
-        found: dict[Site, Load] = {}
+        found: dict[Site, np.ndarray] = {}
         for sites, loads in zip(self._sites, self._loads(multipliers), strict=True):
-            for site, (force, moment) in zip(sites, loads, strict=True):
+            for site, load in zip(sites, np.split(loads, 2), strict=True):
                 if not site.way:
                     continue
-                end, R = self.posed.interface(*site.way[-1])
-                back, moment = R.swapaxes(0, 1), moment + self.dim.moment(site.place - end, force)
-                own = -product(back, force), -self.dim.rotated(back, moment)
-                other = found.get(site.way[-1])
-                if other is not None:
-                    own = own[0] + other[0], own[1] + other[1]
-                found[site.way[-1]] = own
+                end = site.way[-1]
+                own = site.load_on(*self.posed.interface(*end), -load)
+                found[end] = own + found[end] if end in found else own
         return found
 
-    def _loads(self, multipliers: np.ndarray, moved: Sequence[Moved] | None = None) -> list[Loads]:
+    def _loads(
+        self, multipliers: np.ndarray, moved: Sequence[np.ndarray] | None = None
+    ) -> list[np.ndarray]:
         """Return the loads of every closure on its two frames, or their change as frames move."""
         weights, found = iter(multipliers.T), []
         for k, (tie, sites) in enumerate(zip(self.loops.ties, self._sites, strict=True)):
@@ -290,24 +291,20 @@ class ClosedLoops:
                 one.loads(*sites) if moved is None else one.changes(*sites, moved[k])
                 for one in tie.equations
             ]
-            found.append(_sum([_scaled(loads, next(weights)) for loads in every]))
+            found.append(np.sum([next(weights) * loads for loads in every], axis=0))
         return found
 
     def hessian(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the derivative of `generalised_force` by all coordinates (n, C, C)."""
-        moved = [(a.by_place, a.by_spin, b.by_place, b.by_spin) for a, b in self._sites]
-        changes = self._loads(multipliers, moved)
+        moved = [np.concatenate([a.by, b.by]) for a, b in self._sites]
+        every = self._loads(multipliers), moved, self._loads(multipliers, moved)
         size, count = self.posed.mechanism.num_rigid + self.posed.q.shape[1], len(self.posed.q)
         found = np.zeros((count, size, size))
-        for sites, loads, changed in zip(
-            self._sites, self._loads(multipliers), changes, strict=True
-        ):
-            for site, load, change in zip(sites, loads, changed, strict=True):
-                if not site.way:
-                    continue
-                found += site.hessian(load)
-                found += np.einsum("djn,din->nji", site.by_place, change[0])
-                found += np.einsum("rjn,rin->nji", site.by_spin, change[1])
+        for sites, loads, by, changed in zip(self._sites, *every, strict=True):
+            found += np.einsum("bjn,bin->nji", by, changed)
+            for site, load in zip(sites, np.split(loads, 2), strict=True):
+                if site.way:
+                    found += site.hessian(load)
         return found
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
@@ -316,11 +313,14 @@ class ClosedLoops:
         The power g' of unit loads on moving frames, differentiated.
         """
         found = []
-        moved = [(*a.along(rates), *b.along(rates)) for a, b in self._sites]
-        bias = [(*a.acceleration(rates), *b.acceleration(rates)) for a, b in self._sites]
+        moved = self._along(rates)
+        bias = [
+            np.concatenate([*a.acceleration(rates), *b.acceleration(rates)]) for a, b in self._sites
+        ]
         for tie, sites, v, a in zip(self.loops.ties, self._sites, moved, bias, strict=True):
             for one in tie.equations:
-                found.append(_power(one.changes(*sites, v), v) + _power(one.loads(*sites), a))
+                power = one.changes(*sites, v) * v + one.loads(*sites) * a
+                found.append(power.sum(axis=0))
         return np.stack(found, axis=1) if found else np.zeros((len(rates), 0))
 
     def gradient(
@@ -335,57 +335,13 @@ class ClosedLoops:
         Returns:
             Of every body, by its outboard modes (b, q) and K0_outboard (b, q, q).
         """
-        mechanism = self.posed.mechanism
-        found = [{"outboard": np.zeros_like(one.outboard)} for one in mechanism.bodies]
-        for by, body in zip(found, mechanism.bodies, strict=True):
-            if body.is_stiffened:
-                by["K0_outboard"] = np.zeros_like(body.K0_outboard)
-        moved = [(*a.along(virtual), *b.along(virtual)) for a, b in self._sites]
-        values = self._loads(weights)
-        forces, changes = self._loads(multipliers), self._loads(multipliers, moved)
-        for sites, value, load, change in zip(self._sites, values, forces, changes, strict=True):
-            for site, of_gap, of_force, by in zip(sites, value, load, change, strict=True):
-                self._add_gradient(found, site, of_gap, of_force, by, virtual)
+        found, moved = no_gradient(self.posed.mechanism), self._along(virtual)
+        every = self._loads(weights), self._loads(multipliers), self._loads(multipliers, moved)
+        for sites, *loads in zip(self._sites, *every, strict=True):
+            for site, *own in zip(sites, *(np.split(one, 2) for one in loads), strict=True):
+                site.add_gradient(found, *own, virtual)
         return found
 
-    def _add_gradient(
-        self,
-        found: list[dict[str, np.ndarray]],
-        site: SiteMotion,
-        of_gap: Load,
-        of_force: Load,
-        change: Load,
-        virtual: np.ndarray,
-    ) -> None:
-        """Add what one frame's loads depend on of the bodies on the way to it."""
-        dim = self.dim
-        for i, number in site.way:
-            if self.posed.section(i, number).turning is None:
-                continue
-            e, v = self.posed.q[:, self.posed.mechanism.slices[i]], virtual[:, site.columns(i)]
-            rate = site.interface_load(i, number, of_force)
-            value = site.interface_load(i, number, of_gap)
-            value = value + site.interface_load_along(i, number, of_force, change, virtual)
-            own = slice(dim.b * number, dim.b * (number + 1))
-            found[i]["outboard"][own] += value @ e + rate @ v
-            if "K0_outboard" in found[i]:
-                bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T
-                found[i]["K0_outboard"][own] -= bent @ e
-
-
-def _power(loads: Loads, rate: Moved) -> np.ndarray:
-    """Return that (n,) of loads on frames with these velocities."""
-    parts = zip((*loads[0], *loads[1]), rate, strict=True)
-    return np.sum([(f * v).sum(axis=0) for f, v in parts], axis=0)
-
-
-def _scaled(loads: Loads, factor: np.ndarray) -> Loads:
-    (fa, ma), (fb, mb) = loads
-    return (factor * fa, factor * ma), (factor * fb, factor * mb)
-
-
-def _sum(parts: list[Loads]) -> Loads:
-    (fa, ma), (fb, mb) = parts[0]
-    for (ga, na), (gb, nb) in parts[1:]:
-        fa, ma, fb, mb = fa + ga, ma + na, fb + gb, mb + nb
-    return (fa, ma), (fb, mb)
+    def _along(self, virtual: np.ndarray) -> list[np.ndarray]:
+        """Return displacement and rotation of every closure's frames."""
+        return [np.concatenate([a.along(virtual), b.along(virtual)]) for a, b in self._sites]

@@ -36,7 +36,7 @@ from dolfinopt.multibody.measured import SERIES_LIMIT, SERIES_TERMS
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """Return A B (i, ..., n) of matrices (i, j, n), or one (i, j), and (j, ..., n)."""
     if A.ndim == 2:
-        return (A @ B.reshape(len(B), -1)).reshape(len(A), *B.shape[1:])
+        return A.dot(B.reshape(len(B), -1)).reshape(len(A), *B.shape[1:])  # faster than @
     out: np.ndarray = np.einsum("ijn,j...n->i...n", A, B)
     return out
 
@@ -51,266 +51,149 @@ def transposed_product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return product(A.swapaxes(0, 1), B)
 
 
-class Plane:
-    """d = 2: E_c are the identity and the rotation S by 90 degrees."""
+Bilinear: TypeAlias = "Callable[[np.ndarray, np.ndarray], np.ndarray]"
 
-    d, r, g, b = 2, 1, 2, 3
-    loads = np.array([0, 1, 3, 2])  # of K0's accelerations a_x, a_y, wd, -w^2: in the order of E_c
-    trace = np.array([[1.0], [0.0]])  # p'' is the sum of these E_c
 
-    @staticmethod
-    def skew(axis: np.ndarray) -> np.ndarray:
-        """Return w~ (2, 2) of one angular velocity (1,)."""
-        return np.array([[0.0, -axis[0]], [axis[0], 0.0]])
+def _bilinear(T: np.ndarray) -> Bilinear:
+    """Return the function sum_jk T_...jk x_j y_k (..., n) of x (j, ..., n) and y (k, ..., n)."""
+    flat, (j, k) = T.reshape(-1, *T.shape[-2:]), T.shape[-2:]
+    rows, by_x = len(flat), flat.swapaxes(1, 2).reshape(-1, j)
 
-    @staticmethod
-    def transposed(x: np.ndarray) -> np.ndarray:
-        """Return the entries (g, ..., n) of the transposed matrices."""
-        return np.stack([x[0], -x[1]])
+    def function(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        matrix = by_x.dot(x.reshape(j, -1)).reshape(rows, k, *x.shape[1:])
+        out: np.ndarray = np.einsum("ij...,j...->i...", matrix, y)
+        return out.reshape(*T.shape[:-2], *out.shape[1:])
 
-    @staticmethod
-    def alpha(w: np.ndarray, wd: np.ndarray) -> np.ndarray:
-        """Return the entries (g, n) of A."""
-        return np.concatenate([-w * w, wd])
+    return function
 
-    @staticmethod
-    def beta(w: np.ndarray) -> np.ndarray:
-        """Return the entries (g, n) of 2 Omega."""
-        return np.concatenate([np.zeros_like(w), 2.0 * w])
 
-    @staticmethod
-    def apply(alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return sum_c alpha_c E_c p (d, ..., n)."""
-        x, y = alpha
-        out = x * p
-        out[0] -= y * p[1]
-        out[1] += y * p[0]
-        return out
+def components(E: np.ndarray) -> np.ndarray:
+    """Return the matrices (g, d, d) whose products with a matrix are its components by E_c."""
+    return E / np.square(E).sum(axis=(1, 2), keepdims=True)
 
-    @staticmethod
-    def applied_transposed(alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return sum_c alpha_c E_c' p (d, n)."""
-        return Plane.apply(alpha * np.array([[1.0], [-1.0]]), p)
 
-    @staticmethod
-    def velocity(w: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return w x p (d, ..., n)."""
-        return np.stack([-w[0] * p[1], w[0] * p[0]])
+class Dimension:
+    """The plane or space: everything follows from the matrices E_c and S_r, w~ = sum_r w_r S_r.
 
-    @staticmethod
-    def moment(p: np.ndarray, f: np.ndarray) -> np.ndarray:
-        """Return p x f (r, ..., n)."""
-        out: np.ndarray = (p[0] * f[1] - p[1] * f[0])[None]
-        return out
+    Functions of two arguments take and return (., ..., n).
 
-    @staticmethod
-    def commutator(w: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return w x v (r, ..., n) of angular velocities: zero."""
-        return np.asarray(0.0 * (w * v))
+    Attributes:
+        d, r, g, b: numbers of entries of vectors, angular velocities, E_c, and of an interface's
+            displacement and rotation.
+        E: (g, d, d).
+        trace: (g, 1) of the identity: p'' is the sum of these E_c.
+        loads: of K0's accelerations their places in the order of a and E_c.
+        turning: of a rotation by theta.
+        velocity: w x p.
+        moment: p x f.
+        commutator: w x v of angular velocities.
+        apply: A p of the entries alpha of A.
+        centripetal_by_spin: its derivative (d, r, n) by w, of w and p.
+        torque: the moment of accelerations alpha by second moments G.
+        turned: its adjoint, the entries of (w~)' y.
+    """
 
-    @staticmethod
-    def by_spin(p: np.ndarray) -> np.ndarray:
+    def __init__(
+        self, E: np.ndarray, S: np.ndarray, loads: list[int], turning: Callable[..., Turning]
+    ) -> None:
+        """Take the matrices."""
+        self.E, self.loads, self.turning = E, np.array(loads), turning
+        self.d, self.r, self.g, self.b = E.shape[1], len(S), len(E), E.shape[1] + len(S)
+        in_E = components(E)
+        self._spin = np.einsum("cab,rab->cr", in_E, S)
+        self._transposed = np.einsum("cab,eba->ce", in_E, E)
+        self.trace = np.trace(in_E, axis1=1, axis2=2)[:, None]
+        self._skew, self._by_spin = S.reshape(self.r, -1).T, S.swapaxes(0, 1).reshape(-1, self.d)
+        squares = np.einsum("cab,rad,sdb->crs", in_E, S, S)
+        torque = np.einsum("eab,rda,cdb->rce", in_E, S, E)
+        by_w = squares + squares.swapaxes(1, 2)
+        self._inertia = np.einsum("rce,cs->rse", torque, self._spin).reshape(-1, self.g)
+        self._square, self.velocity = _bilinear(squares), _bilinear(S.swapaxes(0, 1))
+        self.moment, self.apply = _bilinear(S.swapaxes(1, 2)), _bilinear(E.swapaxes(0, 1))
+        self.torque, self.turned = _bilinear(torque), _bilinear(torque.transpose(2, 0, 1))
+        self.commutator = _bilinear(np.einsum("tab,rad,sdb->trs", S, S, S))
+        self.centripetal_by_spin = _bilinear(np.einsum("cij,crs->irsj", E, by_w))
+        self._torque_by_w = _bilinear(np.einsum("tce,crs->trse", torque, by_w))
+        self._contracted = _bilinear(by_w.transpose(1, 2, 0))
+
+    def skew(self, w: np.ndarray) -> np.ndarray:
+        """Return w~ (d, d, ...) of angular velocities (r, ...)."""
+        return product(self._skew, w).reshape(self.d, self.d, *w.shape[1:])
+
+    def by_spin(self, p: np.ndarray) -> np.ndarray:
         """Return the derivative of w x p by w (d, r, n)."""
-        return np.stack([-p[1], p[0]])[:, None]
+        return product(self._by_spin, p).reshape(self.d, self.r, *p.shape[1:])
 
-    @staticmethod
-    def centripetal_by_spin(w: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return the derivative of A p by w (d, r, n)."""
-        return (-2.0 * w * p)[:, None]
+    def transposed(self, x: np.ndarray) -> np.ndarray:
+        """Return the entries (g, ..., n) of the transposed matrices."""
+        return product(self._transposed, x)
 
-    @staticmethod
-    def torque(alpha: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the moment (r, ..., n) of accelerations alpha_c E_c by second moments G."""
-        out: np.ndarray = (alpha[1] * G[0] - alpha[0] * G[1])[None]
-        return out
+    def alpha(self, w: np.ndarray, wd: np.ndarray) -> np.ndarray:
+        """Return the entries (g, n) of A."""
+        return self._square(w, w) + self._spin.dot(wd)
 
-    @staticmethod
-    def axial(G: np.ndarray) -> np.ndarray:
-        """Return `torque` of second moments with accelerations themselves."""
-        return -G[1:]
+    def beta(self, w: np.ndarray) -> np.ndarray:
+        """Return the entries (g, n) of 2 Omega."""
+        return product(self._spin, 2.0 * w)
 
-    @staticmethod
-    def turned(w: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the entries of (w~)' y (g, ..., n), of which `torque` is the adjoint."""
-        return np.stack([w[0] * y[1], -w[0] * y[0]])
+    def applied_transposed(self, alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Return A' p (d, n)."""
+        return self.apply(self.transposed(alpha), p)
 
-    @staticmethod
+    def axial(self, G: np.ndarray) -> np.ndarray:
+        """Return `torque` (r, ..., n) of second moments with accelerations themselves."""
+        return product(-self._spin.T, G)
+
     def torque_by_spin(
-        w: np.ndarray, G: np.ndarray, H: np.ndarray
+        self, w: np.ndarray, G: np.ndarray, H: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives (r, r, n) of torque(alpha, G) + torque(beta, H) by w and wd."""
-        return (2.0 * H[0])[None, None], G[0][None, None]
+        of_G, of_H = (product(self._inertia, x).reshape(self.r, self.r, -1) for x in (G, H))
+        return self._torque_by_w(w, G) + 2.0 * of_H, of_G
 
-    @staticmethod
     def contracted_by_spin(
-        w: np.ndarray, Y: np.ndarray, Yd: np.ndarray
+        self, w: np.ndarray, Y: np.ndarray, Yd: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives (r, q, n) of alpha_c Y_c + beta_c Yd_c by w and wd."""
-        return (2.0 * (Yd[1] - w[0] * Y[0]))[None], Y[1:]
+        return self._contracted(w, Y) - 2.0 * self.axial(Yd), -self.axial(Y)
 
-    @staticmethod
-    def rotated(R: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return angular velocities in other components: the same."""
-        return w
+    def rotated(self, R: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return angular velocities (r, ..., n) in other components; in the plane the same."""
+        return w if self.r == 1 else product(R, w)
 
-    @staticmethod
-    def rotation_vector(R: np.ndarray) -> np.ndarray:
-        """Return the angles (1, n) of rotations (2, 2, n), from -pi to pi."""
-        return np.arctan2(R[1, 0], R[0, 0])[None]
-
-    @staticmethod
-    def softness(B: np.ndarray, K: np.ndarray, point: np.ndarray) -> float:
-        """Return how far an interface of modes B (3, q) at `point` goes by a unit force across."""
-        # Or a third of the arm's length squared times its rotation by a unit moment, which is the
-        # same of a cantilever, and not zero of an arm whose frame is its chord.
-        soft = B @ np.linalg.solve(K, B.T)
-        return max(float(soft[1, 1]), float(soft[2, 2]) * float(point @ point) / 3.0)
-
-
-_TRANSPOSED = np.arange(9).reshape(3, 3).T.ravel()
-
-
-class Space:
-    """d = 3: E_ab has a one at (a, b)."""
-
-    d, r, g, b = 3, 3, 9, 6
-    loads = np.arange(12)
-    trace = np.eye(3).reshape(9, 1)
-
-    @staticmethod
-    def skew(axis: np.ndarray) -> np.ndarray:
-        """Return w~ (3, 3) of one angular velocity (3,), or (3, 3, n)."""
-        x, y, z = axis
-        out = np.zeros((3, *axis.shape), dtype=axis.dtype)
-        out[0, 1], out[0, 2], out[1, 2] = -z, y, -x
-        out[1, 0], out[2, 0], out[2, 1] = z, -y, x
+    def turn(self, R: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return vectors and what follows them, angular velocities, in other components."""
+        if self.r == 1:
+            return np.concatenate([product(R, x[:2]), x[2:]])
+        rows = x.reshape(-1, 3, *x.shape[1:])
+        out: np.ndarray = np.einsum("ij...,kj...->ki...", R, rows).reshape(x.shape)
         return out
 
-    @staticmethod
-    def transposed(x: np.ndarray) -> np.ndarray:
-        """Return the entries (9, ..., n) of the transposed matrices."""
-        return x[_TRANSPOSED]
-
-    @staticmethod
-    def alpha(w: np.ndarray, wd: np.ndarray) -> np.ndarray:
-        """Return the entries (9, n) of A."""
-        A = w[:, None] * w
-        x, y, z = A[0, 0].copy(), A[1, 1].copy(), A[2, 2].copy()
-        A[0, 0], A[1, 1], A[2, 2] = -(y + z), -(x + z), -(x + y)
-        _add_skew(A, wd)
-        return A.reshape(9, -1)
-
-    @staticmethod
-    def beta(w: np.ndarray) -> np.ndarray:
-        """Return the entries (9, n) of 2 Omega."""
-        return Space.skew(2.0 * w).reshape(9, -1)
-
-    @staticmethod
-    def apply(alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return A p (3, ..., n)."""
-        return product(alpha.reshape(3, 3, -1), p)
-
-    @staticmethod
-    def applied_transposed(alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return A' p (3, n)."""
-        return transposed_product(alpha.reshape(3, 3, -1), p)
-
-    @staticmethod
-    def velocity(w: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return w x p (3, ..., n)."""
-        first = w[1] * p[2] - w[2] * p[1]
-        out = np.empty((3, *first.shape), dtype=first.dtype)
-        out[0] = first
-        np.subtract(w[2] * p[0], w[0] * p[2], out=out[1])
-        np.subtract(w[0] * p[1], w[1] * p[0], out=out[2])
+    def shifted(self, p: np.ndarray, load: np.ndarray) -> np.ndarray:
+        """Return a load (d + r, n) at p about the origin."""
+        out = load.copy()
+        out[self.d :] += self.moment(p, load[: self.d])
         return out
 
-    moment = commutator = velocity
-
-    @staticmethod
-    def by_spin(p: np.ndarray) -> np.ndarray:
-        """Return the derivative of w x p by w (3, 3, n)."""
-        return Space.skew(-p)
-
-    @staticmethod
-    def centripetal_by_spin(w: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return the derivative of A p by w, w p' + (w . p) 1 - 2 p w' (3, 3, n)."""
-        out = w[:, None] * p - 2.0 * (p[:, None] * w)
-        out[[0, 1, 2], [0, 1, 2]] += (w * p).sum(axis=0)
-        return out
-
-    @staticmethod
-    def torque(alpha: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the moment axial(G A') (3, ..., n)."""
-        A, pairs = alpha.reshape(3, 3, -1), G.reshape(3, 3, *G.shape[1:])
-        found = np.einsum("bcn,ac...n->ab...n", A, pairs)
-        return Space.axial(found.reshape(9, *found.shape[2:]))
-
-    @staticmethod
-    def axial(G: np.ndarray) -> np.ndarray:
-        """Return (G_yz - G_zy, G_zx - G_xz, G_xy - G_yx) (3, ..., n)."""
-        return np.stack([G[5] - G[7], G[6] - G[2], G[1] - G[3]])
-
-    @staticmethod
-    def turned(w: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return (w~)' y (9, ..., n), of which `torque` is the adjoint."""
-        rows = y.reshape(3, 3, *y.shape[1:])
-        out = Space.velocity(-w, rows)
-        return out.reshape(y.shape)
-
-    @staticmethod
-    def torque_by_spin(
-        w: np.ndarray, G: np.ndarray, H: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives (3, 3, n) of torque(alpha, G) + torque(beta, H) by w and wd."""
-        diagonal = [0, 1, 2], [0, 1, 2]
-        inertia, trace = -G.reshape(3, 3, -1), G[::4].sum(axis=0)
-        inertia[diagonal] += trace
-        by_w = Space.velocity(w, inertia)  # of every column
-        _add_skew(by_w, -product(inertia, w))
-        by_w -= 2.0 * H.reshape(3, 3, -1).swapaxes(0, 1)
-        by_w[diagonal] += 2.0 * H[::4].sum(axis=0)
-        return by_w, inertia
-
-    @staticmethod
-    def contracted_by_spin(
-        w: np.ndarray, Y: np.ndarray, Yd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives (3, q, n) of alpha_c Y_c + beta_c Yd_c by w and wd."""
-        rows = Y.reshape(3, 3, *Y.shape[1:])
-        by_w = np.einsum("an,abkn->bkn", w, rows + rows.swapaxes(0, 1))
-        by_w -= 2.0 * (w[:, None] * Y[::4].sum(axis=0))
-        by_w -= 2.0 * Space.axial(Yd)
-        return by_w, -Space.axial(Y)
-
-    @staticmethod
-    def rotated(R: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return R w (3, ..., n)."""
-        return product(R, w)
-
-    @staticmethod
-    def rotation_vector(R: np.ndarray) -> np.ndarray:
-        """Return the rotation vectors (3, n) of rotations (3, 3, n), at most pi long."""
+    def rotation_vector(self, R: np.ndarray) -> np.ndarray:
+        """Return the rotation vectors (r, n) of rotations (d, d, n), at most pi long."""
         from scipy.spatial.transform import Rotation  # takes as long to import as NumPy
 
+        if self.r == 1:
+            return np.arctan2(R[1, 0], R[0, 0])[None]
         out: np.ndarray = Rotation.from_matrix(np.moveaxis(R, -1, 0)).as_rotvec().T
         return out
 
-    @staticmethod
-    def softness(B: np.ndarray, K: np.ndarray, point: np.ndarray) -> float:
-        """Return how far an interface of modes B (6, q) goes by a unit force, at most."""
-        soft = B[:3] @ np.linalg.solve(K, B[:3].T)
-        return float(np.linalg.eigvalsh(0.5 * (soft + soft.T))[-1])
+    def softness(self, B: np.ndarray, K: np.ndarray, point: np.ndarray) -> float:
+        """Return how far an interface of modes B (b, q) at `point` goes by a unit force, at most.
 
-
-def _add_skew(A: np.ndarray, v: np.ndarray) -> None:
-    """Add v~ to matrices (3, 3, n)."""
-    A[0, 1] -= v[2]
-    A[1, 0] += v[2]
-    A[2, 0] -= v[1]
-    A[0, 2] += v[1]
-    A[1, 2] -= v[0]
-    A[2, 1] += v[0]
+        In the plane across, or a third of the arm's length squared times its rotation by a unit
+        moment, which is the same of a cantilever, and not zero of an arm whose frame is its chord.
+        """
+        soft = B @ np.linalg.solve(K, B.T)
+        if self.r == 1:
+            return max(float(soft[1, 1]), float(soft[2, 2]) * float(point @ point) / 3.0)
+        return float(np.linalg.eigvalsh(0.5 * (soft + soft.T)[:3, :3])[-1])
 
 
 class PlaneTurning:
@@ -394,20 +277,20 @@ class SpaceTurning:
         theta, v = self.theta, self.rate
         along = 2.0 * (theta * v).sum(axis=0)
         first, second = self._first
-        turned = Space.velocity(theta, v)
-        bent = (along * first) * turned + (along * second) * Space.velocity(theta, turned)
-        return self.jacobian_times(self.second) + bent + self._c[3] * Space.velocity(v, turned)
+        turned = SPACE.velocity(theta, v)
+        bent = (along * first) * turned + (along * second) * SPACE.velocity(theta, turned)
+        return self.jacobian_times(self.second) + bent + self._c[3] * SPACE.velocity(v, turned)
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray:
         """Return the derivative of J v by theta (3, 3, n); of J' v with `sign` = -1."""
         theta, c = self.theta, self._c
         x, along = (theta * theta).sum(axis=0), (theta * v).sum(axis=0)
         first, second = self._first
-        turned = 2.0 * sign * first * Space.velocity(theta, v)
+        turned = 2.0 * sign * first * SPACE.velocity(theta, v)
         turned += 2.0 * second * (along * theta - x * v) - 2.0 * c[3] * v
         out = turned[:, None] * theta + (c[3] * theta)[:, None] * v
         out[[0, 1, 2], [0, 1, 2]] += c[3] * along
-        _add_skew(out, -sign * c[2] * v)
+        out += SPACE.skew(-sign * c[2] * v)
         return out
 
     @cached_property
@@ -416,14 +299,14 @@ class SpaceTurning:
         theta, v, c = self.theta, self.rate, self._c
         x, s, square = (theta * theta).sum(axis=0), (theta * v).sum(axis=0), (v * v).sum(axis=0)
         (d2, d3), (dd2, dd3) = self._first, self._second
-        turned, plane = Space.velocity(theta, v), s * theta - x * v
+        turned, plane = SPACE.velocity(theta, v), s * theta - x * v
         left = 4.0 * s * (dd2 * turned + dd3 * plane) + 2.0 * d3 * (square * theta - 2.0 * s * v)
         out = self.by_theta(self.second) + left[:, None] * theta
         left = 2.0 * d2 * turned + 2.0 * d3 * (plane + s * theta) - c[3] * v
         out += left[:, None] * v
         out -= (2.0 * d3 * s * v)[:, None] * theta
         out[[0, 1, 2], [0, 1, 2]] += c[3] * square + 2.0 * d3 * s * s
-        _add_skew(out, -2.0 * d2 * s * v)
+        out += SPACE.skew(-2.0 * d2 * s * v)
         return out
 
     @cached_property
@@ -433,7 +316,7 @@ class SpaceTurning:
         s = (theta * v).sum(axis=0)
         first, second = self._first
         out = self.by_theta(v)
-        _add_skew(out, c[2] * v + 2.0 * s * first * theta)
+        out += SPACE.skew(c[2] * v + 2.0 * s * first * theta)
         # theta~ theta~ = theta theta' - x, theta~ v~ + v~ theta~ = v theta' + theta v' - 2 s
         x = (theta * theta).sum(axis=0)
         out += (2.0 * s * second * theta + c[3] * v)[:, None] * theta
@@ -446,7 +329,7 @@ def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
     """Return 1 + c_k theta~ + c_(k+1) theta~^2 (3, 3, n)."""
     out = (c[k + 1] * theta)[:, None] * theta
     out[[0, 1, 2], [0, 1, 2]] += 1.0 - c[k + 1] * (theta * theta).sum(axis=0)
-    _add_skew(out, c[k] * theta)
+    out += SPACE.skew(c[k] * theta)
     return out
 
 
@@ -486,10 +369,12 @@ def _derivative(c: list[np.ndarray], k: int) -> np.ndarray:
     return 0.5 * (k * c[k + 2] - c[k + 1])
 
 
-Dimension: TypeAlias = "type[Plane] | type[Space]"
 Turning: TypeAlias = "PlaneTurning | SpaceTurning"
 
-DIMENSIONS: dict[int, tuple[Dimension, Callable[..., Turning]]] = {
-    2: (Plane, PlaneTurning),
-    3: (Space, SpaceTurning),
-}
+_PERMUTED = np.cross(np.eye(3)[:, None], np.eye(3))  # S_r = e_r~, of which this is the transpose
+_QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
+PLANE = Dimension(np.stack([np.eye(2), _QUARTER]), _QUARTER[None], [0, 1, 3, 2], PlaneTurning)
+SPACE = Dimension(
+    np.eye(9).reshape(9, 3, 3), _PERMUTED.swapaxes(1, 2), list(range(12)), SpaceTurning
+)
+DIMENSIONS = {2: PLANE, 3: SPACE}

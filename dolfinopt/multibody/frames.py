@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Load, Motion
+from dolfinopt.multibody.body import BodyMotion, Motion
 from dolfinopt.multibody.dimension import (
     DIMENSIONS,
     Dimension,
@@ -65,17 +65,16 @@ class MotionTransform:
         kept = np.r_[0:d, d + r : d + 2 * r]
         return self.matrix[:, kept[:, None], kept].swapaxes(1, 2)
 
-    def transposed(self, by: Motion) -> Motion:
+    def transposed(self, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the carrying frame's motion from those by the carried one's."""
-        a, w, wd = by
-        back = self.turn.swapaxes(0, 1)
-        to = product(back, a), self.dim.rotated(back, w), self.dim.rotated(back, wd)
-        extra = (1, self.by_w, a), (2, self.by_wd, a), (1, self.turned, wd)
-        found = list(to)
-        for place, block, x in extra:
+        d, s = self.dim.d, self.dim.b  # where w and wd begin; (d + 2 r, n) both
+        back, a, wd = self.turn.swapaxes(0, 1), by[:d], by[s:]
+        found = self.dim.turn(back, by)
+        blocks = (d, s, self.by_w, a), (s, None, self.by_wd, a), (d, s, self.turned, wd)
+        for first, last, block, x in blocks:
             if block is not None:
-                found[place] = found[place] + transposed_product(block, x)
-        return found[0], found[1], found[2]
+                found[first:last] += transposed_product(block, x)
+        return found
 
 
 class Interface:
@@ -102,7 +101,7 @@ class Interface:
     def turning(self) -> Turning:
         """Its rotation against the body's frame."""
         theta = self.body.conjugates[self.places][self.dim.d :]
-        return self.body.constants.turning(theta[:, 0], theta[:, 1], theta[:, 2])
+        return self.body.constants.dim.turning(theta[:, 0], theta[:, 1], theta[:, 2])
 
     @cached_property
     def _unturned(self) -> Motion:
@@ -127,41 +126,38 @@ class Interface:
         back = self.turning.R.swapaxes(0, 1)
         return product(back, a), self.dim.rotated(back, w), self.dim.rotated(back, wd)
 
-    def in_body(self, load: Load) -> Load:
+    def in_body(self, load: np.ndarray) -> np.ndarray:
         """Return a load on the interface, in its components, in those of the body."""
-        if not self.body.is_flexible:
-            return load
-        R = self.turning.R
-        return product(R, load[0]), self.dim.rotated(R, load[1])
+        return self.dim.turn(self.turning.R, load) if self.body.is_flexible else load
 
-    def at_origin(self, load: Load) -> Load:
+    def at_origin(self, load: np.ndarray) -> np.ndarray:
         """Return a load on the interface, in the body's components, about the body's origin."""
-        return load[0], load[1] + self.dim.moment(self.place, load[0])
+        return self.dim.shifted(self.place, load)
 
-    def load_coefficients(self, load: Load) -> np.ndarray:
+    def load_coefficients(self, load: np.ndarray) -> np.ndarray:
         """Return what works on (u, theta) (b, n): force and J' moment, of `in_body`."""
-        return np.concatenate([load[0], self.turning.jacobian_transposed(load[1])])
+        d = self.dim.d
+        return np.concatenate([load[:d], self.turning.jacobian_transposed(load[d:])])
 
-    def virtual(self, body: Load, zeta: np.ndarray) -> Load:
-        """Return its virtual displacement and rotation, the body's components.
+    def virtual(self, body: np.ndarray, zeta: np.ndarray) -> np.ndarray:
+        """Return its virtual displacement and rotation (d + r, n), the body's components.
 
         Args:
             body: those of the body's frame.
             zeta: (q, n) virtual coordinates.
         """
-        p, phi = body
-        p = p + self.dim.velocity(phi, self.place)
-        if not self.body.is_flexible:
-            return p, phi
-        moved = np.einsum("pkn,kn->pn", self.body.V[self.places], zeta)
-        return p + moved[: self.dim.d], phi + self.turning.jacobian_times(moved[self.dim.d :])
+        d, out = self.dim.d, body.copy()
+        out[:d] += self.dim.velocity(body[d:], self.place)
+        if self.body.is_flexible:
+            moved = np.einsum("pkn,kn->pn", self.body.V[self.places], zeta)
+            out += np.concatenate([moved[:d], self.turning.jacobian_times(moved[d:])])
+        return out
 
-    def in_interface(self, load: Load) -> Load:
+    def in_interface(self, x: np.ndarray) -> np.ndarray:
         """Return vectors of the body's components in those of the interface."""
         if not self.body.is_flexible:
-            return load
-        back = self.turning.R.swapaxes(0, 1)
-        return product(back, load[0]), self.dim.rotated(back, load[1])
+            return x
+        return self.dim.turn(self.turning.R.swapaxes(0, 1), x)
 
     # -- derivatives: arrays (d + 2 r, ..., n) of motions, (d + r, ..., n) of loads -----------
 
@@ -227,42 +223,36 @@ class Interface:
             if by_theta is not None:
                 by_e[d + r :] += product(by_theta[2], Bd[d:])
         back = self.turning.R.swapaxes(0, 1)
-        parts = out[:d], out[d : d + r], out[d + r :]
-        return np.concatenate([product(back, parts[0]), *(dim.rotated(back, x) for x in parts[1:])])
+        return dim.turn(back, out)
 
-    def by_displacement(self, by: Motion) -> Motion:
-        """Return derivatives by (u, theta), their rates and second ones, each (b, n).
+    def by_displacement(self, by: np.ndarray) -> np.ndarray:
+        """Return derivatives by (u, theta), their rates and second ones (b, 3, n).
 
-        Those by its motion, in its components, are given; of a flexible body.
+        Those by its motion, in its components (d + 2 r, n), are given; of a flexible body.
         """
         body, dim, turning = self.body, self.dim, self.turning
-        a, w, wd = product(turning.R, by[0]), *(dim.rotated(turning.R, x) for x in by[1:])
+        a, w, wd = np.split(dim.turn(turning.R, by), [dim.d, dim.b])
         own_a, own_w, own_wd = self._unturned
         turn = dim.commutator(w, own_w) + dim.commutator(wd, own_wd) - dim.moment(own_a, a)
-        value, rate, second = (
-            turning.jacobian_transposed(turn),
-            turning.jacobian_transposed(w),
-            turning.jacobian_transposed(wd),
-        )
+        out = np.empty((dim.b, 3, a.shape[1]))
+        out[: dim.d, 0] = dim.applied_transposed(body.alpha, a)
+        out[: dim.d, 1], out[: dim.d, 2] = dim.applied_transposed(body.beta, a), a
+        out[dim.d :] = turning.jacobian_transposed(np.stack([turn, w, wd], axis=1))
         if (by_theta := self._by_theta) is not None:
             of_w, of_wd, of_rate = by_theta
-            value = value + transposed_product(of_w, w) + transposed_product(of_wd, wd)
-            rate = rate + transposed_product(of_rate, wd)
-        return (
-            np.concatenate([dim.applied_transposed(body.alpha, a), value]),
-            np.concatenate([dim.applied_transposed(body.beta, a), rate]),
-            np.concatenate([a, second]),
-        )
+            out[dim.d :, 0] += transposed_product(of_w, w) + transposed_product(of_wd, wd)
+            out[dim.d :, 1] += transposed_product(of_rate, wd)
+        return out
 
-    def load_by_rates(self, load: Load, kept: np.ndarray) -> np.ndarray:
+    def load_by_rates(self, load: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return the derivative of `in_body` by those e kept (d + r, k, n); `load` its result."""
-        dim = self.dim
-        phi = self.turning.jacobian_times(self.body.V[self.places][self.dim.d :, kept])
-        return np.concatenate([dim.velocity(phi, load[0]), dim.commutator(phi, load[1])])
+        dim, d = self.dim, self.dim.d
+        phi = self.turning.jacobian_times(self.body.V[self.places][d:, kept])
+        return np.concatenate([dim.velocity(phi, load[:d]), dim.commutator(phi, load[d:])])
 
-    def coefficients_by_e(self, load: Load, kept: np.ndarray) -> np.ndarray | None:
+    def coefficients_by_e(self, load: np.ndarray, kept: np.ndarray) -> np.ndarray | None:
         """Return the derivative of J' moment by those e kept (r, k, n); None: zero."""
-        by_theta = self.turning.by_theta(load[1], -1.0)
+        by_theta = self.turning.by_theta(load[self.dim.d :], -1.0)
         if by_theta is None:
             return None
         return product(by_theta, self.body.V[self.places][self.dim.d :, kept])
@@ -276,8 +266,7 @@ class Interface:
     @cached_property
     def rows_by_own_load(self) -> np.ndarray:
         """Derivative of the rows by a load in its own components (d + r, q, n)."""
-        d = self.dim.d
-        return np.concatenate(self.in_interface((self.rows_by_load[:d], self.rows_by_load[d:])))
+        return self.in_interface(self.rows_by_load)
 
 
 class MovingJoint:
@@ -293,7 +282,7 @@ class MovingJoint:
     def __init__(self, joint: Joint, inner: Motion, rates: np.ndarray | None) -> None:
         """Take the interface's motion, and the coordinate with its rates (3, n) if there is one."""
         self.joint, self.inner, self.rates = joint, inner, rates
-        self.dim = DIMENSIONS[len(joint.origin)][0]
+        self.dim = DIMENSIONS[len(joint.origin)]
         self.slides = joint.kind == "prismatic"
         self.R, self.r = joint.rotation, joint.origin[:, None]
         if rates is None:
@@ -339,33 +328,35 @@ class MovingJoint:
             wd = wd + dim.commutator(w, self._rate)
         return a, w + self._rate, wd + second
 
-    def at_interface(self, load: Load) -> Load:
+    def at_interface(self, load: np.ndarray) -> np.ndarray:
         """Return a load on the body's frame as the interface feels it, in its components."""
-        force, moment = product(self.R, load[0]), self.dim.rotated(self.R, load[1])
-        if self.is_offset:
-            moment = moment + self.dim.moment(self.r, force)
-        return force, moment
+        out = self.dim.turn(self.R, load)
+        return self.dim.shifted(self.r, out) if self.is_offset else out
 
-    def drive(self, load: Load) -> np.ndarray:
+    @property
+    def along(self) -> slice:
+        """Where the joint's axis stands in loads and virtual displacements."""
+        return slice(self.dim.d) if self.slides else slice(self.dim.d, None)
+
+    def drive(self, load: np.ndarray) -> np.ndarray:
         """Return what the drive gives (..., n), N m or N, of a load on the body's frame."""
-        return np.tensordot(self.joint.axis, load[0 if self.slides else 1], 1)
+        return np.tensordot(self.joint.axis, load[self.along], 1)
 
-    def virtual(self, interface: Load, drive: np.ndarray | None) -> Load:
-        """Return displacement and rotation of the body's frame, its components.
+    def virtual(self, interface: np.ndarray, drive: np.ndarray | None) -> np.ndarray:
+        """Return displacement and rotation (d + r, n) of the body's frame, its components.
 
         Args:
             interface: those of the interface.
             drive: (n,) virtual coordinate.
         """
-        p, phi = interface
+        d, moved = self.dim.d, interface
         if self.is_offset:
-            p = p + self.dim.velocity(phi, self.r)
-        back = self.R.swapaxes(0, 1)
-        p, phi = product(back, p), self.dim.rotated(back, phi)
-        if drive is None:
-            return p, phi
-        own = self.joint.axis[:, None] * drive
-        return (p + own, phi) if self.slides else (p, phi + own)
+            moved = interface.copy()
+            moved[:d] += self.dim.velocity(interface[d:], self.r)
+        out = self.dim.turn(self.R.swapaxes(0, 1), moved)
+        if drive is not None:
+            out[self.along] += self.joint.axis[:, None] * drive
+        return out
 
     # -- derivatives -------------------------------------------------------------------------
 
@@ -403,19 +394,15 @@ class MovingJoint:
         rate[d : d + r], rate[d + r :], second[d + r :] = axis, turned, axis
         return value, rate, second
 
-    def load_by_joint(self, load: Load) -> np.ndarray:
+    def load_by_joint(self, load: np.ndarray) -> np.ndarray:
         """Return the derivative of `at_interface` by the coordinate (d + r, n)."""
-        dim, R = self.dim, self.R
-        along = np.broadcast_to(self.joint.axis[:, None], (len(self.joint.axis), load[0].shape[1]))
+        dim, d, out = self.dim, self.dim.d, np.zeros_like(load)
+        along = np.broadcast_to(self.joint.axis[:, None], (len(self.joint.axis), load.shape[1]))
         if self.slides:
-            axis = self.joint.rotation @ along
-            force = np.zeros_like(load[0])
-            return np.concatenate([force, dim.moment(axis, product(R, load[0]))])
-        force = product(R, dim.velocity(along, load[0]))
-        moment = dim.rotated(R, dim.commutator(along, load[1]))
-        if self.is_offset:
-            moment = moment + dim.moment(self.r, force)
-        return np.concatenate([force, moment])
+            out[d:] = dim.moment(self.joint.rotation @ along, product(self.R, load[:d]))
+            return out
+        out[:d], out[d:] = dim.velocity(along, load[:d]), dim.commutator(along, load[d:])
+        return self.at_interface(out)
 
 
 class MovingRotor:
@@ -428,7 +415,7 @@ class MovingRotor:
         dh/dt = J s' n + w x J s n.
 
     Attributes:
-        load: force (zero) and moment on the interface (., n).
+        load: force (zero) and moment on the interface (d + r, n).
         force: of the motor (n,), N m, N.
     """
 
@@ -436,16 +423,16 @@ class MovingRotor:
         """Take the joint, the interface's motion, the motor's speed and acceleration (2, n)."""
         assert joint.rotor is not None
         a, self.w, wd = inner
-        self.dim = dim = DIMENSIONS[len(joint.origin)][0]
+        self.dim = dim = DIMENSIONS[len(joint.origin)]
         self.axis = dim.rotated(joint.rotation, joint.axis[:, None])
         self.inertia, self.ratio = joint.rotor.inertia, joint.rotor.ratio
         speed, change = ((self.axis * x).sum(axis=0) for x in (self.w, wd))
         self.momentum = self.inertia * (speed + self.ratio * rates[0])
         moment = self.inertia * (change + self.ratio * rates[1])
         self.force = self.ratio * moment
-        self.load = np.zeros_like(a), self.axis * moment
+        self.load = np.concatenate([np.zeros_like(a), self.axis * moment])
         if dim.r > 1:
-            self.load = self.load[0], self.load[1] + self._gyroscopic(self.momentum)
+            self.load[dim.d :] += self._gyroscopic(self.momentum)
 
     def _gyroscopic(self, momentum: np.ndarray | float) -> np.ndarray:
         """Return w x n times a momentum (r, n): zero in the plane."""

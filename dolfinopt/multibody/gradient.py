@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Load, Motion, Weights
-from dolfinopt.multibody.frames import Interface
+from dolfinopt.multibody.body import BodyMotion
+from dolfinopt.multibody.frames import Interface, MovingRotor
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -45,16 +45,15 @@ def body_gradient(
     loads = inward_pass(tree, links)
     zeta = np.ascontiguousarray(multipliers.T)
     moves, ends = _virtual_motion(tree, links, zeta, drives)
-    by_motion: dict[int, Motion] = {}
+    by_motion: dict[int, np.ndarray] = {}
     by_rotation = _by_rotation(tree, links, moves, zeta)
     gradient: dict[int, ShapeIntegrals] = {}
     for i in reversed(tree.order):
         link, own = links[i], zeta[tree.slices[i]]
         by = [_motion_gradient(link.body, moves[i])]
-        outboard: dict[int, Weights] = {}
+        outboard: dict[int, np.ndarray] = {}
         if link.body.is_flexible:
-            of_rows = np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
-            by.append(_split(link.body, of_rows))
+            by.append(np.einsum("mqn,qn->mn", link.body.rows_by_motion, own))
         for s, interface in link.interfaces.items():
             parts = [links[k].joint.passage.transposed(by_motion[k]) for k in tree.hanging[i, s]]
             parts += [
@@ -64,9 +63,9 @@ def body_gradient(
             ]
             if s in link.carried:
                 parts.append(_motion_gradient(link.carried[s], ends[i, s]))
-            displaced = (np.zeros((link.body.dim.b, zeta.shape[1])),) * 3
+            displaced = np.zeros((link.body.dim.b, 3, zeta.shape[1]))
             if parts:
-                on_interface = _sum_motions(parts)
+                on_interface = np.sum(parts, axis=0)
                 by.append(interface.passage.transposed(on_interface))
                 if link.body.is_flexible:
                     displaced = interface.by_displacement(on_interface)
@@ -74,14 +73,14 @@ def body_gradient(
                 both = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
                 outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
                 if (i, s) in by_rotation:
-                    outboard[s].value[link.body.dim.d :] += by_rotation[i, s]
-        by_motion[i] = _sum_motions(by)
+                    outboard[s][link.body.dim.d :, 0] += by_rotation[i, s]
+        by_motion[i] = np.sum(by, axis=0)
         gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
     return [gradient[i] for i in range(len(links))]
 
 
 def _by_rotation(
-    tree: Mechanism, links: list[Link], moves: dict[int, Load], zeta: np.ndarray
+    tree: Mechanism, links: list[Link], moves: dict[int, np.ndarray], zeta: np.ndarray
 ) -> dict[Site, np.ndarray]:
     """Return the derivatives by every interface's theta (r, n) through forces of the world."""
     # What turns a body turns such a force the other way in the body's components.
@@ -102,43 +101,30 @@ def _by_rotation(
                 found[i, s] = interface.turning.jacobian_transposed(turned)
             total += turned
             if s in link.applied:
-                p, phi = interface.virtual(moves[i], own)
-                force, moment = link.applied[s].in_world
-                total -= dim.moment(force, p) + dim.commutator(moment, phi)
+                given, moved = link.applied[s].in_world, interface.virtual(moves[i], own)
+                total -= dim.moment(given[: dim.d], moved[: dim.d])
+                total -= dim.commutator(given[dim.d :], moved[dim.d :])
         of_bodies[i] = total
     return found
 
 
-def _motion_gradient(body: BodyMotion, virtual: Load) -> Motion:
-    """Return the derivatives of virtual . (F, T) by a body's motion."""
-    return _split(body, np.einsum("ijn,in->jn", body.load_by_motion, np.concatenate(virtual)))
+def _motion_gradient(body: BodyMotion | MovingRotor, virtual: np.ndarray) -> np.ndarray:
+    """Return the derivatives of virtual . (F, T) by a motion (d + 2 r, n)."""
+    return np.asarray(np.einsum("ijn,in->jn", body.load_by_motion, virtual))
 
 
-def _rotor_gradient(link: Link, virtual: Load, drive: np.ndarray) -> Motion:
+def _rotor_gradient(link: Link, virtual: np.ndarray, drive: np.ndarray) -> np.ndarray:
     """Return the derivatives by the motion of what carries a rotor; `drive` (n,) is its motor's."""
     assert link.rotor is not None
-    by = np.einsum("ijn,in->jn", link.rotor.load_by_motion, np.concatenate(virtual))
-    return _split(link.body, by + link.rotor.force_by_motion[:, None] * drive)
-
-
-def _split(body: BodyMotion, x: np.ndarray) -> Motion:
-    d, r = body.dim.d, body.dim.r
-    return x[:d], x[d : d + r], x[d + r :]
-
-
-def _sum_motions(parts: list[Motion]) -> Motion:
-    a, w, wd = parts[0]
-    for one in parts[1:]:
-        a, w, wd = a + one[0], w + one[1], wd + one[2]
-    return a, w, wd
+    return _motion_gradient(link.rotor, virtual) + link.rotor.force_by_motion[:, None] * drive
 
 
 def _virtual_motion(
     tree: Mechanism, links: list[Link], zeta: np.ndarray, of_forces: np.ndarray
-) -> tuple[dict[int, Load], dict[Site, Load]]:
+) -> tuple[dict[int, np.ndarray], dict[Site, np.ndarray]]:
     """Return displacement and rotation of every frame and outboard interface, in its components."""
-    moves: dict[int, Load] = {}
-    ends: dict[Site, Load] = {}
+    moves: dict[int, np.ndarray] = {}
+    ends: dict[Site, np.ndarray] = {}
     ground = tree.virtual_ground(of_forces)
     for i in tree.order:
         link, joint = links[i], tree.joints[i]
@@ -146,31 +132,33 @@ def _virtual_motion(
         drive = None if joint.coordinate is None else of_forces[:, joint.coordinate]
         moves[i] = link.joint.virtual(inner, drive)
         for s, interface in link.interfaces.items():
-            p, phi = interface.virtual(moves[i], zeta[tree.slices[i]])
-            ends[i, s] = interface.in_interface((p, phi))
+            moved = interface.virtual(moves[i], zeta[tree.slices[i]])
+            ends[i, s] = interface.in_interface(moved)
     return moves, ends
 
 
 def _interface_weights(
     interface: Interface,
-    loads: tuple[Load, Load],
-    virtual: Load,
+    loads: tuple[np.ndarray, np.ndarray],
+    virtual: np.ndarray,
     zeta: np.ndarray,
-    displaced: Motion,
-) -> Weights:
-    """Return the derivatives (b, n) by (u, theta), their rates and variation."""
+    displaced: np.ndarray,
+) -> np.ndarray:
+    """Return the derivatives (b, 4, n) by (u, theta), their rates and variation."""
     # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
     # frame, zeta (q, n) its multipliers; `displaced` are those by (u, theta) and their rates
     # through the interface's motion.
-    load, (own_force, own_moment) = loads
-    (force, moment), dim, turning = load, interface.dim, interface.turning
-    p, phi = interface.virtual(virtual, zeta)
+    (load, own), dim, turning, d = loads, interface.dim, interface.turning, interface.dim.d
+    moved = interface.virtual(virtual, zeta)
     # The load's lever, its components, and J' of the row.
-    turned = turning.jacobian_transposed(dim.moment(own_force, p) + dim.commutator(own_moment, phi))
-    by_theta = turning.by_theta(moment, -1.0)
+    turned = turning.jacobian_transposed(
+        dim.moment(own[:d], moved[:d]) + dim.commutator(own[d:], moved[d:])
+    )
+    by_theta = turning.by_theta(load[d:], -1.0)
     if by_theta is not None:
-        theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][dim.d :], zeta)
+        theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][d:], zeta)
         turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
-    value, rate, second = displaced
-    value = value + np.concatenate([-dim.velocity(virtual[1], force), turned])
-    return Weights(value, rate, second, interface.load_coefficients(load))
+    weights = np.concatenate([displaced, interface.load_coefficients(load)[:, None]], axis=1)
+    weights[:d, 0] -= dim.velocity(virtual[d:], load[:d])
+    weights[d:, 0] += turned
+    return weights

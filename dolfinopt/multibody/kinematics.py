@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import Constants, Load
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.dimension import Turning, compose, product
 from dolfinopt.multibody.frames import MovingJoint
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -36,7 +36,7 @@ class Section:
             self.bent = np.tensordot(constants.K0[places], e, 1)
             moved -= 0.5 * np.einsum("pkn,kn->pn", self.bent, e)
         self.place = self.place + moved[:d]
-        self.turning = constants.turning(*(moved[d:],) * 3)  # of its rates none is asked for
+        self.turning = constants.dim.turning(*(moved[d:],) * 3)  # of its rates none is asked for
 
 
 class Posed:
@@ -89,8 +89,8 @@ class SiteMotion:
     Attributes:
         place: (d, n) of the joint's frame, m.
         R: (d, d, n) or (d, d), its rotation.
-        by_place, by_spin: (d, C, n), (r, C, n) displacement and rotation by every coordinate, in
-            the ground's frame.
+        by: (d + r, C, n) displacement and rotation by every coordinate, in the ground's frame;
+            by_place, by_spin its parts.
         order: (C,) how far out a coordinate acts; -1: not on the way to the site.
     """
 
@@ -100,7 +100,8 @@ class SiteMotion:
         self.dim = dim = mechanism.dim
         count = len(posed.q)
         size = mechanism.num_rigid + mechanism.num_coordinates
-        self.by_place, self.by_spin = np.zeros((dim.d, size, count)), np.zeros((dim.r, size, count))
+        self.by = np.zeros((dim.b, size, count))
+        self.by_place, self.by_spin = self.by[: dim.d], self.by[dim.d :]
         self.order = np.full(size, -1)
         self.way = () if site is None else mechanism.way_to(site)
         if site is None:
@@ -159,19 +160,13 @@ class SiteMotion:
         found = product(self.R, v[:, None])
         return np.broadcast_to(found, (self.dim.d, len(self.posed.q)))
 
-    def generalised_force(self, load: Load) -> np.ndarray:
-        """Return what a force and a moment (., n), the ground's components, do on every coordinate.
+    def generalised_force(self, load: np.ndarray) -> np.ndarray:
+        """Return what force and moment (d + r, n), the ground's components, do on all (n, C)."""
+        return np.asarray(np.einsum("bn,bcn->nc", load, self.by))
 
-        (n, C).
-        """
-        force, moment = load
-        found = np.einsum("dn,dcn->nc", force, self.by_place)
-        return found + np.einsum("rn,rcn->nc", moment, self.by_spin)
-
-    def along(self, virtual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return displacement (d, n) and rotation (r, n) by virtual coordinates (n, C)."""
-        place = np.einsum("dcn,nc->dn", self.by_place, virtual)
-        return place, np.einsum("rcn,nc->rn", self.by_spin, virtual)
+    def along(self, virtual: np.ndarray) -> np.ndarray:
+        """Return displacement and rotation (d + r, n) by virtual coordinates (n, C)."""
+        return np.asarray(np.einsum("bcn,nc->bn", self.by, virtual))
 
     def acceleration(self, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return acceleration (d, n) and angular acceleration (r, n) at rates (n, R) alone.
@@ -189,13 +184,13 @@ class SiteMotion:
             w = w + spin
         return a, wd
 
-    def hessian(self, load: Load) -> np.ndarray:
+    def hessian(self, load: np.ndarray) -> np.ndarray:
         """Return the derivative (n, C, C) of `generalised_force` by the coordinates, the load held.
 
         Rows are the coordinates on which it works.
         """
-        (force, moment), dim = load, self.dim
-        s, order = self.by_spin, self.order
+        dim, s, order = self.dim, self.by_spin, self.order
+        force, moment = load[: dim.d], load[dim.d :]
         on_way = order >= 0
         inboard = on_way & (order[None] < order[:, None])  # [j, i]: i is inboard of j
         pulled = dim.moment(self.by_place, force[:, None])
@@ -213,9 +208,9 @@ class SiteMotion:
                 found[:, columns, columns] += self._own_hessian(i, number, load)
         return found
 
-    def _own_hessian(self, i: int, number: int, load: Load) -> np.ndarray:
+    def _own_hessian(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
         """Return the part (n, q, q) of one body's own deformation."""
-        (force, _), dim = load, self.dim
+        dim, force = self.dim, load[: self.dim.d]
         constants, section = self.posed.mechanism.constants[i], self.posed.section(i, number)
         assert section.turning is not None
         d, spin = dim.d, self.by_spin[:, self.columns(i)]
@@ -224,7 +219,7 @@ class SiteMotion:
         found = np.einsum("rkn,rln->nkl", spin, dim.moment(swung, force[:, None]))
         pull = self.interface_load(i, number, load)
         own = self._in_body(i, number, load)
-        by_theta = section.turning.by_theta(own[1], -1.0)
+        by_theta = section.turning.by_theta(own[d:], -1.0)
         if by_theta is not None:
             theta = self.modes(i, number)[d:]
             found += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
@@ -233,52 +228,93 @@ class SiteMotion:
             found -= np.einsum("pn,pkl->nkl", pull, K0)
         return found
 
-    def _in_body(self, i: int, number: int, load: Load) -> Load:
-        """Return force and moment about the interface of body i in its components."""
-        force, moment = load
-        back = self.posed.body(i)[2].swapaxes(0, 1)
-        lever = self.place - self.posed.interface(i, number)[0]
-        moment = moment + self.dim.moment(lever, force)
-        return product(back, force), self.dim.rotated(back, moment)
+    def load_on(self, point: np.ndarray, R: np.ndarray, load: np.ndarray) -> np.ndarray:
+        """Return force and moment about a point (d, n) in the components of a frame."""
+        return self.dim.turn(R.swapaxes(0, 1), self.dim.shifted(self.place - point, load))
 
-    def interface_load(self, i: int, number: int, load: Load) -> np.ndarray:
+    def _in_body(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
+        """Return force and moment about the interface of body i in its components."""
+        return self.load_on(self.posed.interface(i, number)[0], self.posed.body(i)[2], load)
+
+    def interface_load(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
         """Return what works on (u, theta) (b, n) of body i's interface on the way."""
         turning = self.posed.section(i, number).turning
         assert turning is not None
-        force, moment = self._in_body(i, number, load)
-        return np.concatenate([force, turning.jacobian_transposed(moment)])
+        own, d = self._in_body(i, number, load), self.dim.d
+        return np.concatenate([own[:d], turning.jacobian_transposed(own[d:])])
 
     def interface_load_along(
-        self, i: int, number: int, load: Load, change: Load, virtual: np.ndarray
+        self, i: int, number: int, load: np.ndarray, change: np.ndarray, virtual: np.ndarray
     ) -> np.ndarray:
         """Return the derivative of `interface_load` (b, n) along virtual coordinates (n, C).
 
         Args:
             i, number: as there.
-            load: (., n).
+            load: (d + r, n).
             change: its derivative along them.
             virtual: of all coordinates.
         """
-        dim, (force, moment) = self.dim, load
+        dim, d, force = self.dim, self.dim.d, load[: self.dim.d]
         section, columns = self.posed.section(i, number), self.columns(i)
         assert section.turning is not None
         outer = self.order[columns][0] if columns.stop > columns.start else 0
         lever = self.place - self.posed.interface(i, number)[0]
         inner, own = ((self.order >= 0) & (self.order < k) for k in (outer, outer + 1))
-        spin = self.along(virtual * inner)[1]
-        shift, swing = self.along(virtual * own)
-        moved = self.along(virtual)[0] - (shift - dim.velocity(swing, lever))
-        about = moment + dim.moment(lever, force)
-        changed = change[1] + dim.moment(moved, force) + dim.moment(lever, change[0])
+        spin, shifted = self.along(virtual * inner)[d:], self.along(virtual * own)
+        moved = (self.along(virtual) - shifted)[:d] + dim.velocity(shifted[d:], lever)
+        about = load[d:] + dim.moment(lever, force)
         back = self.posed.body(i)[2].swapaxes(0, 1)
-        by_force = product(back, change[0] - dim.velocity(spin, force))
+        by_force = product(back, change[:d] - dim.velocity(spin, force))
+        changed = change[d:] + dim.moment(moved, force) + dim.moment(lever, change[:d])
         by_moment = dim.rotated(back, changed - dim.commutator(spin, about))
         by = section.turning.jacobian_transposed(by_moment)
         by_theta = section.turning.by_theta(dim.rotated(back, about), -1.0)
         if by_theta is not None:
-            theta = np.einsum("rkn,nk->rn", self.modes(i, number)[dim.d :], virtual[:, columns])
+            theta = np.einsum("rkn,nk->rn", self.modes(i, number)[d:], virtual[:, columns])
             by = by + np.einsum("abn,bn->an", by_theta, theta)
         return np.concatenate([by_force, by])
+
+    def add_gradient(
+        self,
+        found: list[dict[str, np.ndarray]],
+        load: np.ndarray,
+        working: np.ndarray,
+        change: np.ndarray,
+        virtual: np.ndarray,
+    ) -> None:
+        """Add the derivative of load . motion + working . along(virtual) by the bodies.
+
+        Args:
+            found: see `no_gradient`.
+            load, working: (d + r, n).
+            change: that of `working` along the virtual coordinates.
+            virtual: (n, C).
+        """
+        mechanism, b = self.posed.mechanism, self.dim.b
+        for i, number in self.way:
+            if self.posed.section(i, number).turning is None:
+                continue
+            e, v = self.posed.q[:, mechanism.slices[i]], virtual[:, self.columns(i)]
+            rate = self.interface_load(i, number, working)
+            value = self.interface_load(i, number, load)
+            value = value + self.interface_load_along(i, number, working, change, virtual)
+            own = slice(b * number, b * (number + 1))
+            found[i]["outboard"][own] += value @ e + rate @ v
+            if "K0_outboard" in found[i]:
+                bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T
+                found[i]["K0_outboard"][own] -= bent @ e
+
+
+def no_gradient(mechanism: Mechanism) -> list[dict[str, np.ndarray]]:
+    """Return zero derivatives by every body's outboard modes and their geometric stiffness."""
+    # Under the names of the shape integrals, (b, q) and (b, q, q).
+    return [
+        {
+            name: np.zeros_like(getattr(body, name))
+            for name in ("outboard", "K0_outboard")[: 1 + body.is_stiffened]
+        }
+        for body in mechanism.bodies
+    ]
 
 
 # -- the end-effector: where it is, how far off the equivalent rigid machine's, derivatives -----
@@ -351,19 +387,9 @@ def end_effector_gradient(
     """
     posed, dim = Posed(mechanism, motion.q, q), mechanism.dim
     site = SiteMotion(posed, mechanism.end, np.zeros(dim.d), np.eye(dim.d))
-    load = weights.T, np.zeros((dim.r, len(q))) if moments is None else moments.T
-    by_all, by_bodies = site.generalised_force(load), []
-    for body in mechanism.bodies:
-        by_bodies.append({"outboard": np.zeros_like(body.outboard)})
-        if body.is_stiffened:
-            by_bodies[-1]["K0_outboard"] = np.zeros_like(body.K0_outboard)
-    for i, number in site.way:
-        if posed.section(i, number).turning is None:
-            continue
-        pull, e = site.interface_load(i, number, load), q[:, mechanism.slices[i]]
-        own = slice(dim.b * number, dim.b * (number + 1))
-        by_bodies[i]["outboard"][own] = pull @ e
-        if mechanism.bodies[i].is_stiffened:
-            by_bodies[i]["K0_outboard"][own] = -0.5 * (pull[:, None] * e.T) @ e
+    load, still = np.zeros((dim.b, len(q))), np.zeros((dim.b, len(q)))
+    load[: dim.d], load[dim.d :] = weights.T, 0.0 if moments is None else moments.T
+    by_all, by_bodies = site.generalised_force(load), no_gradient(mechanism)
+    site.add_gradient(by_bodies, load, still, still, np.zeros_like(by_all))
     by_rigid, by_q = np.split(by_all, [mechanism.num_rigid], axis=1)
     return by_q, by_rigid, by_bodies

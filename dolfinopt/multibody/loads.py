@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.multibody.body import Load
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.newton_euler import (
     NOTHING,
@@ -25,7 +24,10 @@ from dolfinopt.multibody.tree import Mechanism, Site
 
 
 def body_loads(
-    mechanism: Mechanism, motion: RigidMotion, rates: Rates, pull: Mapping[Site, Load] = NOTHING
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    rates: Rates,
+    pull: Mapping[Site, np.ndarray] = NOTHING,
 ) -> list[np.ndarray]:
     """Return what loads every body in the order of its K0 and K0_outboard (n, P).
 
@@ -41,12 +43,10 @@ def body_loads(
     return _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
 
 
-def _body_loads(links: list[Link], outboard: list[dict[int, Load]]) -> list[np.ndarray]:
+def _body_loads(links: list[Link], outboard: list[dict[int, np.ndarray]]) -> list[np.ndarray]:
     found = []
     for link, loads in zip(links, outboard, strict=True):
-        pulls = {s: np.concatenate(load) for s, load in loads.items()}
-        if link.body.is_flexible:
-            pulls = interface_coefficients(link, loads)
+        pulls = interface_coefficients(link, loads) if link.body.is_flexible else loads
         p, order = link.body.load_coefficients(pulls), link.body.dim.loads
         found.append(np.concatenate([p[order], p[len(order) :]]).T)
     return found
@@ -58,18 +58,25 @@ def is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
     return any(p.any() for p in body_loads(mechanism, motion, (rest, rest, rest)))
 
 
-def load_coefficients(mechanism: Mechanism, motion: RigidMotion, rates: Rates) -> list[np.ndarray]:
+def load_coefficients(
+    mechanism: Mechanism,
+    motion: RigidMotion,
+    rates: Rates,
+    pull: Mapping[Site, np.ndarray] = NOTHING,
+) -> list[np.ndarray]:
     """Return c (n, P + g q) of every body: what loads its nodes, as inertia acts.
 
+    In the plane (n, 7 + 2 q), in space (n, 18 + 9 q); m/s2, 1/s2, N, N m and modes per s2.
+
     c = -(p, alpha_c z + beta_c z' + trace_c z''), p of `body_loads`, c before the modes, z being
-    the displacement along them, see `body_motion`. See `dynamics.simulation`.
+    the displacement along them, see `body`. `pull` is that of `body_loads`.
     """
-    links = outward_pass(mechanism, motion, rates)
-    loads = _body_loads(links, inward_pass(mechanism, links).outboard)
+    links = outward_pass(mechanism, motion, rates, pull)
+    loads = _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
     found = []
     for link, p in zip(links, loads, strict=True):
-        elastic = link.body.accelerations(link.body.z)
-        found.append(-np.hstack([p, elastic.reshape(-1, len(p)).T]))
+        elastic = link.body.accelerations.reshape(-1, len(p))
+        found.append(-np.hstack([p, elastic.T]))
     return found
 
 
@@ -130,7 +137,7 @@ def _loads(
 ) -> list[np.ndarray]:
     """Return what loads every body (n, loads); in the plane a_x, a_y, wd, -w^2, F_x, F_y, T."""
     none = np.zeros((len(motion.q), 0))
-    pull: Mapping[Site, Load] = {}
+    pull: Mapping[Site, np.ndarray] = {}
     if loops is not None and dependent is not None:
         forces = inverse_dynamics(rigid, motion, none, none, none)[1]
         here = loops.at(rigid, motion.q, none)

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Load
-from dolfinopt.multibody.dimension import compose, product
+from dolfinopt.multibody.body import BodyMotion
+from dolfinopt.multibody.dimension import compose
 from dolfinopt.multibody.frames import Interface, MovingJoint, MovingRotor
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates
 from dolfinopt.multibody.tree import GROUND, Mechanism, Site
 
-NOTHING: Mapping[Site, Load] = {}
+NOTHING: Mapping[Site, np.ndarray] = {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class Applied:
         in_world: the part that keeps its direction in the world.
     """
 
-    load: Load
-    in_world: Load
+    load: np.ndarray
+    in_world: np.ndarray
 
 
 def outward_pass(
@@ -107,17 +107,15 @@ def _motor_rates(tree: Mechanism, motion: RigidMotion, i: int) -> np.ndarray:
 def _apply_forces(tree: Mechanism, links: list[Link], motion: RigidMotion) -> None:
     """Add the motion's given forces to the interfaces on which they act."""
     assert motion.applied is not None, "a motion without the values of the mechanism's forces"
-    d = tree.dim.d
     turned = rotations(tree, links)
     for force in tree.forces:
         i, s = force.site
         values = -motion.applied[:, force.column].T
-        load, in_world = (values[:d], values[d:]), (0.0 * values[:d], 0.0 * values[d:])
+        load, in_world = values, 0.0 * values
         if force.in_world:
-            back = turned[i].swapaxes(0, 1)
-            load = in_world = (product(back, load[0]), tree.dim.rotated(back, load[1]))
+            load = in_world = tree.dim.turn(turned[i].swapaxes(0, 1), values)
         if (before := links[i].applied.get(s)) is not None:
-            load, in_world = _sum([before.load, load]), _sum([before.in_world, in_world])
+            load, in_world = before.load + load, before.in_world + in_world
         links[i].applied[s] = Applied(load, in_world)
 
 
@@ -146,19 +144,22 @@ def instants_last(rates: Rates) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """What loads the bodies of a tree; (force, moment).
+    """What loads the bodies of a tree; force and moment (d + r, n).
 
     Attributes:
         outboard: on every body's interfaces by number, in the body's components.
         joints: on the frames of bodies by all that hangs on them, themselves included.
     """
 
-    outboard: list[dict[int, Load]]
-    joints: dict[int, Load]
+    outboard: list[dict[int, np.ndarray]]
+    joints: dict[int, np.ndarray]
 
 
 def inward_pass(
-    tree: Mechanism, links: list[Link], driven: bool = True, pull: Mapping[Site, Load] = NOTHING
+    tree: Mechanism,
+    links: list[Link],
+    driven: bool = True,
+    pull: Mapping[Site, np.ndarray] = NOTHING,
 ) -> Loads:
     """Return the loads of all bodies; on frames, unless `driven`, those that deform a body.
 
@@ -167,8 +168,8 @@ def inward_pass(
         driven: whether all frames' are asked for.
         pull: more loads on interfaces, in their components.
     """
-    outboard: list[dict[int, Load]] = [{} for _ in links]
-    joints: dict[int, Load] = {}
+    outboard: list[dict[int, np.ndarray]] = [{} for _ in links]
+    joints: dict[int, np.ndarray] = {}
     for i in reversed(tree.order):
         link, felt = links[i], driven or tree.is_felt(i)
         if not (felt or link.body.is_flexible):
@@ -182,30 +183,19 @@ def inward_pass(
                 parts.append(link.carried[s].load)
             if (i, s) in pull:
                 parts.append(pull[i, s])
-            loads = [interface.in_body(_sum(parts))] if parts else []
+            loads = [interface.in_body(sum(parts[1:], parts[0]))] if parts else []
             if s in link.applied:
                 loads.append(link.applied[s].load)
-            outboard[i][s] = _sum(loads)
+            outboard[i][s] = sum(loads[1:], loads[0])
         if felt:
             parts = [link.interfaces[s].at_origin(load) for s, load in outboard[i].items()]
-            joints[i] = _sum([link.body.load, *parts])
+            joints[i] = sum(parts, link.body.load)
     return Loads(outboard, joints)
 
 
-def carried_load(link: Link, loads: dict[int, Load], s: int) -> Load:
+def carried_load(link: Link, loads: dict[int, np.ndarray], s: int) -> np.ndarray:
     """Return the part of `Loads.outboard` that turns with an interface: without given forces."""
-    force, moment = loads[s]
-    if s not in link.applied:
-        return force, moment
-    applied = link.applied[s].load
-    return force - applied[0], moment - applied[1]
-
-
-def _sum(loads: list[Load]) -> Load:
-    force, moment = loads[0]
-    for more in loads[1:]:
-        force, moment = force + more[0], moment + more[1]
-    return force, moment
+    return loads[s] - link.applied[s].load if s in link.applied else loads[s]
 
 
 def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
@@ -217,7 +207,7 @@ def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
     return np.concatenate(rows).T
 
 
-def interface_coefficients(link: Link, outboard: dict[int, Load]) -> dict[int, np.ndarray]:
+def interface_coefficients(link: Link, outboard: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Return what works on the displacements of a flexible body's interfaces, by number."""
     return {s: link.interfaces[s].load_coefficients(load) for s, load in outboard.items()}
 
@@ -249,7 +239,7 @@ def inverse_dynamics(
     if tree.cart is not None:
         forces[:, 0] = tree.cart * motion.qdd[:, 0]
         for i in tree.hanging[GROUND, 0]:
-            forces[:, 0] += links[i].joint.at_interface(loads.joints[i])[0][0]
+            forces[:, 0] += links[i].joint.at_interface(loads.joints[i])[0]
     if tree.friction is not None:
         forces[:, : tree.num_rigid] += tree.friction.force(motion.qd)
     return elastic_rows(links, loads), forces

@@ -21,15 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.multibody.dimension import DIMENSIONS, components
+
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
     from dolfinopt.fem.geometric_stiffness import UnitLoads
     from dolfinopt.reduction import Basis
-
-# E_c of plane motion: A = wd S - w^2 I, and twice Omega = 2 w S.
-PLANE = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, -1.0], [1.0, 0.0]]])
-# E_ab has a one at (a, b): W_ab = int N_a' N_b.
-SPACE = np.eye(9).reshape(9, 3, 3)
 
 
 @dataclass(frozen=True)
@@ -118,52 +115,17 @@ class ShapeIntegrals:
 
     def __add__(self, other: ShapeIntegrals) -> ShapeIntegrals:
         """Return the sum of derivatives, integral by integral."""
-        return ShapeIntegrals(*(getattr(self, i.name) + getattr(other, i.name) for i in TABLE))
+        return add_integrals(self, integrals_of(other))
 
     @property
     def is_stiffened(self) -> bool:
         """Whether geometric stiffness is known."""
         return len(self.K0) > 0
 
-    # -- as the equations of plane motion name them ----------------------------------------------
-
-    @cached_property
-    def moment(self) -> np.ndarray:
-        """First moment c = int X (d,), kg m."""
-        return np.ascontiguousarray(self.w[:, 0])
-
-    @cached_property
-    def C(self) -> np.ndarray:
-        """Int Phi (d, q)."""
-        return np.ascontiguousarray(self.w[:, 1:])
-
-    @cached_property
-    def inertia(self) -> float:
-        """J = int X . X, kg m2; plane bodies."""
-        return float(self.W[0, 0, 0])
-
-    @cached_property
-    def j(self) -> np.ndarray:
-        """Int X . Phi_k (q,); plane bodies."""
-        return np.ascontiguousarray(self.W[0, 0, 1:])
-
-    @cached_property
-    def r(self) -> np.ndarray:
-        """Int (S X) . Phi_k (q,); plane bodies."""
-        return np.ascontiguousarray(self.W[1, 1:, 0])
-
     @cached_property
     def M(self) -> np.ndarray:
         """Int Phi_k . Phi_l (q, q)."""
-        modes = self.W[:, 1:, 1:]
-        if len(modes) == len(SPACE):  # W_xx + W_yy + W_zz
-            return np.asarray(modes[0] + modes[4] + modes[8])
-        return np.ascontiguousarray(modes[0])
-
-    @cached_property
-    def G(self) -> np.ndarray:
-        """Int Phi_k . (S Phi_l) (q, q), skew; plane bodies."""
-        return np.ascontiguousarray(self.W[1, 1:, 1:])
+        return np.tensordot(DIMENSIONS[len(self.w)].trace[:, 0], self.W[:, 1:, 1:], 1)
 
     def inertia_about_centre(self) -> tuple[np.ndarray, np.ndarray]:
         """Return centre (3,), m, and inertia (3, 3) about it, kg m2, undeformed and in space."""
@@ -223,11 +185,10 @@ def plane_body(
 
     K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
     """
-    q = len(K)
-    none = np.zeros((0, q, q))
-    W = np.zeros((2, 1 + q, 1 + q))
-    W[0, 0, 0], W[0, 0, 1:], W[0, 1:, 0], W[0, 1:, 1:] = inertia, j, j, M
-    W[1, 0, 1:], W[1, 1:, 0], W[1, 1:, 1:] = 0.0 - r, r, G
+    none = np.zeros((0, *K.shape))
+    W = np.array(
+        [np.block([[inertia, j], [j[:, None], M]]), np.block([[0.0, 0.0 - r], [r[:, None], G]])]
+    )
     w, K0 = np.column_stack([moment, C]), none if K0 is None else K0
     further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
     return ShapeIntegrals(
@@ -276,34 +237,13 @@ def _transformed(value: np.ndarray, T: np.ndarray, rank: int, first: int) -> np.
         if len(value) == 0:
             return np.zeros((0, T.shape[1], T.shape[1]))
         return np.tensordot(np.linalg.pinv(T), _transformed(value, T, 2, first), 1)
-    q = T.shape[1]
-    out = np.empty((*value.shape[:-rank], *(first + q,) * rank))
-    if rank == 1:
-        out[..., :first], out[..., first:] = value[..., :first], value[..., first:] @ T
-        return out
-    out[..., :first, :first] = value[..., :first, :first]
-    out[..., :first, first:] = value[..., :first, first:] @ T
-    out[..., first:, :first] = (value[..., first:, :first].swapaxes(-1, -2) @ T).swapaxes(-1, -2)
-    out[..., first:, first:] = T.T @ value[..., first:, first:] @ T
-    return out
+    every = np.zeros((first + T.shape[0], first + T.shape[1]))
+    every[range(first), range(first)], every[first:, first:] = 1.0, T
+    out = value @ every
+    return out if rank == 1 else every.T @ out
 
 
 # -- from finite elements --------------------------------------------------------------------
-
-
-def augmented(points: np.ndarray, V: np.ndarray) -> np.ndarray:
-    """Return the nodal fields N = [X, V] (n_nodes, d, 1 + q)."""
-    return np.concatenate([points[:, :, None], V], axis=2)
-
-
-def generators(dimension: int) -> np.ndarray:
-    """Return the matrices E_c (g, d, d) of the plane or of space."""
-    return PLANE if dimension == 2 else SPACE
-
-
-def _diagonal(E: np.ndarray) -> np.ndarray:
-    """Return which of E_c have a trace: those whose integrals M is the sum of."""
-    return np.trace(E, axis1=1, axis2=2) != 0.0
 
 
 def by_modal_loads(body: ShapeIntegrals, by: ShapeIntegrals) -> tuple[ShapeIntegrals, np.ndarray]:
@@ -318,7 +258,7 @@ def by_modal_loads(body: ShapeIntegrals, by: ShapeIntegrals) -> tuple[ShapeInteg
     """
     L, W = body.along_modes, by.W.copy()
     by_K0 = np.linalg.solve(body.M, by.along_modes.reshape(len(L), -1)).reshape(L.shape)
-    diagonal = _diagonal(generators(len(by.w)))
+    diagonal = DIMENSIONS[len(by.w)].trace[:, 0] > 0.0
     W[diagonal, 1:, 1:] -= np.tensordot(by_K0, L, ((1, 2), (1, 2)))
     return replace(by, W=W), by_K0
 
@@ -338,14 +278,14 @@ def shape_integrals(
         loads: of that design, whose stress stiffens the body; None of a linear body.
     """
     q = basis.V.shape[2]
-    E = generators(arm.points.shape[1])
-    mass, w, W = integrated(arm, basis, E)
+    dim = DIMENSIONS[arm.points.shape[1]]
+    mass, w, W = integrated(arm, basis, dim.E)
     K0 = by_modes = by_outboard = np.zeros((0, q, q))
     if loads is not None:
         ends = [loads.num_frame, loads.num_inertial]
         K0, by_modes, by_outboard = np.split(loads.geometric_stiffness(basis.V), ends)
     if len(by_modes):
-        M = W[_diagonal(E), 1:, 1:].sum(axis=0)
+        M = np.tensordot(dim.trace[:, 0], W[:, 1:, 1:], 1)
         by_modes = np.linalg.solve(M, by_modes.reshape(q, -1)).reshape(by_modes.shape)
     return ShapeIntegrals(
         mass=mass,
@@ -402,7 +342,7 @@ def _assembled(
 ) -> np.ndarray:
     """Return W (g, 1 + q, 1 + q) of int X' E_c X, int Phi' E_c X and int Phi' E_c Phi."""
     # The integral with E_c' is the transposed one: exactly, so that rounding goes.
-    partners = np.einsum("cab,eba->ce", E, E) / np.einsum("cab,cab->c", E, E)
+    partners = np.einsum("cab,eba->ce", components(E), E)
     q = first.shape[1]
     W = np.empty((len(E), 1 + q, 1 + q))
     W[:, 0, 0] = 0.5 * (second + partners @ second)
@@ -441,7 +381,7 @@ def mass_partners(points: np.ndarray, V: np.ndarray, by: ShapeIntegrals) -> Mass
         V: (n, d, q) modes.
         by: derivatives by the integrals.
     """
-    N, E = augmented(points, V), generators(points.shape[1])
+    N, E = np.concatenate([points[:, :, None], V], axis=2), DIMENSIONS[points.shape[1]].E
     unit = np.zeros_like(N[:, :, :1])
     unit[:, 0] = 1.0  # m = int 1_x . 1_x
     quadratic = np.einsum("cab,nak,ckl->nbl", E, N, by.W, optimize=True)
@@ -466,12 +406,19 @@ def rigid_body(
         inertia: about it, kg m2.
         outboard_point: (2,) m.
     """
-    none, square = np.zeros(0), np.zeros((0, 0))
-    modes, outboard = np.zeros((2, 0)), np.zeros((3, 0))
-    return plane_body(
-        mass, moment, inertia, modes, none, none, square, square, square, square, outboard,
-        outboard_point,
-    )  # fmt: skip
+    return _rigid(mass, moment, 0.5 * inertia * np.eye(2), outboard_point[None])
+
+
+def _rigid(
+    mass: float, moment: np.ndarray, second: np.ndarray, points: np.ndarray
+) -> ShapeIntegrals:
+    """Return a rigid body of moments int X (d,) and int X X' (d, d), interfaces at `points`."""
+    dim, square, none = DIMENSIONS[len(moment)], np.zeros((0, 0)), np.zeros((0, 0, 0))
+    W = np.einsum("cab,ab->c", dim.E, second)[:, None, None]
+    modes = np.zeros((dim.b * len(points), 0))
+    return ShapeIntegrals(
+        float(mass), moment[:, None], W, square, square, modes, points[0], none, none, points[1:]
+    )
 
 
 def rigid_spatial_body(
@@ -494,19 +441,8 @@ def rigid_spatial_body(
     r, tensor = np.asarray(centre, dtype=float), inertia_tensor(inertia)
     # int x_a x_b = tr(I)/2 delta - I about the centre, and m r r' more about the frame's origin.
     second = 0.5 * np.trace(tensor) * np.eye(3) - tensor + mass * np.outer(r, r)
-    square, further = np.zeros((0, 0)), np.reshape(further_points, (-1, 3)).astype(float)
-    return ShapeIntegrals(
-        mass=float(mass),
-        w=(mass * r)[:, None],
-        W=second.reshape(9, 1, 1),
-        K=square,
-        D=square,
-        outboard=np.zeros((6 + 6 * len(further), 0)),
-        outboard_point=np.asarray(outboard_point, dtype=float),
-        K0=np.zeros((0, 0, 0)),
-        K0_outboard=np.zeros((0, 0, 0)),
-        further_points=further,
-    )
+    points = np.reshape([outboard_point, *further_points], (-1, 3)).astype(float)
+    return _rigid(mass, mass * r, second, points)
 
 
 def inertia_tensor(inertia: np.ndarray | tuple[float, ...]) -> np.ndarray:

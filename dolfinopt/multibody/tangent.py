@@ -20,7 +20,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from dolfinopt.multibody.body import Load
 from dolfinopt.multibody.frames import MotionTransform
 from dolfinopt.multibody.newton_euler import (
     Link,
@@ -92,6 +91,35 @@ class Tangent:
             left = None if one.left is None else one.left[part]
             blocks.append(replace(one, left=left, right=one.right[part]))
         return replace(self, blocks=tuple(blocks), count=last - first)
+
+    def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Tangent:
+        """Return it by some of the coordinates, at further instants between those of every step.
+
+        Args:
+            weights: (m, s) of s instants in turn, for m others.
+            keep: ascending places among the S coordinates.
+        """
+        size = len(self.own)
+        places = np.arange(size)[self.order]  # of every coordinate
+        kept = np.zeros(size, dtype=bool)
+        kept[places[keep]] = True
+        before = np.append(0, np.cumsum(kept))
+        m, s = weights.shape
+        count = self.count // s
+
+        def between(x: np.ndarray) -> np.ndarray:
+            found: np.ndarray = weights @ x.reshape(count, s, x[0].size)
+            return found.reshape(count * m, *x.shape[1:])
+
+        blocks = []
+        for one in self.blocks:
+            first, last = one.columns.start // 3, one.columns.stop // 3
+            columns = slice(3 * before[first], 3 * before[last])
+            right = between(one.right[:, :, np.repeat(kept[first:last], 3)])
+            left = None if one.left is None else between(one.left)
+            blocks.append(Block(one.rows, columns, left, right))
+        order = before[places[keep]]
+        return Tangent(tuple(blocks), self.own[keep], order, count * m)
 
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
@@ -440,8 +468,8 @@ class _Walk:
         tree, columns, link = self.tree, self.columns, self.links[i]
         joint, on_frame, frame = tree.joints[i], self.on_frames[i], self.frames[i]
         if (row := columns.drives.get(joint.coordinate)) is not None:
-            axis = np.zeros(self.dim.d + self.dim.r)
-            axis[slice(self.dim.d) if link.joint.slides else slice(self.dim.d, None)] = joint.axis
+            axis = np.zeros(self.dim.b)
+            axis[link.joint.along] = joint.axis
             by_inboard = (axis @ on_frame.by_motion)[:, None] @ frame
             self.drives[:, row, : frame.shape[2]] = by_inboard[:, 0]
             own = slice(columns.modes[i].start, columns.last[i])
@@ -516,7 +544,7 @@ def _by_instant(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(x.transpose(2, 0, 1))
 
 
-def _load_by_rates(link: Link, outboard: dict[int, Load], kept: np.ndarray) -> np.ndarray:
+def _load_by_rates(link: Link, outboard: dict[int, np.ndarray], kept: np.ndarray) -> np.ndarray:
     """Return the derivative of what a joint feels by those e, e', e'' of its body kept."""
     # (d + r, 3, k, n): of the body's inertia, and of where and how its interfaces are turned.
     body, dim, d = link.body, link.body.dim, link.body.dim.d
@@ -526,12 +554,13 @@ def _load_by_rates(link: Link, outboard: dict[int, Load], kept: np.ndarray) -> n
         found[:, 0] += turned
         found[d:, 0] += dim.moment(interface.place, turned[:d])
         displaced = body.V[interface.places][:d, kept]
-        found[d:, 0] += dim.moment(displaced, outboard[s][0])
+        found[d:, 0] += dim.moment(displaced, outboard[s][:d])
     return found
 
 
 def _given(link: Link, s: int) -> np.ndarray:
     """Return the derivative (n, d + r, r) of the forces of the world by the body's rotation."""
-    dim, (force, moment) = link.body.dim, link.applied[s].in_world
+    dim = link.body.dim
+    force, moment = np.split(link.applied[s].in_world, [dim.d])
     of_moment = dim.by_spin(moment) if dim.r > 1 else np.zeros((1, 1, moment.shape[1]))
     return -_by_instant(np.concatenate([dim.by_spin(force), of_moment]))

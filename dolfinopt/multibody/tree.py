@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from dolfinopt.multibody.body import Constants, Load, Motion
+from dolfinopt.multibody.body import Constants, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
 from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -39,8 +39,9 @@ def saturated(wanted: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.nda
 
     Args:
         wanted: w (..., R), N, N m.
-        limit: L > 0 (R,), finite.
+        limit: L > 0 (R,); inf without.
     """
+    limit = np.minimum(limit, np.finfo(float).max)
     width = 2.0 * (1.0 - LINEAR_DRIVE_SHARE)
     x = np.clip((np.abs(wanted) / limit - LINEAR_DRIVE_SHARE) / width, 0.0, 1.0)
     bent = LINEAR_DRIVE_SHARE + width * (x - x**4 * (2.5 - 3.0 * x + x * x))
@@ -140,31 +141,21 @@ class Drives:
 
     def force(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return u (n, R) from u_ff, q - q_d and its rate, each (n, R)."""
-        wanted = ahead - self.stiffness * error - self.damping * rate
-        if not self.limited.any():
-            return wanted
-        u = wanted.copy()
-        limits = self.limits[self.limited]
-        u[:, self.limited] = saturated(wanted[:, self.limited], limits)[0]
-        return u
+        return self._saturated(ahead, error, rate)[0]
 
     def passing(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return du / d(wanted force) (n, R): 1 within the limits, 0 beyond."""
-        wanted = ahead - self.stiffness * error - self.damping * rate
-        out = np.ones_like(wanted)
-        limits = self.limits[self.limited]
-        out[:, self.limited] = saturated(wanted[:, self.limited], limits)[1]
-        return out
+        return self._saturated(ahead, error, rate)[1]
+
+    def _saturated(
+        self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return saturated(ahead - self.stiffness * error - self.damping * rate, self.limits)
 
     @property
     def dependent(self) -> np.ndarray:
         """Rigid coordinates that follow from a closed loop."""
         return self.free[~self.driven]
-
-    @cached_property
-    def limited(self) -> np.ndarray:
-        """Where there is a limit (R,)."""
-        return np.isfinite(self.limits)
 
 
 # -- few instants: the same bits wherever arrays lie in memory
@@ -228,7 +219,7 @@ class Joint:
     @cached_property
     def turns(self) -> np.ndarray:
         """A revolute joint's rotation by (1, sin(angle), 1 - cos(angle)) (d, d, 3)."""
-        R, S = self.rotation, DIMENSIONS[len(self.origin)][0].skew(self.axis)
+        R, S = self.rotation, DIMENSIONS[len(self.origin)].skew(self.axis)
         return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
@@ -296,7 +287,7 @@ class Mechanism:
     @property
     def dim(self) -> Dimension:
         """What differs between the plane and space."""
-        return DIMENSIONS[len(self.gravity)][0]
+        return DIMENSIONS[len(self.gravity)]
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -439,12 +430,12 @@ class Mechanism:
         still = np.zeros((self.dim.r, len(motion.q)))
         return a, still, still
 
-    def virtual_ground(self, of_forces: np.ndarray) -> Load:
-        """Return its displacement and rotation for virtual rigid coordinates (n, .)."""
-        p = np.zeros((self.dim.d, len(of_forces)))
+    def virtual_ground(self, of_forces: np.ndarray) -> np.ndarray:
+        """Return its displacement and rotation (d + r, n) for virtual coordinates (n, .)."""
+        out = np.zeros((self.dim.b, len(of_forces)))
         if self.cart is not None:
-            p[0] = of_forces[:, 0]
-        return p, np.zeros((self.dim.r, len(of_forces)))
+            out[0] = of_forces[:, 0]
+        return out
 
     # -- how stiff and how large it is -------------------------------------------------------
 

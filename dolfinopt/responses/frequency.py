@@ -161,7 +161,8 @@ def _chain(analysis: Analysis) -> Chain:
                 outboard_points.append(complex(scene.arms[place].length, 0.0))
             else:
                 body = fixed_body(scene, place)
-                bodies.append(RigidIntegrals(body.mass, complex(*body.moment), body.inertia))
+                moment, inertia = complex(*body.w[:, 0]), float(body.W[0, 0, 0])
+                bodies.append(RigidIntegrals(body.mass, moment, inertia))
                 outboard_points.append(complex(*body.outboard_point))
         angle = scene.objective.elbow_angle
         if angle is None:

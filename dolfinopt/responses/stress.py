@@ -16,7 +16,8 @@ from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import LoadFields, element_centres
 from dolfinopt.mesh import compat
-from dolfinopt.multibody.shape_integrals import SPACE, STIFFENING, ShapeIntegrals
+from dolfinopt.multibody.dimension import DIMENSIONS
+from dolfinopt.multibody.shape_integrals import STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BOUND_BATCH_INSTANTS,
@@ -230,12 +231,10 @@ def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[Arm
 
 def load_matrix(body: ShapeIntegrals) -> np.ndarray:
     """Return P = V' L (q, 7 + 2 q), in space (q, 18 + 9 q): every load's part in the modes."""
-    if len(body.W) == len(SPACE):
-        q, (of_X, of_modes) = body.num_modes, (body.W[:, 1:, 0], body.W[:, 1:, 1:])
-        elastic = of_modes.swapaxes(0, 1).reshape(q, -1)
-        return np.hstack([body.C.T, of_X.T, body.outboard.T, elastic])
-    columns = [body.C.T, body.r[:, None], body.j[:, None], body.outboard.T, body.M, body.G]
-    return np.hstack(columns)
+    d, q = len(body.w), body.num_modes
+    frame = np.concatenate([body.w[:, 1:], body.W[:, 1:, 0]])[DIMENSIONS[d].loads]
+    elastic = body.W[:, 1:, 1:].swapaxes(0, 1).reshape(q, -1)
+    return np.hstack([frame.T, body.outboard.T, elastic])
 
 
 def loads_gradient(
@@ -309,18 +308,12 @@ def _scale(scene: Scene, other: Scene, place: int, body: ShapeIntegrals) -> np.n
 
 def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> ShapeIntegrals:
     """Return the derivatives by a body from those by P and K."""
-    q = body.num_modes
+    d, q = len(body.w), body.num_modes
     w, W = np.zeros_like(body.w), np.zeros_like(body.W)
-    if len(W) == len(SPACE):
-        b = len(body.outboard)
-        outboard = by_P[:, 12 : 12 + b].T
-        w[:, 1:], W[:, 1:, 0] = by_P[:, :3].T, by_P[:, 3:12].T
-        W[:, 1:, 1:] = by_P[:, 12 + b :].reshape(q, 9, q).swapaxes(0, 1)
-    else:
-        outboard = by_P[:, 4:7].T
-        w[:, 1:] = by_P[:, :2].T
-        W[1, 1:, 0], W[0, 0, 1:] = by_P[:, 2], by_P[:, 3]
-        W[0, 1:, 1:], W[1, 1:, 1:] = by_P[:, 7 : 7 + q], by_P[:, 7 + q :]
+    ends = np.cumsum([d + len(W), len(body.outboard)])
+    frame, outboard, elastic = np.split(by_P.T, ends)
+    w[:, 1:], W[:, 1:, 0] = np.split(frame[DIMENSIONS[d].loads], [d])
+    W[:, 1:, 1:] = elastic.reshape(len(W), q, q).swapaxes(1, 2)
     zero = {
         key: np.zeros_like(getattr(body, key))
         for key in ("D", "outboard_point", "further_points", *STIFFENING)

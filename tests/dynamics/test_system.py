@@ -19,7 +19,7 @@ from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import Tangent
 from dolfinopt.multibody.tree import Drives, plane_chain
-from dolfinopt.paths import quintic
+from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -28,6 +28,7 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 # -- integrators know a system by its interface alone; free joints move as SciPy has them ----
 
 
+QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 GRAVITY = 9.81  # m/s2
 
 
@@ -113,7 +114,7 @@ def test_order_of_positions(stages: int) -> None:
 
 def desired(t: np.ndarray) -> RigidMotion:
     """Return a quintic motion of cart and joint over 0.3 s."""
-    return RigidMotion(*(np.outer(x, [0.3, 0.8]) for x in quintic(t, 0.3)))
+    return RigidMotion(*(np.outer(x, [0.3, 0.8]) for x in QUINTIC(t, 0.3)))
 
 
 def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:

@@ -220,11 +220,14 @@ class Chain:
         angles = self.frames(y)[1]
         for k, (body, K0) in enumerate(zip(self.bodies, self.K0)):
             e, R = self.parts(y)[k], rotation(angles[k])
-            s = body.moment + body.C @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
+            s = body.w[:, 0] + body.w[:, 1:] @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
             L = e @ K0[7:]
             z, turn = e - 0.5 * L @ e, np.eye(len(e)) - L
-            J = body.inertia + 2.0 * body.j @ e - e @ K0[3] @ e + z @ body.M @ z
-            by_s, by_h = body.C - e @ K0[:2], body.r + turn.T @ body.G @ z - K0[2] @ e
+            J = body.W[0, 0, 0] + 2.0 * body.W[0, 0, 1:] @ e - e @ K0[3] @ e + z @ body.M @ z
+            by_s, by_h = (
+                body.w[:, 1:] - e @ K0[:2],
+                body.W[1, 1:, 0] + turn.T @ body.W[1, 1:, 1:] @ z - K0[2] @ e,
+            )
             around = np.array([-s[1], s[0]])
             (v1, w1, s1, h1, e1), (v2, w2, s2, h2, e2) = (
                 (R.T @ place[k], turned[k], by_s @ ed, by_h @ ed, turn @ ed)
@@ -243,7 +246,7 @@ class Chain:
         origins, angles, _ = self.frames(y)
         weight, elastic = self.carried[0] @ origins[1:], 0.0
         for k, (body, e) in enumerate(zip(self.bodies, self.parts(y))):
-            s = body.moment + body.C @ e
+            s = body.w[:, 0] + body.w[:, 1:] @ e
             if self.K0:
                 s = s - 0.5 * np.array([e @ A @ e for A in self.K0[k][:2]])
             weight = weight + body.mass * origins[k] + rotation(angles[k]) @ s

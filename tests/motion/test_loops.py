@@ -167,7 +167,7 @@ def test_redundant_equations_are_counted(tmp_path) -> None:
         (delta(), "t,drive0,drive1,drive2\n0,0.5,0.5,0.5\n1,0.6,0.5,0.5\n", 0),
     ):
         start = follower(closed(tmp_path, table, tree)).start
-        assert start.counts.redundant == redundant and start.misfit == 0.0
+        assert start.redundant == redundant and start.misfit == 0.0
 
 
 TURN = "t,turn\n0,0.5\n1,1.0\n"
@@ -220,7 +220,7 @@ DURATION, SPEED = 0.05, 150.0  # s, rad/s
 def crank(t: np.ndarray, law: str = "quintic") -> tuple[np.ndarray, ...]:
     """Return angle and rates of the first joint (n, 1)."""
     one = law_for(law, 1.0, Limits(np.inf, np.inf, np.inf), 0.25)
-    return tuple(x[:, None] for x in rotation(t, one, SPEED, 0.4, DURATION))
+    return rotation(t, one, SPEED, 0.4, DURATION)
 
 
 def test_run_up_of_a_crank() -> None:
@@ -369,6 +369,6 @@ def test_what_stays_determined_goes_on(tmp_path, tree) -> None:
 def test_links_that_nearly_fit_are_joined(tmp_path) -> None:
     """And those that do not are refused by how much."""
     start = follower(closed(tmp_path, FLAT.format(1.0, 2.2), cranks(longer=1e-5))).start
-    assert start.misfit == pytest.approx(9e-6, rel=0.02) and start.counts.redundant == 7
+    assert start.misfit == pytest.approx(9e-6, rel=0.02) and start.redundant == 7
     with refused("pin two", "cannot be closed", "open by 0.00"):
         check_motion(closed(tmp_path, FLAT.format(1.0, 2.2), cranks(longer=2e-3)))

@@ -22,7 +22,7 @@ from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid
 from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.motion.plane import Bend
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.paths import quintic, septic
+from dolfinopt.paths import Limits, law_for
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -128,7 +128,7 @@ def test_line_is_straight(law: str) -> None:
     path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
     assert_close(path[0], [[-0.4, 0.1], [0.2, 0.35], [0.8, 0.6], [0.8, 0.6]], 1e-15)
     p, pd, pdd = desired_path(INSIDE, of)
-    s = quintic(INSIDE, DURATION) if law == "quintic" else septic(INSIDE, DURATION)
+    s = law_for(law, 1.0, Limits(), 0.25)(INSIDE, DURATION)
     for found, expected in zip((p - [-0.4, 0.1], pd, pdd), s, strict=True):
         assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
 

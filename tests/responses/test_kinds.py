@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.motion.build import rests
 from dolfinopt.part.folder import toml_text
-from dolfinopt.paths import quintic
+from dolfinopt.paths import Limits, law_for
 from dolfinopt.responses.constraints import (
     EXCESS,
     constraint_label,
@@ -28,6 +28,7 @@ from dolfinopt.scene.load import scene_from_dict
 
 # Ranks: limits of effort and peak force in test_every_option_gives_the_same_bits_on_any_number...
 EFFORT = "objective.kind=effort"
+QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 KEPT = "constraints.compliance=1e6"  # N m; far away
 SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
 
@@ -35,7 +36,7 @@ SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
 def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
     """Return the forces (n, 3) of cart, shoulder and elbow that move a point mass on the arc."""
     # Newton's law of the payload alone: arms of 1 m without mass hand its force on.
-    s, sd, sdd = quintic(t, 1.9)
+    s, sd, sdd = QUINTIC(t, 1.9)
     place = np.exp(1j * np.pi * (1.0 - s))  # x + i y
     force = mass * ((-1j * np.pi * sdd - (np.pi * sd) ** 2) * place + 1j * gravity)
     shoulder = 0.5 * place.real - 0.5j

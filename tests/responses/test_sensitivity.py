@@ -99,7 +99,7 @@ def fixed_frequencies(height: float) -> tuple[float, float]:
     arm = Arm(loaded, 0, MPI.COMM_SELF, do.Profile())
     body = arm.reduce(arm.uniform(0.5))
     values = np.diag(body.K)[3:]
-    axial = int(np.argmax(np.abs(body.C[0, 3:])))
+    axial = int(np.argmax(np.abs(body.w[0, 4:])))
     return float(values[axial]), float(np.delete(values, axial)[1])
 
 

@@ -14,10 +14,9 @@ from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics.simulation import Trajectory, load_coefficients
+from dolfinopt.dynamics.simulation import Trajectory, _Probe
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import places_of, rotated, stress_operator
-from dolfinopt.multibody.loads import load_coefficients as coefficients_of
 from dolfinopt.multibody.newton_euler import outward_pass
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
 from dolfinopt.responses.stress import (
@@ -101,19 +100,27 @@ def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
     return ALUMINIUM * cells.root * np.linalg.norm(found, axis=0)
 
 
+def agree_with_rows(trajectory: Trajectory, tolerance: float) -> None:
+    """What loads the bodies is what the rows of coordinates say that never move."""
+    probe = _Probe(trajectory.problem)
+    at = (probe.spread(x) for x in trajectory.unknowns)
+    rows = probe.system.at(trajectory.t).residual(*at)
+    for part, found in zip(probe.places, trajectory.load_coefficients, strict=True):
+        scale = np.abs(found).max(axis=0).clip(1e-300)
+        np.testing.assert_allclose(-rows[:, part] / scale, found / scale, atol=tolerance)
+
+
 @pytest.mark.serial
 def test_both_ways_to_the_loads_agree() -> None:
     """From the passes of inverse dynamics, and from the rows of coordinates that never move."""
     built = build("simulation.stiffening=true", "motion.gravity=[0,-9.81]", "arms.joint_mass=0.3")
-    trajectory = Analysed(built, built.fields(wave)).trajectory
-    n = np.array([0, 500, 1300, 2900])
-    rates_at = tuple(x[n] for x in trajectory.unknowns)
-    found = load_coefficients(trajectory.problem, trajectory.t[n], rates_at)
-    short = coefficients_of(trajectory.mechanism, trajectory.motion[n], rates_at)
-    for one, other, whole in zip(found, short, trajectory.load_coefficients, strict=True):
-        scale = np.abs(whole).max(axis=0).clip(1e-300)
-        np.testing.assert_allclose(one / scale, other / scale, atol=1e-12)
-        np.testing.assert_allclose(whole[n] / scale, other / scale, atol=1e-12)
+    agree_with_rows(Analysed(built, built.fields(wave)).trajectory, 1e-12)
+
+
+@pytest.mark.serial
+def test_loads_of_a_closed_loop_are_those_of_its_rows() -> None:
+    model = do.Model(do.load_scene(ROOT / "demos/five_bar.toml", ["arms.cells=[8,2,2]"]))
+    agree_with_rows(model.simulate().trajectory, 1e-10)
 
 
 def analysed_arms(built: Built):
