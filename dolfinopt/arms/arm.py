@@ -360,7 +360,7 @@ class Arm:
         other.scene, other.initial = scene, InitialVectors()
         if self.scene.reduction != scene.reduction:
             other.coordinates = scene.reduction.count or None
-        loads = ("motion", "payload", "closure", "closures")
+        loads = ("motion", "payload", "forces", "closures")
         same = all(getattr(self.scene, key) == getattr(scene, key) for key in loads)
         if not same or self.scene.simulation.stiffening != scene.simulation.stiffening:
             other.stiffening = None

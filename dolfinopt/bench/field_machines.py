@@ -15,7 +15,7 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
-from dolfinopt.multibody.closures import Loops, Tie
+from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -116,7 +116,7 @@ def crank(body: ShapeIntegrals) -> Crank:
     none = np.zeros(1)
     drives = Drives(np.array([2]), none, none, np.full(1, np.inf), np.array([False]))
     across = np.array([[0.0, 1.0]])
-    loops = Loops((Tie.in_plane("slider", (1, 0), np.zeros(2), across),))
+    loops = Loops((Tie("slider", (1, 0), None, np.zeros(2), np.eye(2), tuple(map(Along, across))),))
     return Crank(
         plane_chain(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
         desired,

@@ -200,7 +200,7 @@ def draw(
     from dolfinopt.plots.machine import machine_figure
     from dolfinopt.plots.style import save
 
-    title, closure, bodies = scene.name, trajectory.closure, trajectory.mechanism.arms
+    title, bodies = scene.name, trajectory.mechanism.arms
     if arms := designed(views):
         masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
         save(design_figure(arms, title, masses), folder / "design.png")
@@ -209,7 +209,7 @@ def draw(
     save(machine_figure(views, trajectory, title), folder / "machine.png")
     if history:
         save(history_of(scene, history), folder / "history.png")
-    if closure is None or len(closure.equations) == 1:  # a pinned end stays where it is
+    if not scene.is_pinned:
         save(deviation_of(trajectory, initial), folder / "deviation.png")
     if trajectory.is_machine:
         save(drives_figure(trajectory), folder / "drives.png")
@@ -296,8 +296,8 @@ def _sought(summary: Mapping[str, Any]) -> str:
 
 def _largest(summary: Mapping[str, Any]) -> str:
     """Return the largest deviation and when; of a pinned end, which has none, the pin's force."""
-    closure = summary["scene"]["closure"]
-    if closure is not None and closure["kind"] == "pin" and "closure_force_peak" in summary:
+    kinds = [one["kind"] for one in summary["scene"]["closures"]]
+    if kinds == ["pin"] and "closure_force_peak" in summary:
         return f"largest force of the pin {summary['closure_force_peak']:.4g} N"
     return (
         f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "

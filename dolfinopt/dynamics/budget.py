@@ -77,8 +77,7 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     """
     worst = int(np.argmax(trajectory.distance))
     size = float(trajectory.distance[worst])
-    closure = trajectory.scene.closure
-    if size == 0.0 or (closure is not None and closure.kind == "pin"):  # it holds the end
+    if size == 0.0 or trajectory.scene.is_pinned:
         return None
     seen = trajectory.at(trajectory.t[worst : worst + 1])
     by_rigid, by_q = _derivatives(seen, seen.deviation / size)

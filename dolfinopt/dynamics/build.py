@@ -39,8 +39,7 @@ from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
 
 def is_machine(scene: Scene) -> bool:
     """Return whether rigid coordinates are unknown: by control, closed loops, soft joints."""
-    closed = scene.closure is not None or bool(scene.closures)
-    return scene.control is not None or closed or bool(soft_joints(scene))
+    return scene.control is not None or bool(scene.closures) or bool(soft_joints(scene))
 
 
 def check_motion(scene: Scene) -> None:
@@ -75,7 +74,7 @@ def build_system(
     """Return the equations of a scene.
 
     Args:
-        scene: motion, payload, control and closure.
+        scene: motion, payload, control and closures.
         bodies: from the base outwards.
         motion: the desired rigid motion, shared with other scenes; None: the scene's.
     """
@@ -186,17 +185,6 @@ def with_ends(
 # -- forces on interfaces, [[forces]] ------------------------------------------------------------
 
 
-def forces_on(scene: Scene) -> tuple[Force, ...]:
-    """Return the scene's forces on interfaces, that of [closure] on the slider among them."""
-    closure = scene.closure
-    if closure is None or closure.force == 0.0:
-        return scene.forces
-    x, y = closure.direction
-    size = closure.force / np.hypot(x, y)
-    own = Force(arm=scene.arms[-1].name, force=(size * x, size * y))
-    return (*scene.forces, own)
-
-
 def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
     """Return where the scene's forces act; their values: `loads_of`."""
     names = [arm.name for arm in scene.arms]
@@ -207,14 +195,14 @@ def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
             in_world=force.frame == "world",
             known=force.feed_forward,
         )
-        for column, force in enumerate(forces_on(scene))
+        for column, force in enumerate(scene.forces)
         for k in [names.index(force.arm)]
     )
 
 
 def loads_of(scene: Scene) -> tuple[LoadHistory, ...]:
     """Return the scene's forces and moments over time, N and N m."""
-    return tuple(_load(force, scene.dimension) for force in forces_on(scene))
+    return tuple(_load(force, scene.dimension) for force in scene.forces)
 
 
 def _load(force: Force, dimension: int) -> LoadHistory:

@@ -27,7 +27,7 @@ from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.motion.build import rests
-from dolfinopt.multibody.closures import Loops, Tie
+from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.dimension import SPACE
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
@@ -46,7 +46,6 @@ from dolfinopt.multibody.tangent import linearise
 from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.closures import PARTS
 
 if TYPE_CHECKING:
     from typing import TypeAlias
@@ -226,7 +225,7 @@ class Trajectory:
     @property
     def closure(self) -> Tie | None:
         """What holds the last interface of a closed loop in the plane, or None."""
-        return self.loops.ties[0] if self.scene.closure and self.loops else None
+        return self.loops.ties[0] if self.loops and not self.scene.is_spatial else None
 
     @cached_property
     def closure_force(self) -> np.ndarray | None:
@@ -234,7 +233,7 @@ class Trajectory:
 
         In the plane of the ground on the chain's end: of a slider along the line's direction turned
         by +90 degrees, without the given constant force; of a pin along x and y. In space those of
-        every closure on its first interface, in the joint's frame, see `tables.closures.PARTS`.
+        every closure on its first interface, in the joint's frame, see `Closures.parts`.
         """
         if not isinstance(self.problem, MachineSystem) or self.loops is None:
             return None
@@ -242,13 +241,13 @@ class Trajectory:
 
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
-        """Magnitude of every closure's force and moment in space, (n,), by name and unit."""
+        """Magnitude of every closure's force and moment (n,), by name and unit."""
         found: dict[str, dict[str, np.ndarray]] = {}
         forces, k = self.closure_force, 0
         if forces is None:
             return found
         for one in self.scene.closures:
-            units = [unit for _, unit in PARTS[one.kind]]
+            units = [unit for _, unit in one.parts(self.scene.dimension)]
             own = forces[:, k : k + len(units)]
             found[one.name] = {
                 unit: np.linalg.norm(own[:, [u == unit for u in units]], axis=1)
@@ -265,11 +264,13 @@ class Trajectory:
     @cached_property
     def slider_position(self) -> np.ndarray | None:
         """Place of a slider on its line, from the closure's point along its direction (n,), m."""
-        closure = self.scene.closure
-        if closure is None or closure.kind != "slider":
+        closure = self.closure
+        if closure is None or len(closure.equations) > 1:
             return None
-        along = np.array(closure.direction) / np.linalg.norm(closure.direction)
-        return (self.end - np.array(closure.point)) @ along
+        (across,) = closure.equations
+        assert isinstance(across, Along)
+        out: np.ndarray = (self.end - closure.point) @ [across.e[1], -across.e[0]]
+        return out
 
     @property
     def motor_columns(self) -> tuple[int, ...]:
@@ -486,14 +487,7 @@ def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -
     problems: list[Problem] = []
     for scene, own in zip(scenes, bodies, strict=True):
         lengths = tuple((arm.name, arm.length) for arm in scene.arms)
-        key = (
-            scene.motion,
-            scene.closure,
-            lengths,
-            scene.joints,
-            scene.closures,
-            scene.end_effector,
-        )
+        key = (scene.motion, lengths, scene.joints, scene.closures, scene.end_effector)
         motion = motions.setdefault(key, desired_motion(scene))
         problems.append(build_system(scene, own, motion))
     return problems

@@ -91,12 +91,7 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
 
 def follows(scene: Scene) -> bool:
     """Return whether joints follow from equations: closed loops, or a path in space."""
-    return has_loops(scene) or (scene.is_spatial and scene.motion.path != "joints")
-
-
-def has_loops(scene: Scene) -> bool:
-    """Return whether closures close loops."""
-    return scene.closure is not None or bool(scene.closures)
+    return bool(scene.closures) or (scene.is_spatial and scene.motion.path != "joints")
 
 
 def check_path(scene: Scene) -> None:
@@ -368,7 +363,7 @@ def _chain(t: np.ndarray, scene: Scene) -> Values:
     if len(scene.arms) == 1:
         length, height = scene.arms[0].length, motion.joint_height
         return plane.one_arm_on(
-            t, path, length, height, motion.elbow, Words(scene.source, _keys(scene), "")
+            t, path, length, height, motion.elbow, Words(scene.source, _keys(scene))
         )
     found = _bare_chain(t, path, scene)
     # Both angles of a direction, whole turns apart, are right; the dense motion tells which.
@@ -385,7 +380,7 @@ def _bare_chain(t: np.ndarray, path: Values, scene: Scene) -> Values:
     if motion.base == "fixed":
         p, v, a = np.tile([motion.base_position, 0.0], (len(t), 1)), 0.0 * v, 0.0 * a
     base = p + np.array([0.0, motion.joint_height]), v, a
-    return plane.chain_on(t, path, base, bend, motion.elbow, Words(scene.source, _keys(scene), ""))
+    return plane.chain_on(t, path, base, bend, motion.elbow, Words(scene.source, _keys(scene)))
 
 
 @_kept
@@ -454,7 +449,6 @@ def follower(scene: Scene) -> Follower:
             words=Words(
                 scene.source,
                 _keys(scene),
-                "closure.side" if scene.closure is not None else "motion.initial_joints",
             ),
         )
     )
@@ -474,13 +468,14 @@ def _guess(scene: Scene) -> tuple[np.ndarray, float]:
     if stated is not None:
         found[first : first + len(stated)] = stated
         return found, 0.1
-    if (closure := scene.closure) is not None:
+    if scene.closures and not scene.is_spatial:
+        (closure,) = scene.closures
         base = complex(scene.motion.base_position, scene.motion.joint_height)
-        direction = complex(*closure.direction) if closure.kind == "slider" else None
-        tied = plane.Tied(complex(*closure.point), direction, closure.side)
+        direction = complex(*(closure.axis or ())[:2])
+        away = complex(*closure.point[:2]) - base
         joints = _prescribed(np.zeros(1), scene)[0][0, 1:]
         lengths = np.array([arm.length for arm in scene.arms])
-        found[1:] = plane.branch_guess(joints, lengths, base, tied)
+        found[1:] = plane.branch_guess(joints, lengths, away, direction, closure.side)
         return found, 0.1
     return found, 1.5
 
@@ -517,7 +512,7 @@ def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) ->
 
 def loop_start(scene: Scene) -> dict[str, float]:
     """Return the joints that follow in closed loops at t = 0, rad, m: the branch."""
-    if not has_loops(scene):
+    if not scene.closures:
         return {}
     task, q = follower(scene).task, follower(scene).start.q
     return {task.names[k]: float(q[k]) for k in task.unknown}
@@ -525,7 +520,7 @@ def loop_start(scene: Scene) -> dict[str, float]:
 
 def misfit(scene: Scene) -> float:
     """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
-    return follower(scene).start.misfit if has_loops(scene) else 0.0
+    return follower(scene).start.misfit if scene.closures else 0.0
 
 
 def forced_rest(scene: Scene) -> str | None:

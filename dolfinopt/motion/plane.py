@@ -234,22 +234,9 @@ def _unreached(
     )
 
 
-@dataclass(frozen=True)
-class Tied:
-    """What holds the end of the last arm in the plane.
-
-    Attributes:
-        point: of a line, or a pin, m.
-        direction: of the line; None of a pin.
-        side: sign of the last joint's angle at the start.
-    """
-
-    point: complex
-    direction: complex | None
-    side: int
-
-
-def branch_guess(joints: np.ndarray, lengths: np.ndarray, base: complex, tie: Tied) -> np.ndarray:
+def branch_guess(
+    joints: np.ndarray, lengths: np.ndarray, away: complex, direction: complex, side: int
+) -> np.ndarray:
     """Return joint angles (arms,) near those that close a loop at its start, by `side`.
 
     Of a loop that does not close the nearest ones.
@@ -257,25 +244,26 @@ def branch_guess(joints: np.ndarray, lengths: np.ndarray, base: complex, tie: Ti
     Args:
         joints: angles of the first arms, which are given, rad.
         lengths: of all arms, m.
-        base: place of the first joint, m.
-        tie: what holds the last arm's end.
+        away: a pin, or a point of a line, from the first joint, m.
+        direction: of the line; 0 of a pin.
+        side: sign of the last joint's angle at the start.
     """
     angles = np.cumsum(joints)
     own = lengths[: len(joints)]
-    away = tie.point - base - (own * np.exp(1j * angles)).sum()
+    away -= (own * np.exp(1j * angles)).sum()
     before = float(angles[-1])
-    if tie.direction is None:
+    if not direction:
         a, b = lengths[-2:]
         cosine = (abs(away) ** 2 - a * a - b * b) / (2.0 * a * b)
-        beta = tie.side * np.arccos(np.clip(cosine, -1.0, 1.0))
+        beta = side * np.arccos(np.clip(cosine, -1.0, 1.0))
         first = np.angle(away) - np.angle(a + b * np.exp(1j * beta))
         return np.append(joints, [first - before, beta])
-    along = float(np.angle(tie.direction))
+    along = float(np.angle(direction))
     height = (np.conj(1j * np.exp(1j * along)) * away).real
     lean = float(np.arcsin(np.clip(height / lengths[-1], -1.0, 1.0)))
     choices = np.array([along + lean - before, along + np.pi - lean - before])
     wrapped = np.angle(np.exp(1j * choices))
-    right = (np.sign(wrapped) == tie.side) | (np.abs(wrapped) < 1e-9)
+    right = (np.sign(wrapped) == side) | (np.abs(wrapped) < 1e-9)
     # Where the sign does not tell, the stretched way.
     chosen = int(np.argmax(right)) if right.sum() == 1 else int(np.argmin(np.abs(wrapped)))
     return np.append(joints, wrapped[chosen])

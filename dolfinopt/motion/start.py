@@ -213,7 +213,7 @@ def unreached(task: Task, t: float, q: np.ndarray, target: Target) -> InputError
     """Return which closure stays open, or how far the end-effector is off, at pose q (R,)."""
     error, words = task.constraints.error(q[None], target)[0], task.words
     reach, k = task.constraints.reach, task.constraints.loops.count
-    joints, start = task.called(task.unknown), f"{words.start}, " if t == 0.0 else ""
+    joints, start = task.called(task.unknown), "motion.initial_joints, " if t == 0.0 else ""
     if k and np.abs(error[:k]).max() > 0.1 * np.abs(error).max():
         gaps = task.constraints.loops.by_tie(error[:k])
         worst = int(np.argmax(gaps))

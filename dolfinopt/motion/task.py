@@ -13,11 +13,10 @@ from dolfinopt.multibody.ranks import least_norm
 
 @dataclass(frozen=True)
 class Words:
-    """What messages name: where the motion is stated, and the keys that change it and its start."""
+    """What messages name: where the motion is stated, and the keys that change it."""
 
     source: str
     motion: str
-    start: str
 
 
 @dataclass(frozen=True, eq=False)

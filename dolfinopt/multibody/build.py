@@ -21,7 +21,6 @@ from dolfinopt.multibody.tree import (
     JointHardware,
     Mechanism,
     Rotor,
-    Site,
     bearing_body,
     plane_chain,
     spatial_mechanism,
@@ -163,27 +162,18 @@ def skeleton(scene: Scene) -> Mechanism:
 
 def loops_of(scene: Scene) -> Loops | None:
     """Return the scene's closures; None of a tree."""
-    if scene.closure is not None:
-        return Loops((_plane_tie(scene.closure, (len(scene.arms) - 1, 0)),))
     if not scene.closures:
         return None
-    reach, first = reach_of(skeleton(scene)), len(scene.movable)
+    d, reach, first = scene.dimension, reach_of(skeleton(scene)), len(scene.movable)
     places = {one.name: first + k for k, one in enumerate(scene.rods)}
     ties = []
     for one in scene.closures:
         a, b = (closing_site(scene, one, which) for which in (0, 1))
         assert a is not None
-        equations = _equations(one, reach, places.get(one.name))
-        point, rotation = np.array(one.point, dtype=float), roll_pitch_yaw(one.rpy)
+        equations = _equations(one, d, reach, places.get(one.name))
+        point, rotation = np.array(one.point[:d], dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]
         ties.append(Tie(one.name, a, b, point, rotation, equations))
     return Loops(tuple(ties))
-
-
-def _plane_tie(one: scenes.Closure, site: Site) -> Tie:
-    """Return what holds an interface in the plane: a slider across its line, a pin along x, y."""
-    x, y = _unit(one.direction)
-    normals = np.array([[-y, x]]) if one.kind == "slider" else np.eye(2)
-    return Tie.in_plane("closure", site, np.array(one.point), normals)
 
 
 def reach_of(mechanism: Mechanism) -> float:
@@ -195,14 +185,16 @@ def reach_of(mechanism: Mechanism) -> float:
     return total + float(np.linalg.norm(point)) or 1.0
 
 
-def _equations(one: Closures, reach: float, place: int | None) -> tuple[Equation, ...]:
+def _equations(one: Closures, d: int, reach: float, place: int | None) -> tuple[Equation, ...]:
     """Return a closure's equations; vectors of the second frame are in the joint's."""
     if one.kind == "rod":
         return (Distance(0.0 if place is not None else one.length or 0.0, place),)
-    together: tuple[Equation, ...] = tuple(map(Along, ONE))
-    if one.kind == "ball":
+    together: tuple[Equation, ...] = tuple(map(Along, np.eye(d)))
+    if one.kind == "ball" or (one.kind == "pin" and d == 2):
         return together
     axis = _unit(one.axis)
+    if d == 2:
+        return (Along(np.array([-axis[1], axis[0]])),)
     if one.kind == "universal":
         return (*together, Facing(_unit(one.cross_axis), axis, reach))
     across = _unit(np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))

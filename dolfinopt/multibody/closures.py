@@ -161,20 +161,6 @@ class Tie:
     rotation: np.ndarray
     equations: tuple[Equation, ...]
 
-    @classmethod
-    def in_plane(cls, name: str, site: Site, point: np.ndarray, normals: np.ndarray) -> Tie:
-        """Return what holds an interface of a plane machine to the ground's point (2,), m.
-
-        Args:
-            name: of it.
-            site: the interface.
-            point: a pin, or a point of a line.
-            normals: (m, 2) directions of its forces: across a line, or two of a pin.
-        """
-        return cls(
-            name, site, None, np.asarray(point, float), np.eye(2), tuple(map(Along, normals))
-        )
-
     @property
     def is_rod(self) -> bool:
         """Whether its frames are apart."""

@@ -38,7 +38,6 @@ from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
-from dolfinopt.scene.tables.closures import PARTS
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
@@ -373,8 +372,9 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
             name: {unit: float(size.max()) for unit, size in sizes.items()}
             for name, sizes in trajectory.closure_sizes.items()
         }
-    elif trajectory.closure_force is not None:
-        found["closure_force_peak"] = float(np.linalg.norm(trajectory.closure_force, axis=1).max())
+    if trajectory.closure is not None:
+        (sizes,) = trajectory.closure_sizes.values()
+        found["closure_force_peak"] = float(sizes["N"].max())
     return found
 
 
@@ -446,11 +446,10 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     if free := free_drives(scene):
         rigid = scene.rigid_units
         units["drive_error_peak"] = {name: rigid[name] for name in free}
-    if scene.closure is not None:
-        units["closure_force_peak"] = "N"
     if scene.closures:
-        kinds = {one.name: [unit for _, unit in PARTS[one.kind]] for one in scene.closures}
-        units["closure_peak"] = {name: {u: u for u in own} for name, own in kinds.items()}
+        parts = {one.name: one.parts(scene.dimension) for one in scene.closures}
+        units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
+        units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
     units["history.csv"] = {"objective": unit, **HISTORY_UNITS}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)

@@ -10,7 +10,6 @@ import numpy as np
 from dolfinopt.disk import read_arrays, write_arrays, write_text
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.closures import PARTS
 from dolfinopt.scene.tables.joints import joint_parts
 
 BEHIND = "; behind them the bearings', m and rad"
@@ -55,8 +54,8 @@ def write_trajectory(
         "deviation": "m",
         "compliance": "N m",
         "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
-        "closure_force": _of_closures(scene) or "N, " + _directions(scene),
-        "slider_position": "m, from closure.point along closure.direction",
+        "closure_force": ", ".join(_closure_units(scene).values()),
+        "slider_position": "m, from closures.point along closures.axis",
         "rotation": "rad",
         "initial_deviation": "m",
     }
@@ -102,7 +101,7 @@ def _columns(trajectory: Trajectory) -> list[np.ndarray]:
         trajectory.compliance,
         trajectory.joint_forces[:, trajectory.scene.driven_columns],
         *arrays.values(),
-        *([arrays["closure_force"]] if trajectory.scene.closure is not None else []),
+        *([arrays["closure_force"]] if trajectory.closure is not None else []),
         trajectory.rotation,
     ]
 
@@ -149,28 +148,22 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
     if trajectory.is_machine:
         units |= {f"q_r_desired_{name}": unit for name, unit in scene.rigid_units.items()}
         units |= {f"q_motor_{name}": unit for name, unit in _motor_units(trajectory).items()}
-    for one in scene.closures:
-        for part, unit in PARTS[one.kind]:
-            units["_".join(filter(None, ("closure", one.name, part)))] = unit
-    if scene.closure is not None:
-        names = {"slider": ("normal",), "pin": ("x", "y")}[scene.closure.kind]
-        units |= {f"closure_force_{name}": "N" for name in names}
-        units |= {"slider_position": "m"} if scene.closure.kind == "slider" else {}
-        units |= {f"closure_{scene.closure.name}_{name}": "N" for name in names}
+    if trajectory.closure is not None:
+        parts = scene.closures[0].parts(scene.dimension)
+        units |= {f"closure_force_{part}": unit for part, unit in parts}
+        units |= {} if trajectory.slider_position is None else {"slider_position": "m"}
+    units |= _closure_units(scene)
     ends = [""] if trajectory.mechanism.dim.r == 1 else [f"_{axis}" for axis in axes]
     return units | {f"rotation{end}": "rad" for end in ends}
 
 
-def _of_closures(scene: Scene) -> str:
-    """Return the unit of every column of the closures' forces in space; "" in the plane."""
-    return ", ".join(unit for one in scene.closures for _, unit in PARTS[one.kind])
-
-
-def _directions(scene: Scene) -> str:
-    """Return in words along what the closure's forces are positive."""
-    if scene.closure is None or scene.closure.kind == "pin":
-        return "along x and y"
-    return "along closure.direction turned by +90 degrees"
+def _closure_units(scene: Scene) -> dict[str, str]:
+    """Return the unit of every force and moment of closures by its column, `closure_NAME_PART`."""
+    return {
+        "_".join(filter(None, ("closure", one.name, part))): unit
+        for one in scene.closures
+        for part, unit in one.parts(scene.dimension)
+    }
 
 
 def read_initial_deviation(path: Path, even: np.ndarray) -> np.ndarray | None:

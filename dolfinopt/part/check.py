@@ -252,7 +252,7 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
     ):
         yield "objective", found.objective
     yield "compliance", found.compliance
-    if scene.closure is None or scene.closure.kind != "pin":  # such an end stays where it is
+    if not scene.is_pinned:
         yield "deviation", found.max_deviation
         yield "settling", motion.settling
     yield "orientation", motion.max_rotation
@@ -261,14 +261,11 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         yield f"drive_peak_{name}", float(value)
     for number, (other, figures) in enumerate(zip(motion.scenarios, found.scenarios), 1):
         yield f"compliance_scenario_{number}", figures.compliance
-        if scene.closure is None or scene.closure.kind != "pin":
+        if not scene.is_pinned:
             yield f"deviation_scenario_{number}", figures.max_deviation
             yield f"settling_scenario_{number}", other.settling
-    if motion.closure_sizes:
-        for name, sizes in motion.closure_sizes.items():
-            yield f"closure_force_{name}", float(sizes["N"].max())
-    elif motion.closure_force is not None:
-        yield "closure_force", float(np.linalg.norm(motion.closure_force, axis=1).max())
+    for name, sizes in motion.closure_sizes.items():
+        yield f"closure_force_{name}", float(sizes["N"].max())
     yield STRESS, stress
 
 

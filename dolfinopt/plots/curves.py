@@ -349,13 +349,15 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
         if name in free:
             row.insert(0, (f"{name}: error", units[name], {"": error[:, k]}))
         rows.append(row)
-    for name, sizes in trajectory.closure_sizes.items() if scene.closures else ():
+    forces = trajectory.closure_force
+    if forces is None:
+        return rows
+    if trajectory.closure is not None:
+        names = ("",) if forces.shape[1] == 1 else ("x", "y")
+        what = "normal force on the slider" if len(names) == 1 else "force of the pin on the arm"
+        return [*rows, [(what, "N", dict(zip(names, forces.T, strict=True)))]]
+    for name, sizes in trajectory.closure_sizes.items():
         words = {"N": "force", "N m": "moment"}
         row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
         rows += [row] if name not in scene.driven else []  # a driven rod's is its drive's
-    forces = trajectory.closure_force
-    if forces is not None and trajectory.closure is not None:
-        names = ("",) if forces.shape[1] == 1 else ("x", "y")
-        what = "normal force on the slider" if len(names) == 1 else "force of the pin on the arm"
-        rows.append([(what, "N", dict(zip(names, forces.T, strict=True)))])
     return rows

@@ -169,7 +169,6 @@ class PlaneMotion:
 
     def block(self, n: int) -> np.ndarray:
         """Return the corners (4, 2), m, of a slider's block."""
-        assert self.closure is not None
         return block_corners(self.place[n, -1], reach(self.mechanism), self._normal)
 
     @property

@@ -52,7 +52,12 @@ from dolfinopt.scene.tables.arms import (
     Arm,
 )
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
-from dolfinopt.scene.tables.closures import Closures, as_closure
+from dolfinopt.scene.tables.closures import (
+    OLD,
+    Closures,
+    read_old_closure,
+    take_old_keys,
+)
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Force, Joint
 from dolfinopt.scene.tables.motion import Motion, Reduction
@@ -136,6 +141,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     tree.setdefault("name", name)
     tree.setdefault("material", {})  # so that the message names the first key missing in it
     _name_material(tree)
+    read_old_closure(tree, source)
     inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
     sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
     changes = [_override(tree, text, source) for text in overrides]
@@ -152,17 +158,15 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _resolve_files(tree, source, changes)
     _drop_sizes(tree, sizes)
     _measure_bodies(tree, inherited)
-    if (closure := as_closure(tree)) is not None:
-        tree["closure"] = closure
-        del tree["closures"]
     derived = complete(tree, source, changes)
     try:
-        scene = Scene.model_validate(tree)
+        scene = Scene.model_validate({key: tree[key] for key in tree if key != OLD})
     except ValidationError as error:
         message = first_problem(error, tree, inherited, source, changes)
         raise InputError(message) from None
     scene._source = source
     scene._derived = derived
+    scene._has_old_closure = data.get(OLD) is not None
     pose_scenarios(scene)
     return scene
 
@@ -415,6 +419,10 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
     parts = tuple(part.strip() for part in path.split("."))
     if not equals or not all(parts):
         raise input_error(where, "expected key.path=value, for example payload.mass=4.0")
+    if parts[0] == OLD:
+        given = _parse_value(value.strip())
+        take_old_keys(tree, given if len(parts) == 1 else {parts[1]: given}, where)
+        return Override(text, (parts,))
     locs = _override_locs(tree, parts, where)
     for loc in locs:
         if loc[0] == "arms" and loc[2:] in (("cells",), ("mesh",)):

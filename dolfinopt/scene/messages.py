@@ -24,6 +24,7 @@ from dolfinopt.scene.tables.base import (
     table_in,
     without_none,
 )
+from dolfinopt.scene.tables.closures import as_written
 from dolfinopt.scene.tables.objective import need_of
 
 _COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
@@ -63,7 +64,7 @@ def first_problem(
     # A misspelt key is also a missing one: the spelling is the message that helps.
     problems.sort(key=lambda problem: problem.kind != "unknown")
     first, n_more = problems[0], len(problems) - 1
-    where = blamed(source, changes, first.locs)
+    where = blamed(source, changes, (*first.locs, *(as_written(loc, tree) for loc in first.locs)))
     more = f" (and {n_more} more)" if n_more else ""
     return one_line(f"{where}: {first.text}{more}")
 
@@ -235,8 +236,9 @@ def _found(loc: Loc, tree: dict[str, Any]) -> str:
 
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:
     """Return the TOML spelling of a path, with the name of the arm it belongs to."""
+    loc = as_written(loc, tree)
     text = ".".join(map(key_text, loc))
-    named = loc[0] in ("arms", "joints", "closures") and len(loc) > 1
+    named = loc[0] in ("arms", "joints", "closures", "forces") and len(loc) > 1
     name = arm_name(tree, loc[1], loc[0]) if named else None
     return f"{text} ({name})" if name and loc[2:] != ("name",) else text
 
@@ -301,13 +303,18 @@ def implausible(scene: Scene) -> list[str]:
         *_sizes(scene),
         *_motion(scene),
         *_solid_ends(scene),
-        *_without_effect(scene),
+        *_old_words(scene),
     ]
 
 
-def _without_effect(scene: Scene) -> list[str]:
+def _old_words(scene: Scene) -> list[str]:
+    """Tell words that are translated, and keys that are read without effect."""
     keys = sorted({"integrator", "rho_inf"} & scene.simulation.model_fields_set)
-    return [
+    old = (
+        "[closure] is read as one of [[closures]], closure.direction as its axis, closure.force "
+        'as the factor of the force "closure" among [[forces]]; state those'
+    )
+    return [old] * scene.has_old_closure + [
         f"simulation.{key} is read without effect: every motion is integrated by Radau IIA, see "
         "simulation.tolerance"
         for key in keys

@@ -24,7 +24,7 @@ from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, wi
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.joints import interface_number
-from dolfinopt.scene.tables.machine import Closure, Control, Damping, Force, Joint, Payload
+from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
 
@@ -59,13 +59,10 @@ class Scene(Table):
         description="feedback control; without this table the rigid coordinates follow the desired "
         "motion exactly",
     )
-    closure: Closure | None = Field(
-        default=None, description="closed loop; without this table the last arm's end is free"
-    )
     closures: tuple[Closures, ...] = Field(
         default=(),
-        description="joints that close loops of a machine in space; without this table it is a "
-        "tree",
+        description="joints that close loops: in the plane a pin or a slider at the last arm's "
+        "end; without this table the machine is a tree, or a chain",
     )
     payload: Payload = Field(
         description="load of the end-effector",
@@ -88,11 +85,17 @@ class Scene(Table):
 
     _source: str = PrivateAttr("<scene>")
     _derived: tuple[tuple[str, str], ...] = PrivateAttr(())  # (table, key), see `to_tree`
+    _has_old_closure: bool = PrivateAttr(False)  # whether its file states [closure]
 
     @property
     def source(self) -> str:
         """Return the path of the scene's file as messages show it."""
         return self._source
+
+    @property
+    def has_old_closure(self) -> bool:
+        """Whether the scene's data state `[closure]`, an older word for one of `[[closures]]`."""
+        return self._has_old_closure
 
     @property
     def owners(self) -> tuple[int | None, ...]:
@@ -211,7 +214,12 @@ class Scene(Table):
     @property
     def dependent_joints(self) -> int:
         """Number of joints, the last ones, that follow from the others in a closed loop."""
-        return 0 if self.closure is None else self.closure.dependent
+        return 0 if self.is_spatial else sum(len(one.parts(2)) for one in self.closures)
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether a pin holds the end-effector in the plane, which deviates from nothing then."""
+        return not self.is_spatial and any(one.kind == "pin" for one in self.closures)
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -309,7 +317,7 @@ class Scene(Table):
     def _check_tables(self) -> Scene:
         # Closures first: which joints are driven depends on them; then forces, since an interface
         # with a wrong name elsewhere seems to be of no use.
-        first = ("closure", "closures", "forces")
+        first = ("closures", "forces")
         for key in (*first, *(key for key in type(self).model_fields if key not in first)):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]

@@ -56,7 +56,7 @@ Action = Literal["optimize", "simulate", "sample"]
 
 # Scenes that differ in these tables alone have the same arms, which are built and factorised once.
 SCENARIO = frozenset(
-    "motion control closure payload forces damping reduction simulation objective constraints "
+    "motion control closures payload forces damping reduction simulation objective constraints "
     "optimizer scenarios".split()
 )
 # Bases that do not depend on `SCALING`: Krylov's shifts and the Gramian's band are frequencies.

@@ -23,6 +23,7 @@ from dolfinopt.parallel import on_root
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.tables.base import without_none
+from dolfinopt.scene.tables.closures import in_new_words
 from dolfinopt.study.cases import SAMPLED, Case, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
@@ -361,7 +362,7 @@ def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
 
 # Tables and keys that do not change what a given design does, or that no given design outlives.
 TABLES = (
-    "motion", "control", "closure", "payload", "forces", "damping", "material", "arms",
+    "motion", "control", "closures", "payload", "forces", "damping", "material", "arms",
     "interpolation",
 )  # fmt: skip
 RESULTS = (*QUANTITIES, "at [s]")
@@ -497,8 +498,9 @@ def parse_input(scene: Scene, text: str) -> Input:
         raise InputError(f"--random {text}: expected KEY=DISTRIBUTION, {example}")
     with asked_by(f"--random {text}"):
         distribution = parse_distribution(law)
-        middle = float(distribution.at(np.array(0.5)))
-        if not isinstance(nominal_value(changed(scene, f"{key}={middle!r}"), key), float):
+        middle, named = float(distribution.at(np.array(0.5))), key
+        key = in_new_words(key)
+        if not isinstance(nominal_value(changed(scene, f"{named}={middle!r}"), key), float):
             raise InputError("expected a key with a real number as its value")
         parts = key.split(".")
         if parts[0] not in TABLES:
@@ -507,30 +509,26 @@ def parse_input(scene: Scene, text: str) -> Input:
             )
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
-        several = parts[0] in ("arms", "forces")
-        field = field_at((parts[0], 0, parts[-1]) if several else tuple(parts))
+        field = field_at((parts[0], parts[-1]))
         try:
-            return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
+            return Input(named, nominal_value(scene, key), distribution.within(*_range(field)))
         except InputError as error:
             raise InputError(f"{error}; {key} is {allowed_words(field)}") from None
 
 
 def nominal_value(scene: Scene, key: str) -> object:
     """Return the scene's value of a key, None where arms differ in it."""
-    parts = key.split(".")
-    if parts[0] == "forces":  # told by their numbers
-        places = [int(parts[1])] if len(parts) == 3 else range(len(scene.forces))
-        found = {getattr(scene.forces[i], parts[-1], None) for i in places}
-        return found.pop() if len(found) == 1 else None
-    if parts[0] != "arms":
-        return getattr(getattr(scene, parts[0]), parts[1], None)
-    count = len(scene.arms)
-    names = [*map(str, range(count)), *(arm.name for arm in scene.arms)]
-    places = [names.index(parts[1]) % count] if len(parts) == 3 else range(count)
+    table, *which, name = in_new_words(key).split(".")
+    rows = getattr(scene, table)
+    if not isinstance(rows, tuple):
+        return getattr(rows, name, None)
     values = set()
-    for i in places:
-        own = getattr(scene.arms[i], parts[-1])
-        values.add(getattr(scene.material_of(i), parts[-1], None) if own is None else own)
+    for i, row in enumerate(rows):
+        own = getattr(row, name, None)
+        if own is None and table == "arms":
+            own = getattr(scene.material_of(i), name, None)
+        if not which or which[0] in (str(i), row.name):
+            values.add(own)
     return values.pop() if len(values) == 1 else None
 
 

@@ -262,8 +262,8 @@ def test_loops_of_the_plane(kind: str, side: int) -> None:
     motion = rigid_motion(t, scene)
     lengths = np.array([arm.length for arm in scene.arms])
     end = (lengths * np.exp(1j * np.cumsum(motion.q[:, 1:], axis=1))).sum(axis=1)
-    end = end + 1j * scene.motion.joint_height - complex(*scene.closure.point)
-    gap = (np.conj(1j * complex(*scene.closure.direction)) * end).real if line else np.abs(end)
+    end = end + 1j * scene.motion.joint_height - complex(*scene.closures[0].point)
+    gap = (np.conj(1j * complex(*line["direction"])) * end).real if line else np.abs(end)
     assert np.abs(gap).max() < 1e-14
     assert np.sign(np.angle(np.exp(1j * motion.q[0, -1]))) == side
     assert np.abs(np.diff(motion.q, axis=0)).max() < 1.0  # no jump by a turn

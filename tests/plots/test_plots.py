@@ -13,7 +13,7 @@ from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.multibody.closures import Tie
+from dolfinopt.multibody.closures import Along, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
@@ -354,7 +354,8 @@ def tie(site: tuple[int, int], point: complex, direction: complex | None = None)
     if direction is not None:
         across = 1j * direction / abs(direction)
         normals = np.array([[across.real, across.imag]])
-    return Tie.in_plane("closure", site, np.array([point.real, point.imag]), normals)
+    place = np.array([point.real, point.imag])
+    return Tie("closure", site, None, place, np.eye(2), tuple(map(Along, normals)))
 
 
 def gap_of(closure: Tie, place: np.ndarray) -> np.ndarray:

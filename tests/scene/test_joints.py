@@ -140,7 +140,7 @@ REFUSED = [
     (("motion", "cart_mass"), 2.0, "motion.cart_mass", "0.0, the default, with [[joints]]"),
     (("objective",), {"kind": "static", "loads": [[0, 1, 2]]}, "loads", "arrays of six numbers"),
     (("objective",), {"kind": "eigenfrequency", "elbow_angle": 0.1}, "elbow_angle", "the middle"),
-    (("closure",), {"kind": "pin"}, "closure", "no [closure] with [[joints]]"),
+    (("closure",), {"kind": "pin"}, "closure", "[[closures]]"),
     (("control",), {"stiffness": [1], "damping": [1, 1]}, "control", "2 numbers, for yaw, lift"),
     (("joints",), ROBOT["joints"][:1], 'arms.1.name = "slide"', "one of [[joints]]"),
 ]  # fmt: skip

@@ -52,7 +52,15 @@ USED = {
 NO_LIMITS = {"objective.loads", "scenarios.weight", "reduction.tolerance", "simulation.tolerance"}
 
 
-MACHINE_KEYS = ("control.", "closure.", "arms.joint", "arms.rotor", "arms.gear", "motion.speed")
+MACHINE_KEYS = (
+    "control.",
+    "closures.point",
+    "closures.axis",
+    "arms.joint",
+    "arms.rotor",
+    "arms.gear",
+    "motion.speed",
+)
 MACHINE_KEYS += ("motion.start_angle", "motion.cart_mass")
 
 
@@ -86,8 +94,8 @@ def tree_at(key, value):
             data["arms"][0]["joint_stiffness"] = 1e3
     elif table == "control":
         data["control"] = {"stiffness": [2e3], "damping": [20.0], name: [value]}
-    elif name in ("point", "direction"):
-        data["closure"][name] = [value, value]
+    elif table == "closures":
+        data["closure"][{"axis": "direction"}.get(name, name)] = [value, value]
     elif name == "cart_mass":
         base = load_scene(TWO_ARM, ["arms.cells=[8,2]", "simulation.tolerance=0.01"]).to_tree()
         data = base | {"control": GAINS, "motion": base["motion"] | {name: value}}

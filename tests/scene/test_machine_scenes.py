@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from loops import BOOM_TABLE, boom, closed, four_bar
-from machines import CRANK, ROD, controlled, fork, loop, loop_tree, two_arm, with_keys
+from machines import CRANK, ROD, controlled, fork, loop, loop_tree, simulated, two_arm, with_keys
 from mpi4py import MPI
 from remainders import built_of
 from runs import ROOT, TWO_ARM, refusal, refused, scene
@@ -17,6 +17,7 @@ from scenes import put_at
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
 from dolfinopt.multibody.build import loops_of
 from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
+from dolfinopt.scene.messages import implausible
 
 pytestmark = pytest.mark.serial
 POLES, EFFORT = "constraints.damping_ratio=0.05", "objective.kind=effort"
@@ -42,7 +43,7 @@ CONTROLLED = [
     ("arms.bearing_stiffness=[0, 0, 0, 0, 1e6, inf]", "arms.0.bearing_stiffness", "about y"),
     ("control.forces=nothing.csv", 'forces = "nothing.csv"', "the path of a file"),
     ("control.gain=3", "control.gain", "unknown key"),
-    ("closure.kind=slider", 'motion.base = "cart"', '"fixed" with [closure]'),
+    ("closure.kind=slider", 'motion.base = "cart"', '"fixed" with [[closures]]'),
     ("constraints.damping_below=10.0", "damping_below = 10.0", "without constraints.damping_ratio"),
     (POLES, "constraints.poles_at=[0.5,9.0]", "constraints.poles_at", "motion.horizon"),
     ("constraints.damping_ratio=1.5", "damping_ratio = 1.5", "<= 0.99"),
@@ -94,18 +95,18 @@ def test_two_arms_that_cannot_be(make, told):
         ("slider", {"scenarios": [{"changes": ["control.stiffness=[1e3, 1.0]"]}],
                     "control": {"stiffness": [2e3], "damping": [20.0]}}, ["1 number, for crank"]),
         ("slider", {"closure": {"kind": "pin"}}, ['closure.kind = "pin"', "at least 3 arms"]),
-        ("slider", {"closure": {"direction": [0.0, 0.0]}}, ["closure.direction", "than zero"]),
+        ("slider", {"closure": {"direction": [0.0, 0.0]}}, ["closure.direction", "length zero"]),
         ("slider", {"closure": {"side": 0}}, ["closure.side = 0", "-1 | 1"]),
         ("pin", {"closure": {"force": 3.0}}, ["closure.force = 3.0", "0.0, the default, with"]),
         ("pin", {"closure": {"direction": [0.0, 1.0]}}, ["closure.direction", "the default, with"]),
         ("slider", {"motion": {"path": "arc"}}, ["motion.", "expected"]),
-        ("pin", {"objective": {"kind": "deviation"}}, ['objective.kind = "deviation"', '"pin"']),
+        ("pin", {"objective": {"kind": "deviation"}}, ['objective.kind = "deviation"', "a pin"]),
         ("slider", {"arms": [CRANK, ROD | {"joint_stiffness": 10.0}]},
          ["arms.1.joint_stiffness (rod) = 10.0", "no drive"]),
         ("slider", {"arms": [CRANK, ROD | {"gear_stiffness": 10.0}]},
          ["arms.1.gear_stiffness (rod) = 10.0", "no drive"]),
         ("slider", {"arms": [CRANK, ROD | {"bearing_stiffness": [1e6, 0, 0, 0, 0, 0]}]},
-         ["arms.1.bearing_stiffness (rod)", "none with [closure]"]),
+         ["arms.1.bearing_stiffness (rod)", "none with [[closures]]"]),
         ("slider", {"arms": [CRANK | {"joint_stiffness": 1.0, "gear_stiffness": 1.0}, ROD]},
          ["arms.0.joint_stiffness (crank) = 1.0", "only one of"]),
         # Where it cannot be assembled the instant is named.
@@ -163,7 +164,10 @@ def test_scenarios_change_gains_and_closures():
     changes = [{"changes": ["control.stiffness=[1e3]"]}, {"changes": ["closure.force=10.0"]}]
     gains = {"stiffness": [2e3], "damping": [20.0]}
     first, second = pose_scenarios(loop(control=gains, scenarios=changes))
-    assert first.control.stiffness == (1e3,) and second.closure.force == 10.0
+    assert first.control.stiffness == (1e3,) and not first.forces
+    (force,) = second.forces
+    assert (force.name, force.arm, force.factor) == ("closure", "rod", 10.0)
+    assert force.force == (1.0, 0.0)
 
 
 FORK_PUSH = {"arm": "link", "force": [0.0, 0.0, 1.0]}
@@ -182,7 +186,7 @@ FORK_PUSH = {"arm": "link", "force": [0.0, 0.0, 1.0]}
         ({"arm": "arm1", "force": [1.0, 2.0], "frame": "tip"}, ["frame", '"world" | "arm"']),
         ({"arm": "arm1", "force": [1.0, 2.0], "feed_forward": False},
          ["forces.0.feed_forward = false", "the default", "[control]"]),
-        ({"arm": "arm1", "force": [1.0, 2.0], "factor": 1e9}, ["forces.0.factor", "<= 1000000"]),
+        ({"arm": "arm1", "force": [1.0, 2.0], "factor": 1e13}, ["forces.0.factor", "<= 1e+12"]),
         ({"arm": "arm1", "table": "nowhere.csv"}, ['forces.0.table = "nowhere.csv"', "a file"]),
         ({**FORK_PUSH, "force": [1.0, 2.0]}, ["forces.0.force", "three numbers", "[[joints]]"]),
         ({**FORK_PUSH, "moment": 2.0}, ["forces.0.moment", "array of three numbers"]),
@@ -282,17 +286,81 @@ def in_plane(kind: str, **keys: Any) -> dict:
 
 def test_the_plane_has_closures_that_are_its_closure():
     named = {"name": "end"}
-    for key, value in (("axis", [2.0, 0.0, 0.0]), ("axis", [2.0, 0.0]), ("direction", [2.0, 0.0])):
-        found = scene_from_dict(in_plane("slider", **{key: value}))
+    for key in ("axis", "direction"):
+        found = scene_from_dict(in_plane("slider", **{key: [2.0, 0.0]}))
         assert found == loop("slider", closure=named | {"direction": [2.0, 0.0]})
-        assert not found.closures
-    for point in ([0.25, 0.0, 0.0], [0.25, 0.0]):
-        found = scene_from_dict(in_plane("pin", point=point, side=-1))
-        assert found == loop("pin", closure=named)
-    up = {"axis": [0, 0, 1]}
-    for keys in ({"point": [0.2, 0.0, 0.1]}, {"axis": [1, 0, 0]}, {"between": ["crank", "ground"]}):
-        with refused("closures.0.kind", "the last arm and the ground", "[[joints]]"):
-            scene_from_dict(in_plane("pin", **(up | keys)))
+    assert scene_from_dict(in_plane("pin", point=[0.25, 0.0], side=-1)) == loop(
+        "pin", closure=named
+    )
+    # A third number says nothing new.
+    for kind, flat, keys in (
+        ("slider", {"axis": [2.0, 0.0]}, {"axis": [2.0, 0.0, 0.0]}),
+        ("pin", {"point": [0.25, 0.0]}, {"point": [0.25, 0.0, 0.0], "axis": [0.0, 0.0, 1.0]}),
+    ):
+        (one,), (other,) = (
+            loops_of(scene_from_dict(in_plane(kind, side=-1, **given))).ties
+            for given in (flat, keys)
+        )
+        np.testing.assert_array_equal(one.point, other.point)
+        normals = [[k.e for k in tie.equations] for tie in (one, other)]
+        np.testing.assert_array_equal(*normals)
+    for keys, *words in (
+        ({"point": [0.2, 0.0, 0.1]}, "closures.0.point", "two numbers"),
+        ({"axis": [1, 0, 0]}, "closures.0.axis", "[0, 0, 1]"),
+        ({"between": ["crank", "ground"]}, "closures.0.kind", "the last arm and the ground"),
+        ({"rpy": [0.0, 0.0, 1.0]}, "closures.0.kind", "[[joints]]"),
+    ):
+        with refused(*words):
+            scene_from_dict(in_plane("pin", **keys))
+
+
+def test_both_spellings_of_a_loaded_slider_are_the_same():
+    """The same scene and the same bits; changes are understood in both spellings."""
+    line = {"point": [0.0, 0.01], "side": 1}
+    was = loop_tree(closure=line | {"direction": [1.0, 0.1], "force": -200.0})
+    size = np.hypot(1.0, 0.1)
+    now = in_plane("slider", axis=[1.0, 0.1], name="closure", **line)
+    force = {"name": "closure", "arm": "rod", "force": [1.0 / size, 0.1 / size], "factor": -200.0}
+    now["forces"] = [force]
+    old, new = map(scene_from_dict, (was, now))
+    assert old == new and old.has_old_closure and not new.has_old_closure
+    assert ["[closure]" in one for one in implausible(old)] == [True] and not implausible(new)
+    a, b = (simulated(one).trajectory for one in (was, now))
+    np.testing.assert_array_equal(a.q_r, b.q_r)
+    np.testing.assert_array_equal(a.closure_force, b.closure_force)
+    for was, now in (
+        ("closure.force=7", "forces.closure.factor=7.0"),
+        ("closure.side=-1", "closures.closure.side=-1"),
+        ("closure.point=[0.0, 0.02]", "closures.0.point=[0.0, 0.02]"),
+    ):
+        assert scene_from_dict(old.to_tree(), overrides=[was]) == scene_from_dict(
+            new.to_tree(), overrides=[now]
+        )
+    turned = scene_from_dict(new.to_tree(), overrides=["closure.direction=[0.0, 2.0]"])
+    assert turned.forces[0].force == (0.0, 1.0) and turned.forces[0].factor == -200.0
+
+
+@pytest.mark.parametrize(
+    ("tree", "changes", "words"),
+    [
+        (loop_tree(), ["closure.side=0"], ("--set closure.side=0", "closure.side = 0", "-1 | 1")),
+        (loop_tree(), ["closure.sides=1"], ("unknown key closure.sides", "closures.0.side?")),
+        (loop_tree(), ["closure.force=1e13"], ("closure.force", "a number", "<= 1e+12")),
+        (loop_tree(), ["closure.force=much"], ('closure.force = "much"', "a number")),
+        (loop_tree(), ["closure=3"], ("closure:", "[[closures]]")),
+        (loop_tree() | {"closure": 3}, [], ("closure:", "[[closures]]")),
+        (loop_tree(closure={"point": [0.0, 1e5]}), [], ("closure.point", "two numbers")),
+        (
+            in_plane("slider", axis=[1, 0]) | {"closure": {"side": 1}},
+            [],
+            ("closure:", "[[closures]]"),
+        ),
+        (in_plane("slider", axis=[1, 0]), ["closures.end.side=0"], ("closures.0.side (end) = 0",)),
+    ],
+)
+def test_keys_of_the_closure_are_told_as_they_are_written(tree, changes, words):
+    with refused(*words):
+        scene_from_dict(tree, overrides=changes)
 
 
 CLOSURE = ("closures", 0)

@@ -74,7 +74,7 @@ def test_every_value_is_part_of_the_key():
     """But the name; closures and joints are tables of other machines."""
     known = Case(scene()).key
     assert Case(scene('name="another"'), label="b").key == known
-    assert {*scene_content(scene())} == {*CHANGES, "closure", "closures", "joints"}
+    assert {*scene_content(scene())} == {*CHANGES, "closures", "joints"}
     for change in CHANGES.values():
         assert Case(scene(change)).key != known
     spatial = TWO_ARM.parent / "spatial_arm.toml"

@@ -1,4 +1,4 @@
-"""`[[closures]]`: joints that close loops between arms, or with the ground, in space."""
+"""`[[closures]]`: joints that close loops between arms, or with the ground."""
 
 from __future__ import annotations
 
@@ -6,27 +6,46 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from dolfinopt.scene.tables.base import Length, Loc, Position, Refusal, Table, shown
-from dolfinopt.scene.tables.joints import OUTBOARD, interface_number, refuse_unknown
+from dolfinopt.scene.tables.base import (
+    Length,
+    Loc,
+    Position,
+    Refusal,
+    Table,
+    input_error,
+    shown,
+)
+from dolfinopt.scene.tables.joints import (
+    OUTBOARD,
+    Components,
+    check_direction,
+    interface_number,
+    refuse_unknown,
+)
 from dolfinopt.scene.tables.machine import (
     GROUND,
     Angle,
     Component,
+    Direction,
     Gain,
     check_joint_name,
 )
-from dolfinopt.scene.tables.objective import need_of
+from dolfinopt.scene.tables.objective import asked, need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
-UP = [0, 0, 1]
+Line = tuple[Component, Component]
 Kind = Literal["ball", "pin", "slider", "universal", "rod"]
-Direction = tuple[Component, Component, Component]
-# What is positive of every equation's force, in the joint's frame, and its unit.
-PARTS: dict[str, tuple[tuple[str, str], ...]] = {
+# Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
+OF_THE_END = ("deviation", "settling")
+# What is positive of every equation's force, in the joint's frame, and its unit; in the plane and
+# in space.
+Parts = tuple[tuple[str, str], ...]
+IN_PLANE: dict[str, Parts] = {"pin": (("x", "N"), ("y", "N")), "slider": (("normal", "N"),)}
+IN_SPACE: dict[str, Parts] = {
     "ball": (("x", "N"), ("y", "N"), ("z", "N")),
     "pin": (("x", "N"), ("y", "N"), ("z", "N"), ("moment_1", "N m"), ("moment_2", "N m")),
     "slider": (("force_1", "N"), ("force_2", "N"), ("moment_1", "N m"), ("moment_2", "N m"),
@@ -44,13 +63,14 @@ class Closures(Table):
     )
     kind: Kind = Field(
         description="ball (3 equations), pin about an axis (5), slider along an axis that does not "
-        "turn (5), universal of two crossing axes (4), or a rod between two balls (1) [-]"
+        "turn (5), universal of two crossing axes (4), or a rod between two balls (1); in the "
+        "plane pin (2), or slider that may turn (1) [-]"
     )
     between: tuple[str, str] = Field(
         description='what it joins: "arm.interface" or "arm" for its outboard one, then another '
         'or "ground" [-]'
     )
-    point: tuple[Position, Position, Position] = Field(
+    point: tuple[Position, Position] | tuple[Position, Position, Position] = Field(
         default=(0.0, 0.0, 0.0),
         description="the joint in the frame of the second interface, or in the world's [m]",
     )
@@ -59,10 +79,10 @@ class Closures(Table):
         description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; at zero the "
         "first interface's frame lies like it [rad]",
     )
-    axis: Direction | None = Field(
+    axis: Line | tuple[Component, Component, Component] | None = Field(
         default=None,
-        description="of a pin, a slider, or the universal joint's axis on the second interface, in "
-        "the joint's frame, of any length [-]",
+        description="of a pin in space, a slider, or the universal joint's axis on the second "
+        "interface, in the joint's frame, of any length [-]",
     )
     cross_axis: Direction | None = Field(
         default=None,
@@ -75,7 +95,8 @@ class Closures(Table):
     )
     side: Literal[-1, 1] = Field(
         default=1,
-        description="in the plane: which way the loop is assembled, as of [closure]; in space "
+        description="in the plane: which way the loop is assembled: sign of the last joint's angle "
+        "at the start; where that is zero, the stretched way; instead, and in space, "
         "motion.initial_joints says it [-]",
     )
     stiffness: float = Field(
@@ -98,10 +119,19 @@ class Closures(Table):
         """Whether the length of a rod changes: it is a rigid coordinate of the machine."""
         return self.driven or self.is_spring
 
+    def parts(self, dimension: int) -> Parts:
+        """Return what is positive of every equation's force, in the joint's frame, and its unit."""
+        return (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
+
     def site(self, which: int) -> tuple[str, str]:
         """Return arm and interface of the first (0) or second (1) end."""
         arm, _, interface = self.between[which].partition(".")
         return arm, interface or OUTBOARD
+
+    @field_validator("axis")
+    @classmethod
+    def _check_axis(cls, axis: Components | None) -> Components | None:
+        return axis if axis is None else check_direction(axis)
 
     @model_validator(mode="after")
     def _check_kind(self) -> Closures:
@@ -110,47 +140,47 @@ class Closures(Table):
         self.refuse_unused(self.kind in ("pin", "slider", "universal"), "kind", "axis")
         self.refuse_unused(self.kind != "rod", "kind", "rpy")
         self.refuse_unused(self.is_spring, "stiffness", "damping")
-        needed = {"pin": ("axis",), "slider": ("axis",), "universal": ("axis", "cross_axis")}
+        needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
         for key in needed.get(self.kind, ()):
-            value = getattr(self, key)
-            if value is None:
-                raise Refusal(
-                    f"expected an array of three numbers with a {self.kind}", (key,), ("kind",)
-                )
-            if math.hypot(*value) < 1e-9:
-                raise Refusal("expected a direction, not of length zero", (key,))
+            if getattr(self, key) is None:
+                reason = f"expected an array of three numbers with a {self.kind}"
+                raise Refusal(reason, (key,), ("kind",))
         if self.kind == "universal":
             self._check_cross()
         return self
 
     def _check_cross(self) -> None:
         assert self.axis is not None and self.cross_axis is not None
-        along = sum(a * b for a, b in zip(self.axis, self.cross_axis, strict=True))
+        along = sum(a * b for a, b in zip(self.axis, self.cross_axis, strict=False))
         if abs(along) > 1e-6 * math.hypot(*self.axis) * math.hypot(*self.cross_axis):
             raise Refusal("expected a direction across closures.axis", ("cross_axis",), ("axis",))
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
-        if not scene.is_spatial:
-            raise Refusal(
-                "expected one pin or slider between the last arm and the ground without "
-                "[[joints]], nothing else of [[closures]] beside it: more is closed in space, with "
-                "[[joints]] about the plane's normal",
-                (*at, "kind"),
-                ("arms",),
-            )
-        if self.side != type(self).model_fields["side"].default:
+        taken = [joint.name for joint in scene.joints]
+        taken += [one.name for one in scene.closures[: at[-1]]]
+        if self.name.casefold() in map(str.casefold, taken):
+            raise Refusal("expected a name that no joint or other closure has", (*at, "name"))
+        self._check_ends(scene, at)
+        if scene.is_spatial:
+            self._check_in_space(scene, at)
+        else:
+            self._check_in_plane(scene, at)
+
+    def _check_in_space(self, scene: Scene, at: Loc) -> None:
+        """Refuse what is of the plane, and what a loop in space cannot be combined with."""
+        if self.side != 1:
             raise Refusal(
                 "expected 1, the default, with [[joints]]: motion.initial_joints says which way "
                 "the loop is assembled",
                 (*at, "side"),
                 ("joints",),
             )
-        taken = [joint.name for joint in scene.joints]
-        taken += [one.name for one in scene.closures[: at[-1]]]
-        if self.name.casefold() in map(str.casefold, taken):
-            raise Refusal("expected a name that no joint or other closure has", (*at, "name"))
-        self._check_ends(scene, at)
+        if self.kind == "pin" and self.axis is None:
+            raise Refusal("expected an array of three numbers with a pin", (*at, "axis"))
+        for key in ("point", "axis"):
+            if len(getattr(self, key) or ()) == 2:
+                raise Refusal("expected an array of three numbers with [[joints]]", (*at, key))
         if self.is_spring and scene.control is not None:
             raise Refusal(
                 "expected 0 with [control]: a driven rod has its drive's gains there",
@@ -169,6 +199,78 @@ class Closures(Table):
                 "expected a joint without passive = true, or a rod without length: nothing is "
                 "driven",
                 ("joints", 0, "passive"),
+                (*at, "kind"),
+            )
+
+    def _check_in_plane(self, scene: Scene, at: Loc) -> None:
+        """Refuse all but one pin or slider at the chain's end, and what it rules out."""
+        ends = [closing_site(scene, self, which) for which in (0, 1)]
+        alone = ends == [(len(scene.arms) - 1, 0), None] and len(scene.closures) == 1
+        if not alone or self.kind not in IN_PLANE or any(self.rpy):
+            raise Refusal(
+                "expected one pin or slider between the last arm and the ground without "
+                "[[joints]]: more is closed in space, with [[joints]] about the plane's normal",
+                (*at, "kind"),
+                ("arms",),
+            )
+        if any(self.point[2:]):
+            raise Refusal("expected an array of two numbers without [[joints]]", (*at, "point"))
+        axis = self.axis or (0.0, 0.0, 1.0)
+        if any(axis[:2] if self.kind == "pin" else axis[2:]):
+            expected = "[0, 0, 1], the default" if self.kind == "pin" else "two numbers"
+            raise Refusal(f"expected {expected}, without [[joints]]", (*at, "axis"))
+        if len(scene.arms) <= scene.dependent_joints:
+            raise Refusal(
+                f'expected kind = "{self.kind}" with at least {scene.dependent_joints + 1} arms, '
+                f"found {len(scene.arms)}",
+                (*at, "kind"),
+                ("arms",),
+            )
+        if scene.motion.base != "fixed":
+            raise Refusal('expected "fixed" with [[closures]]', ("motion", "base"), (*at, "kind"))
+        if scene.motion.path not in ("rotation", "joints"):
+            raise Refusal(
+                'expected "rotation" or "joints" with [[closures]] without [[joints]]: the motion '
+                "prescribes the joints that are independent",
+                ("motion", "path"),
+                (*at, "kind"),
+            )
+        self._check_springs(scene, at)
+        if self.kind == "pin":
+            self._check_pin(scene, at)
+
+    def _check_springs(self, scene: Scene, at: Loc) -> None:
+        """Refuse springs between drive and arm at joints of the plane that have no drive."""
+        first = len(scene.arms) - scene.dependent_joints
+        for index, arm in enumerate(scene.arms):
+            for key in ("joint_stiffness", "gear_stiffness"):
+                if index >= first and getattr(arm, key) > 0.0:
+                    raise Refusal(
+                        f"expected 0: the joint of {arm.name} follows from the others in the "
+                        "closed loop and has no drive",
+                        ("arms", index, key),
+                        (*at, "kind"),
+                    )
+            if arm.bearing_stiffness is not None:
+                raise Refusal(
+                    "expected none with [[closures]] without [[joints]]: state [[joints]] about "
+                    "the plane's normal, or leave it out",
+                    ("arms", index, "bearing_stiffness"),
+                    (*at, "kind"),
+                )
+
+    def _check_pin(self, scene: Scene, at: Loc) -> None:
+        """Refuse responses of the deviation of an end that a pin holds, and forces along a line."""
+        for n, force in enumerate(scene.forces):
+            if force.name == OLD:
+                reason = "expected 0.0, the default, with a pin: its end does not move"
+                raise Refusal(reason, ("forces", n, "factor"), (*at, "kind"))
+        for key in set(OF_THE_END).intersection(asked(scene)):
+            place = ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
+            raise Refusal(
+                "expected another response with a pin: the end of the last arm is held, it "
+                "deviates from nothing; take the compliance",
+                place,
                 (*at, "kind"),
             )
 
@@ -200,32 +302,87 @@ def closing_site(scene: Scene, one: Closures, which: int) -> tuple[int, int] | N
     return k, interface_number(scene.arms[k], interface) or 0
 
 
-def as_closure(tree: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return [closure] of a plane scene, not validated yet, that states it as [[closures]].
+# -- `[closure]`, an older word -------------------------------------------------------------------
+#
+# The tree is the scene as read, before it is validated: values of any type may stand in it.
 
-    Points and directions have two numbers there, or three; `direction` is another word for `axis`.
-    None where that is not all that is asked for: validation tells why.
+OLD = "closure"  # the table, and the name of what it states among [[closures]] and [[forces]]
+
+
+def read_old_closure(tree: dict[str, Any], source: str) -> None:
+    """Put [closure] of a scene in its places; `direction` is another word for `axis`.
+
+    Raises:
+        InputError: it is no table, or stands beside [[closures]] or [[joints]].
     """
-    closures, arms = tree.get("closures"), tree.get("arms")
-    if tree.get("joints") or tree.get("closure") or not isinstance(arms, list):
-        return None
-    if not isinstance(closures, list) or len(closures) != 1 or not isinstance(closures[0], dict):
-        return None
-    one, last = dict(closures[0]), arms[-1].get("name") if isinstance(arms[-1], dict) else None
-    slides, ends = one.get("kind") == "slider", ([last, GROUND], [f"{last}.{OUTBOARD}", GROUND])
-    axis, point = one.pop("axis", one.pop("direction", None)), one.pop("point", [0.0, 0.0])
-    if one.pop("between", None) not in ends or one.get("kind") not in ("pin", "slider"):
-        return None
-    right = _is_flat(axis) if slides else axis is None or (_is_vector(axis) and axis[:2] == UP[:2])
-    if not (right and _is_flat(point)) or set(one) - {"name", "kind", "side"}:
-        return None
-    return one | {"point": point[:2]} | ({"direction": axis[:2]} if slides else {})
+    for one in _rows(tree, "closures"):
+        if "direction" in one and "axis" not in one:
+            one["axis"] = one.pop("direction")
+    if (table := tree.pop(OLD, None)) is not None:
+        others = tree.get("closures") or tree.get("joints")
+        take_old_keys(tree, None if others else table, source)
 
 
-def _is_flat(x: Any) -> bool:
-    """Return whether a value is a vector of the plane: two numbers, or a third that is 0."""
-    return isinstance(x, list) and (len(x) == 2 or (_is_vector(x) and x[2] == 0.0))
+def take_old_keys(tree: dict[str, Any], table: Any, source: str) -> None:
+    """Put keys of [closure] in their places: of [[closures]], and `force` of [[forces]].
+
+    Raises:
+        InputError: it is no table.
+    """
+    if not isinstance(table, dict):
+        raise input_error(source, "closure: expected [[closures]], of which it is an older word")
+    tree[OLD] = True  # messages name its keys
+    last = [arm.get("name") for arm in _rows(tree, "arms")][-1:]
+    tree["closures"] = tree.get("closures") or [{"name": OLD, "between": [*last, GROUND]}]
+    for one in _rows(tree, "closures")[:1]:
+        before = _unit(one.get("axis"))
+        one.update({"axis" if key == "direction" else key: x for key, x in table.items()})
+        load = one.pop("force", None)
+        if one.get("kind") == "slider":
+            one.setdefault("axis", [1.0, 0.0])
+        elif one.get("axis") == [1.0, 0.0]:
+            del one["axis"]  # the default of a line
+        if load and not _old_forces(tree):
+            tree["forces"] = [*(tree.get("forces") or []), {"name": OLD, "arm": last[0]}]
+        for force in _old_forces(tree):
+            if load is not None:
+                force["factor"] = load
+            if load is not None or force.get("force") == before:
+                force["force"] = _unit(one.get("axis"))
 
 
-def _is_vector(x: Any) -> bool:
-    return isinstance(x, list) and len(x) == 3
+def _old_forces(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return [force for force in _rows(tree, "forces") if force.get("name") == OLD]
+
+
+def _rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    """Return the tables of an array of tables."""
+    rows = tree.get(key)
+    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+
+
+def _unit(axis: Any) -> list[float]:
+    """Return an axis of the plane of length 1; along x where it is none, which is refused."""
+    try:
+        size = math.hypot(*axis[:2])
+        return [x / size for x in axis[:2]]
+    except (TypeError, ZeroDivisionError):
+        return [1.0, 0.0]
+
+
+def as_written(loc: Loc, tree: Mapping[str, Any]) -> Loc:
+    """Return the path of a key as [closure] has it, where the scene states that."""
+    if OLD in tree and len(loc) > 2 and loc[0] == "closures":
+        return (OLD, *("direction" if part == "axis" else part for part in loc[2:]))
+    if OLD in tree and len(loc) > 2 and loc[0] == "forces":
+        return (OLD, "force") if tree["forces"][loc[1]].get("name") == OLD else loc
+    return loc
+
+
+def in_new_words(key: str) -> str:
+    """Return a dotted key of [closure] as a scene has it, any other as it is."""
+    table, _, rest = key.partition(".")
+    if table != OLD:
+        return key
+    known = {"force": f"forces.{OLD}.factor", "direction": "closures.0.axis"}
+    return known.get(rest, f"closures.0.{rest}")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from dolfinopt.scene.tables.base import Length, Loc, Position, Refusal, Table, shown
 
@@ -17,6 +17,17 @@ if TYPE_CHECKING:
 INBOARD, OUTBOARD = "inboard", "outboard"
 Point = tuple[Position, Position, Position]
 Vector = tuple[float, float, float]
+Components = TypeVar("Components", bound=tuple[float, ...])
+
+
+def check_direction(axis: Components) -> Components:
+    """Return a direction unless it has no length."""
+    if math.hypot(*axis) < 1e-9:
+        raise Refusal("expected a direction, not of length zero")
+    return axis
+
+
+Axis = Annotated[Vector, AfterValidator(check_direction)]
 
 
 def _check_name(name: str) -> str:
@@ -45,16 +56,11 @@ class Interface(Table):
         "within this distance of the point, each as a whole, are the interface; with axis, of the "
         "bore [m]",
     )
-    axis: Vector | None = Field(
+    axis: Axis | None = Field(
         default=None,
         description="of an arm with a mesh file: the interface is the bore of this radius about "
         "the line through the point along this direction, of any length, in the point's frame [-]",
     )
-
-    @field_validator("axis")
-    @classmethod
-    def _check_axis(cls, axis: Vector | None) -> Vector | None:
-        return axis if axis is None else check_direction(axis)
 
 
 def interface_number(arm: Arm, name: str) -> int | None:
@@ -125,26 +131,12 @@ SAME_LENGTH = 1e-3
 ALONG = 1e-3  # sine of the angle from an axis to the arm's, below which they are parallel
 
 
-def check_direction(axis: Vector) -> Vector:
-    """Return a direction unless it has no length."""
-    if math.hypot(*axis) < 1e-9:
-        raise Refusal("expected a direction, not of length zero")
-    return axis
-
-
 class Bore(Table):
     """The bore that is an interface of an arm with a mesh file, in the file's frame."""
 
     point: Point = Field(description="the middle of the bore on its axis, in the file's frame [m]")
-    axis: Vector = Field(
-        description="direction of its axis, of any length, in the file's frame [-]"
-    )
+    axis: Axis = Field(description="direction of its axis, of any length, in the file's frame [-]")
     radius: Length = Field(description="its radius [m]")
-
-    @field_validator("axis")
-    @classmethod
-    def _check_axis(cls, axis: Vector) -> Vector:
-        return check_direction(axis)
 
 
 def check_bores(arm: Arm) -> None:

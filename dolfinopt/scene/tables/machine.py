@@ -1,8 +1,7 @@
-"""Joints, closure, control, damping, payload, forces: what holds, moves and loads a machine."""
+"""Joints, control, damping, payload, forces: what holds, moves and loads a machine."""
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -21,6 +20,7 @@ from dolfinopt.scene.tables.joints import (
     GearStiffness,
     Inertia,
     Ratio,
+    check_direction,
     check_parts,
     check_used,
     joint_parts,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 Component = Annotated[float, Field(ge=-1e6, le=1e6)]
+Direction = Annotated[tuple[Component, Component, Component], AfterValidator(check_direction)]
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
 Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
@@ -66,7 +67,7 @@ class Joint(Table):
         description="name of the parent's interface that it sits on, one of arms.interfaces [-]",
     )
     child: str = Field(description="name of the arm that it holds, whose frame is the joint's [-]")
-    axis: tuple[Component, Component, Component] | None = Field(
+    axis: Direction | None = Field(
         default=None,
         description="axis in the joint's frame, of any length; of revolute and prismatic ones [-]",
     )
@@ -151,8 +152,6 @@ class Joint(Table):
             )
         if self.axis is not None and not self.moves:
             raise Refusal("expected none with a fixed joint", ("axis",), ("type",))
-        if self.axis is not None and math.hypot(*self.axis) < 1e-9:
-            raise Refusal("expected a direction, not of length zero", ("axis",))
         return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
@@ -315,117 +314,6 @@ def _check_joint_parts(scene: Scene) -> None:
                 )
 
 
-# -- `[closure]` ---------------------------------------------------------------------------------
-
-ClosureKind = Literal["slider", "pin"]
-# Responses of the deviation at the end of the chain, which a pin leaves none.
-OF_THE_END = ("deviation", "settling")
-DEPENDENT = {"slider": 1, "pin": 2}  # joints that follow from the others, the last ones
-
-
-class Closure(Table):
-    """What holds the outboard interface of the last arm, whose rotation stays free."""
-
-    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
-        default="closure", description="name in the columns of trajectory.csv [-]"
-    )
-    kind: ClosureKind = Field(
-        description="the interface slides on a line, or turns about a fixed point [-]"
-    )
-    point: tuple[Position, Position] = Field(
-        default=(0.0, 0.0), description="a point of the line, or the pin [m]"
-    )
-    direction: tuple[Component, Component] = Field(
-        default=(1.0, 0.0), description="direction of the line, of any length [-]"
-    )
-    side: Literal[-1, 1] = Field(
-        default=1,
-        description="which way the loop is assembled: sign of the last joint's angle at the start; "
-        "where that is zero, the stretched way [-]",
-    )
-    force: float = Field(
-        default=0.0,
-        ge=-1e12,
-        le=1e12,
-        description="constant force on the slider along the direction [N]",
-    )
-
-    @model_validator(mode="after")
-    def _check_kind(self) -> Closure:
-        self.refuse_unused(self.kind == "slider", "kind", "direction", "force")
-        if self.direction == (0.0, 0.0):
-            raise Refusal("expected a direction other than zero", ("direction",))
-        return self
-
-    @property
-    def dependent(self) -> int:
-        """Number of joints that follow from the others: the last ones."""
-        return DEPENDENT[self.kind]
-
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse a loop of too few arms, and what a closed loop cannot be combined with."""
-        if scene.is_spatial:
-            raise Refusal(
-                "expected no [closure] with [[joints]]: in space loops are closed by [[closures]]",
-                (*at, "kind"),
-                ("joints",),
-            )
-        if len(scene.arms) <= self.dependent:
-            raise Refusal(
-                f'expected kind = "{self.kind}" with at least {self.dependent + 1} arms, found '
-                f"{len(scene.arms)}",
-                (*at, "kind"),
-                ("arms",),
-            )
-        if scene.motion.base != "fixed":
-            raise Refusal('expected "fixed" with [closure]', ("motion", "base"), (*at, "kind"))
-        if scene.motion.path not in ("rotation", "joints"):
-            raise Refusal(
-                'expected "rotation" or "joints" with [closure]: the motion prescribes the '
-                "joints that are independent",
-                ("motion", "path"),
-                (*at, "kind"),
-            )
-        self._check_springs(scene, at)
-        if self.kind == "pin":
-            self._check_end(scene, at)
-
-    def _check_springs(self, scene: Scene, at: Loc) -> None:
-        """Refuse springs between drive and arm at joints that have no drive."""
-        first = len(scene.arms) - self.dependent
-        for index in range(first, len(scene.arms)):
-            for key in ("joint_stiffness", "gear_stiffness"):
-                if getattr(scene.arms[index], key) > 0.0:
-                    raise Refusal(
-                        f"expected 0: the joint of {scene.arms[index].name} follows from the "
-                        "others in the closed loop and has no drive",
-                        ("arms", index, key),
-                        (*at, "kind"),
-                    )
-        for index, arm in enumerate(scene.arms):
-            if arm.bearing_stiffness is not None:
-                raise Refusal(
-                    "expected none with [closure]: close the loop by [[closures]], with [[joints]] "
-                    "about the plane's normal, or leave it out",
-                    ("arms", index, "bearing_stiffness"),
-                    (*at, "kind"),
-                )
-
-    def _check_end(self, scene: Scene, at: Loc) -> None:
-        """Refuse responses of the deviation of an end that a pin holds."""
-        for key in OF_THE_END:
-            if scene.objective.kind == key or getattr(scene.constraints, key, None) is not None:
-                where = (
-                    ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
-                )
-                raise Refusal(
-                    'expected another response with closure.kind = "pin": the end of the last arm '
-                    "is held, it deviates from nothing; take the compliance",
-                    where,
-                    (*at, "kind"),
-                )
-
-
 # -- `[control]` ---------------------------------------------------------------------------------
 
 FeedForward = Literal["rigid", "elastic", "none"]
@@ -568,6 +456,9 @@ FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
+    name: Annotated[str, AfterValidator(check_joint_name)] | None = Field(
+        default=None, description="unique name, by which changes may call it [-]"
+    )
     arm: str = Field(description="name of the arm on which it acts [-]")
     interface: str = Field(
         default=OUTBOARD,
@@ -589,8 +480,8 @@ class Force(Table):
     )
     factor: float = Field(
         default=1.0,
-        ge=-1e6,
-        le=1e6,
+        ge=-1e12,
+        le=1e12,
         description="factor on force, moment and table, to be varied in studies [-]",
     )
     frame: ForceFrame = Field(
@@ -621,6 +512,8 @@ class Force(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what acts nowhere, has another dimension, or a key that nothing uses."""
+        if self.name and self.name in [one.name for one in scene.forces[: at[-1]]]:
+            raise Refusal("expected a name that no other force has", (*at, "name"))
         names = [arm.name for arm in scene.arms]
         if self.arm not in names:
             allowed = " | ".join(map(shown, names))

@@ -65,7 +65,7 @@ class Motion(Table):
         default=None,
         description="joint coordinates near those at the start of an end-effector's path in "
         "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
-        "solution is meant; default: 0, in the plane by closure.side [rad, m]",
+        "solution is meant; default: 0, in the plane by closures.side [rad, m]",
     )
     file: FileName | None = Field(
         default=None,
@@ -239,7 +239,7 @@ class Motion(Table):
                     "the plane",
                     ("motion", key),
                 )
-        for key in ("rpy", *(["initial_joints"] if scene.closure is None else [])):
+        for key in ("rpy", *([] if scene.closures else ["initial_joints"])):
             if getattr(self, key) is not None:
                 raise Refusal(
                     "expected none without [[joints]]: the machine moves in the plane",

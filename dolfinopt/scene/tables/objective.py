@@ -633,14 +633,14 @@ def need_of(scene: Scene, what: Need) -> list[str]:
 # -- `[[scenarios]]` -----------------------------------------------------------------------------
 
 # What may differ between scenarios: not the arms, which are one design, reduced once.
-TABLES = ("motion", "control", "closure", "payload", "forces", "damping", "material")
+TABLES = ("motion", "control", "closures", "payload", "forces", "damping", "material")
 
 
 class Scenario(Table):
     """A scenario: another use of the same design, part of the objective."""
 
     changes: tuple[str, ...] = Field(
-        description='changes to the scene as "key=value", of motion, control, closure, payload, '
+        description='changes to the scene as "key=value", of motion, control, closures, payload, '
         "forces, damping or material [-]"
     )
     weight: float = Field(
@@ -653,7 +653,7 @@ class Scenario(Table):
         for change in changes:
             key = change.partition("=")[0].strip()
             table = key.partition(".")[0]
-            if table not in TABLES:
+            if table not in (*TABLES, "closure"):  # an older word
                 raise Refusal(
                     f"expected keys of {', '.join(TABLES[:-1])} or {TABLES[-1]}, found {shown(key)}"
                 )
