@@ -31,7 +31,8 @@ from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm, build_arms
-    from dolfinopt.dynamics.simulation import Trajectory, simulate
+    from dolfinopt.dynamics.simulation import simulate
+    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
     from dolfinopt.optimization.loop import Result
@@ -65,7 +66,7 @@ _HOME = {
     "Scene": "scene.load",
     "load_scene": "scene.load",
     "scene_from_dict": "scene.load",
-    "Trajectory": "dynamics.simulation",
+    "Trajectory": "dynamics.trajectory",
     "simulate": "dynamics.simulation",
 }
 

@@ -32,7 +32,7 @@ from mpi4py import MPI
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body, uniform_design
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.build import check_forces, check_motion
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.optimization.certificate import Certificate

@@ -45,7 +45,7 @@ from dolfinopt.progress import NOT_MET, with_unit
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection

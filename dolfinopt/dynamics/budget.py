@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.multibody.kinematics import end_effector_gradient
 from dolfinopt.multibody.ranks import least_norm
 

@@ -650,3 +650,6 @@ def feed_forward_weights(
         dependent, moved = drives.dependent, np.einsum("nkr,nr->nk", J, out)
         out[:, dependent] -= least_norm(J[:, :, dependent], moved)
     return out
+
+
+Problem = ElasticSystem | MachineSystem  # what moves: see `build.build_system`

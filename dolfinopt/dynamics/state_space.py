@@ -13,7 +13,7 @@ from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.linearised import Linearised, linearised
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.poles import damping_ratios
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import end_effector_gradient
 from dolfinopt.scene.load import Scene

@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import uniform_design
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.iterate import Iterate

@@ -10,7 +10,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import Patterns
 from dolfinopt.dynamics.measured import AIM
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.measured import (
     FORCE_ROUNDING,

@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.optimization.measured import (
     ERODED_LIMIT_FACTOR,
     GENTLE_SHARPNESS,

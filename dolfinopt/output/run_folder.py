@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization import loop
 from dolfinopt.optimization.certificate import Certificate

@@ -19,7 +19,7 @@ from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.simulation import JointLimit, Trajectory
+from dolfinopt.dynamics.trajectory import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
@@ -41,7 +41,7 @@ from dolfinopt.scene.messages import implausible
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.output.run_folder import Simulated
 
 # Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.arms.arm import Arm
     from dolfinopt.dynamics.collocation import Solution
-    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.parallel import Partition
     from dolfinopt.responses.evaluation import Evaluation
 

@@ -23,7 +23,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.modes import BucklingModes, buckling_modes
 from dolfinopt.density.interpolation import interpolate
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.fem.stress import DisplacementGradient, Prestress, PrestressGradient, StressedModulus
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.motion.build import rests
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.motion import LoadCases, MotionResponse

@@ -15,7 +15,8 @@ import numpy as np
 from dolfinopt.arms.arm import chain_of, stiffening_of
 from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.simulation import Trajectory, simulate, simulate_all
+from dolfinopt.dynamics.simulation import simulate, simulate_all
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, shape_integrals

@@ -21,7 +21,7 @@ from dolfinopt.arms.modes import Chain, LoadedModes, RigidIntegrals, rigid_integ
 from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.build import build_mechanism
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.motion.build import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together

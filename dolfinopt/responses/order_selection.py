@@ -15,7 +15,8 @@ import numpy as np
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
-from dolfinopt.dynamics.simulation import Trajectory, simulate_all
+from dolfinopt.dynamics.simulation import simulate_all
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together

@@ -32,7 +32,7 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.tables.objective import Direction, Need, Objective
 

@@ -12,7 +12,8 @@ from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.dynamics.adjoint import add_gradients
-from dolfinopt.dynamics.simulation import Trajectory, load_counts, load_gradient
+from dolfinopt.dynamics.load_gradient import load_counts, load_gradient
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import LoadFields, element_centres
 from dolfinopt.mesh import compat

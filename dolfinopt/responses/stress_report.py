@@ -25,7 +25,7 @@ from dolfinopt.responses.stress import (
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.dynamics.simulation import Trajectory
+    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.profiling import Profile
 
 

@@ -33,7 +33,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.disk import make_folder, write_text
-from dolfinopt.dynamics.simulation import Trajectory, simulate_all
+from dolfinopt.dynamics.simulation import simulate_all
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.state import HistoryRow

@@ -19,8 +19,8 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import measured, radau
 from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.system import relative_error
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import floats, rounding_error

@@ -12,8 +12,8 @@ from runs import ROOT, refusal
 import dolfinopt as do
 from dolfinopt.dynamics.linearised import Linearised
 from dolfinopt.dynamics.poles import poles_of
-from dolfinopt.dynamics.simulation import Trajectory
 from dolfinopt.dynamics.state_space import StateSpace, free_machine, state_space
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.responses.linearised_machine import accurate_below
 from dolfinopt.scene.load import Scene, scene_from_dict
 

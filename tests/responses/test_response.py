@@ -11,7 +11,7 @@ from remainders import beside_volume, build, limit_rates, wave
 from runs import TWO_ARM, minimising
 
 import dolfinopt as do
-from dolfinopt.dynamics.simulation import Trajectory
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses import response as registry
 from dolfinopt.responses.motion import LoadCases, MotionResponse

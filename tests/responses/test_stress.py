@@ -14,7 +14,8 @@ from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics.simulation import Trajectory, _Probe
+from dolfinopt.dynamics.load_gradient import _Probe
+from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import places_of, rotated, stress_operator
 from dolfinopt.multibody.newton_euler import outward_pass

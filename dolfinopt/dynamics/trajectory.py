@@ -1,0 +1,399 @@
+"""A simulated motion: places, deviations and forces at instants, and what they depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.dynamics.adjoint import Adjoint
+from dolfinopt.dynamics.collocation import Solution
+from dolfinopt.dynamics.drive_forces import DriveForces
+from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.measured import FILE_ROUNDING
+from dolfinopt.motion.build import rests
+from dolfinopt.multibody.closures import Along, Loops, Tie
+from dolfinopt.multibody.kinematics import (
+    deviation,
+    end_effector,
+    end_effector_gradient,
+    end_rotation,
+    lengths,
+)
+from dolfinopt.multibody.loads import load_coefficients
+from dolfinopt.multibody.newton_euler import inverse_dynamics
+from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+@dataclass(frozen=True)
+class JointLimit:
+    """How near a motion comes to one of a joint's limits.
+
+    Attributes:
+        joint: its name.
+        quantity: "position", "velocity" or "effort".
+        limit: of the coordinate, or of the absolute value.
+        value: where it is nearest to the limit or farthest beyond it.
+        instant: of that, s.
+        unit: of limit and value.
+        met: whether it stays within the limit.
+    """
+
+    joint: str
+    quantity: str
+    limit: float
+    value: float
+    instant: float
+    unit: str
+    met: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A simulated motion; values at instants are those of the integrator's own interpolant.
+
+    Attributes:
+        problem: what moved, and how.
+        scene: its scene.
+        solution: the integrator's.
+        t: (n,) instants at which responses look at the motion, see `response_instants`, s. Files
+            have those of `sampled`.
+        scenarios: the same design under the scene's scenarios.
+    """
+
+    problem: ElasticSystem | MachineSystem
+    scene: Scene
+    solution: Solution
+    t: np.ndarray
+    scenarios: tuple[Trajectory, ...] = ()
+
+    def at(self, t: np.ndarray) -> Self:
+        """Return the same motion, without scenarios, seen at other instants (n,), s."""
+        return replace(self, t=t, scenarios=())
+
+    @cached_property
+    def sampled(self) -> Self:
+        """The same motion every `simulation.sample`, as files have it."""
+        horizon, sample = self.scene.motion.horizon, self.scene.simulation.sample
+        t = np.arange(round(horizon / sample) + 1) * sample
+        t = t[t <= horizon * (1 + 1e-12)]
+        return self if np.array_equal(t, self.t) else self.at(t)
+
+    @property
+    def solutions(self) -> tuple[Solution, ...]:
+        """Its own and the scenarios'."""
+        return (self.solution, *(one.solution for one in self.scenarios))
+
+    @property
+    def mechanism(self) -> Any:
+        """What moved."""
+        return self.problem.mechanism
+
+    @cached_property
+    def adjoint(self) -> Adjoint:
+        """The transposed recursion, for the gradient of any function of the motion."""
+        return Adjoint(self.problem, self.solution)
+
+    @cached_property
+    def drive_forces(self) -> DriveForces:
+        """The forces of all drives at the instants, for the gradient of any function of them."""
+        return DriveForces(self.problem, self.t, self.unknowns)
+
+    @cached_property
+    def unknowns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The system's coordinates and their rates, each (n, S)."""
+        y, yd, ydd = (self.solution.sample(self.t, k) for k in range(3))
+        return y, yd, ydd
+
+    @cached_property
+    def q_e(self) -> np.ndarray:
+        """Elastic coordinates (n, N)."""
+        return self.solution.sample(self.t, 0)[:, self.problem.elastic_columns]
+
+    @cached_property
+    def q_r(self) -> np.ndarray:
+        """Rigid coordinates (n, 1 + arms): m, rad."""
+        return self.motion.q
+
+    @cached_property
+    def deviation(self) -> np.ndarray:
+        """Flexible minus rigid end-effector (n, 2), m.
+
+        Of free rigid coordinates the end-effector as it moves, less that of the desired motion: of
+        a slider along its line; of a pinned end none but the integrator's error.
+        """
+        if isinstance(self.problem, ElasticSystem):
+            return deviation(self.mechanism, self.motion, self.q_e)
+        none = np.zeros_like(self.q_e)
+        return self.end - end_effector(self.mechanism, self.desired, none)
+
+    @property
+    def distance(self) -> np.ndarray:
+        """Length of the deviation (n,), m."""
+        return lengths(self.deviation)
+
+    @cached_property
+    def rotation(self) -> np.ndarray:
+        """Rotation vector of the end-effector against that of rigid links (n, 1 or 3), rad.
+
+        Of free rigid coordinates against that of the desired motion.
+        """
+        return end_rotation(self.mechanism, self.motion, self.q_e, self.desired)
+
+    @cached_property
+    def compliance(self) -> np.ndarray:
+        """q' K q of every arm (n, arms), N m."""
+        return self.mechanism.compliance(self.q_e)
+
+    @cached_property
+    def deflections(self) -> np.ndarray:
+        """Largest deflection of every arm's end in its own frame, over its length (arms,)."""
+        return self.mechanism.deflections(self.q_e)
+
+    @cached_property
+    def interface_rotations(self) -> np.ndarray:
+        """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
+        return self.mechanism.rotations(self.q_e)
+
+    @cached_property
+    def joint_forces(self) -> np.ndarray:
+        """Drive forces of cart (N) and joints (N m), (n, 1 + arms).
+
+        With control they are the control's. A fixed base bears the cart's as the horizontal force
+        on the first joint; a joint that follows from the others in a closed loop has none.
+        """
+        if isinstance(self.problem, MachineSystem):
+            return self.problem.at(self.t).forces(*self.unknowns)
+        qd, qdd = self.unknowns[1:]
+        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+
+    @cached_property
+    def load_coefficients(self) -> list[np.ndarray]:
+        """What loads every body (n, 7 + 2 q), in space (n, 18 + 9 q), see the function."""
+        pull = {}
+        if self.loops is not None:
+            here = self.loops.at(self.mechanism, self.motion.q, self.q_e)
+            pull = here.interface_loads(self._multipliers)
+        q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
+        return load_coefficients(self.mechanism, self.motion, (q, qd, qdd), pull)
+
+    @property
+    def _multipliers(self) -> np.ndarray:
+        assert isinstance(self.problem, MachineSystem)
+        return self.unknowns[2][:, slice(*self.problem.ends[1:])]
+
+    @property
+    def is_machine(self) -> bool:
+        """Whether rigid coordinates are unknown: they may differ from the desired ones."""
+        return isinstance(self.problem, MachineSystem)
+
+    @property
+    def loops(self) -> Loops | None:
+        """What closes loops, in the plane and in space, or None."""
+        return self.problem.loops if isinstance(self.problem, MachineSystem) else None
+
+    @property
+    def closure(self) -> Tie | None:
+        """What holds the last interface of a closed loop in the plane, or None."""
+        return self.loops.ties[0] if self.loops and not self.scene.is_spatial else None
+
+    @cached_property
+    def closure_force(self) -> np.ndarray | None:
+        """Forces of closures on what they hold (n, k), N; moments, N m; or None.
+
+        In the plane of the ground on the chain's end: of a slider along the line's direction turned
+        by +90 degrees, without the given constant force; of a pin along x and y. In space those of
+        every closure on its first interface, in the joint's frame, see `Closures.parts`.
+        """
+        if not isinstance(self.problem, MachineSystem) or self.loops is None:
+            return None
+        return self.loops.reactions(self._multipliers)
+
+    @property
+    def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
+        """Magnitude of every closure's force and moment (n,), by name and unit."""
+        found: dict[str, dict[str, np.ndarray]] = {}
+        forces, k = self.closure_force, 0
+        if forces is None:
+            return found
+        for one in self.scene.closures:
+            units = [unit for _, unit in one.parts(self.scene.dimension)]
+            own = forces[:, k : k + len(units)]
+            found[one.name] = {
+                unit: np.linalg.norm(own[:, [u == unit for u in units]], axis=1)
+                for unit in dict.fromkeys(units)
+            }
+            k += len(units)
+        return found
+
+    @cached_property
+    def end(self) -> np.ndarray:
+        """Place of the end-effector (n, 2), m, as it moves."""
+        return end_effector(self.mechanism, self.motion, self.q_e)
+
+    @cached_property
+    def slider_position(self) -> np.ndarray | None:
+        """Place of a slider on its line, from the closure's point along its direction (n,), m."""
+        closure = self.closure
+        if closure is None or len(closure.equations) > 1:
+            return None
+        (across,) = closure.equations
+        assert isinstance(across, Along)
+        out: np.ndarray = (self.end - closure.point) @ [across.e[1], -across.e[0]]
+        return out
+
+    @property
+    def motor_columns(self) -> tuple[int, ...]:
+        """Rigid coordinates whose motors move by themselves, behind springs and under control."""
+        if not isinstance(self.problem, MachineSystem):
+            return ()
+        drives = self.problem.drives
+        return tuple(map(int, drives.free[drives.springs.joints]))
+
+    @cached_property
+    def motors(self) -> np.ndarray | None:
+        """Angles of these motors as their joints would have them (n, M), rad, m; None without."""
+        if not isinstance(self.problem, MachineSystem) or not self.motor_columns:
+            return None
+        columns = list(self.motor_columns)
+        return self.desired.q[:, columns] + self.problem.at(self.t).motors(self.unknowns[0])
+
+    @cached_property
+    def motion(self) -> RigidMotion:
+        """Rigid coordinates at the instants, as they move."""
+        if isinstance(self.problem, ElasticSystem):
+            return self.desired
+        return self.problem.at(self.t).motion(*self.unknowns)
+
+    @cached_property
+    def desired(self) -> RigidMotion:
+        """Rigid coordinates at the instants as the scene asks for them."""
+        return self.problem.motion(self.t)
+
+    def by_unknowns(self, by_q: np.ndarray) -> np.ndarray:
+        """Return derivatives by the system's coordinates (n, S) from those by the elastic ones."""
+        out = np.zeros((len(by_q), self.problem.num_coordinates))
+        out[:, self.problem.elastic_columns] = by_q
+        return out
+
+    def by_end_effector(
+        self, indices: np.ndarray, weights: np.ndarray, moments: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+        """Return the gradient of sum_n weights_n . end_effector_n + moments_n . spin_n.
+
+        Args:
+            indices: (n,) of the instants.
+            weights: (n, 2).
+            moments: (n, 1), in space (n, 3), or None: what its virtual rotation counts.
+
+        Returns:
+            By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
+        """
+        motion, q = self.motion[indices], self.q_e[indices]
+        every = end_effector_gradient(self.mechanism, motion, q, weights, moments)
+        by_q, by_rigid, by_bodies = every
+        by = self.by_unknowns(by_q)
+        if isinstance(self.problem, MachineSystem):
+            free = self.problem.drives.free
+            by[:, : len(free)] = by_rigid[:, free]
+        return by, by_bodies
+
+    def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
+
+        With g(d, q) = 0 of the closures and the joints d that follow, by_q - g_q' x, g_d' x = by_d;
+        of arms that closures hold by more equations than that, x is of least norm.
+
+        Args:
+            indices: (n,) of the instants.
+            by: (n, S) derivatives by the system's coordinates, each held.
+        """
+        problem = self.problem
+        by_q = by[:, problem.elastic_columns]
+        if not isinstance(problem, MachineSystem) or problem.loops is None:
+            return by_q
+        q_r, q = self.motion.q[indices], self.q_e[indices]
+        here = problem.loops.at(self.mechanism, q_r, q)
+        J = here.jacobian[:, :, problem.columns]
+        dependent = np.flatnonzero(~problem.drives.driven)
+        by_g = least_norm(J[:, :, dependent].swapaxes(1, 2), by[:, dependent])
+        return by_q - np.einsum("nm,nmk->nk", by_g, J[:, :, problem.elastic_columns])
+
+    @property
+    def joint_limits(self) -> tuple[JointLimit, ...]:
+        """How the motion stands to the limits that the scene states of its joints."""
+        return tuple(self._joint_limits())
+
+    def _joint_limits(self) -> Iterator[JointLimit]:
+        for k, joint in enumerate(self.scene.movable):
+            slides = joint.type == "prismatic"
+            length, force = ("m", "N") if slides else ("rad", "N m")
+            if joint.position_limits is not None:
+                q = self.motion.q[:, k]
+                width = joint.position_limits[1] - joint.position_limits[0]
+                ends = zip(joint.position_limits, (-1.0, 1.0), strict=True)
+                beyond = [(sign * (q - limit), limit) for limit, sign in ends]
+                over, limit = max(beyond, key=lambda one: float(one[0].max()))
+                at = int(np.argmax(over))
+                met = bool(over[at] <= FILE_ROUNDING * max(width, abs(limit)))
+                value, instant = float(q[at]), float(self.t[at])
+                yield JointLimit(joint.name, "position", limit, value, instant, length, met)
+            for quantity, limit, values, unit in (
+                ("velocity", joint.velocity_limit, self.motion.qd, f"{length}/s"),
+                ("effort", joint.effort_limit, self.joint_forces, force),
+            ):
+                if limit is None:
+                    continue
+                size = np.abs(values[:, k])
+                at = int(np.argmax(size))
+                value, met = float(size[at]), bool(size[at] <= (1.0 + FILE_ROUNDING) * limit)
+                instant = float(self.t[at])
+                yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)
+
+    @property
+    def settling(self) -> float:
+        """Largest deviation in any rest: after the motion and in its dwells, see `rests`, m.
+
+        With a horizon that ends with the motion, the deviation at its end.
+        """
+        return float(self.distance[self.at_rest].max())
+
+    @property
+    def at_rest(self) -> np.ndarray:
+        """Which instants are in a rest (n,); the last one is in any case."""
+        rounding = 1e-9 * self.scene.motion.horizon
+        found = np.zeros(len(self.t), dtype=bool)
+        for begin, end in rests(self.scene):
+            found |= (self.t >= begin - rounding) & (self.t <= end + rounding)
+        found[-1] = True
+        return found
+
+    @property
+    def drives(self) -> tuple[np.ndarray, np.ndarray]:
+        """Largest absolute value and root mean square over time of `joint_forces` (1 + arms,)."""
+        forces = self.joint_forces
+        if len(self.t) == 1:
+            return np.abs(forces[0]), np.abs(forces[0])
+        steps = np.diff(self.t)[:, None]
+        squares = 0.5 * steps * (forces[1:] ** 2 + forces[:-1] ** 2)
+        return np.abs(forces).max(axis=0), np.sqrt(squares.sum(axis=0) / steps.sum())
+
+    @property
+    def max_deviation(self) -> tuple[float, float]:
+        """Largest distance between flexible and rigid end-effector, m, and its instant, s."""
+        worst = int(np.argmax(self.distance))
+        return float(self.distance[worst]), float(self.t[worst])
+
+    @property
+    def max_rotation(self) -> float:
+        """Largest rotation of the end-effector against that of rigid links, rad."""
+        return float(lengths(self.rotation).max())
