@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.build import build_system, desired_motion
+from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import Problem
 from dolfinopt.dynamics.march import BEYOND, REMEDY
@@ -28,18 +27,22 @@ def simulate(
     """Integrate the elastic coordinates over the horizon to `simulation.tolerance`.
 
     Args:
-        scene: motion, payload, damping and integrator.
+        scene: motion, payload, control, tolerance.
         bodies: from the cart outwards.
         profile: counts the simulation.
         start: solution of a nearby design, or None.
 
     Raises:
-        ConvergenceError: the integrator gave up; the message says what to try.
+        ConvergenceError: the integrator gave up, or an arm bends by more than `DEFLECTION_LIMIT`
+            of its length; the message says what to try.
     """
-    (found,) = simulate_all([scene], [bodies], profile, [start])
-    if isinstance(found, ConvergenceError):
-        raise found
-    return found
+    problem, options = build_system(scene, bodies), scene.simulation
+    with profile.phase("simulation"):
+        solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
+    profile.counts.simulations += 1
+    trajectory = _trajectory(problem, scene, solution)
+    _check_deflections(trajectory)
+    return trajectory
 
 
 def simulate_all(
@@ -48,7 +51,7 @@ def simulate_all(
     profile: Profile,
     starts: Sequence[Solution | None] = (),
 ) -> list[Trajectory | ConvergenceError]:
-    """Integrate several scenes, each to its `simulation.tolerance`; those of one motion share it.
+    """Integrate several scenes, each to its `simulation.tolerance`.
 
     Args:
         scenes: any number of them.
@@ -62,37 +65,12 @@ def simulate_all(
     """
     starts = [*starts, *[None] * (len(scenes) - len(starts))]
     results: list[Trajectory | ConvergenceError] = []
-    for problem, scene, start in zip(_problems(scenes, bodies), scenes, starts, strict=True):
+    for scene, own, start in zip(scenes, bodies, starts, strict=True):
         try:
-            results.append(_simulated(problem, scene, profile, start))
+            results.append(simulate(scene, own, profile, start))
         except ConvergenceError as error:
             results.append(error)
     return results
-
-
-def _simulated(
-    problem: Problem, scene: Scene, profile: Profile, start: Solution | None
-) -> Trajectory:
-    """Return the motion of a problem, or raise why there is none."""
-    options = scene.simulation
-    with profile.phase("simulation"):
-        solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
-    profile.counts.simulations += 1
-    trajectory = _trajectory(problem, scene, solution)
-    _check_deflections(trajectory)
-    return trajectory
-
-
-def _problems(scenes: Sequence[Scene], bodies: Sequence[list[ShapeIntegrals]]) -> list[Problem]:
-    """Return what moves in every scene; scenes of one motion share it."""
-    motions: dict[object, Callable[[np.ndarray], Any]] = {}
-    problems: list[Problem] = []
-    for scene, own in zip(scenes, bodies, strict=True):
-        lengths = tuple((arm.name, arm.length) for arm in scene.arms)
-        key = (scene.motion, lengths, scene.joints, scene.closures, scene.end_effector)
-        motion = motions.setdefault(key, desired_motion(scene))
-        problems.append(build_system(scene, own, motion))
-    return problems
 
 
 def _check_deflections(trajectory: Trajectory) -> None:
