@@ -8,14 +8,13 @@ Kd (qd_d - qd), of which u_ff is inverse dynamics of the rigid arms of the same 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from dolfinopt.dynamics.machine_system import MachineInstants, MachineSystem, Problem
-from dolfinopt.dynamics.measured import DRIVES_CHUNK, MATRIX_BYTES
+from dolfinopt.dynamics.measured import MATRIX_BYTES
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -36,7 +35,7 @@ class DriveForces:
     def __init__(self, system: Problem, t: np.ndarray, rates: Rates) -> None:
         """Take the motion."""
         self.system, self.t, self.rates = system, t, rates
-        self._kept: list[_Prescribed | _Machine] = []
+        self._kept: _Prescribed | _Machine | None = None
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return the derivative of sum_n weights_n . forces_n, instants and coordinates held apart.
@@ -48,29 +47,34 @@ class DriveForces:
             By coordinates, rates and accelerations (3, n, S); and by every body's integrals, the
             coordinates held.
         """
-        parts = [slice(i, i + DRIVES_CHUNK) for i in range(0, len(self.t), DRIVES_CHUNK)]
         by_rates, total = [], None
-        for chunk, part in zip(self._chunks(parts), parts, strict=True):
-            by, bodies = chunk.gradient(weights[part])
+        for part in self._parts:
+            by, bodies = self._chunk(part).gradient(weights[part])
             by_rates.append(by)
             total = bodies if total is None else [a + b for a, b in zip(total, bodies, strict=True)]
         assert total is not None, "no instants"
         return np.concatenate(by_rates, axis=1), total
 
-    def _chunks(self, parts: list[slice]) -> Iterable[_Prescribed | _Machine]:
-        """Return the parts' own; the same ones every time unless they take too much memory."""
+    @cached_property
+    def _parts(self) -> list[slice]:
+        """Runs of instants whose matrices fit in `MATRIX_BYTES`: mostly one."""
         bodies, columns = len(self.system.mechanism.bodies), 3 * self.rates[0].shape[1]
-        if 8 * len(self.t) * (1 + 8 * bodies) * columns > MATRIX_BYTES:
-            return map(self._chunk, parts)
-        self._kept = self._kept or [self._chunk(part) for part in parts]
-        return self._kept
+        length = max(1, int(MATRIX_BYTES / (8 * (1 + 8 * bodies) * columns)))
+        return [slice(i, i + length) for i in range(0, len(self.t), length)]
 
     def _chunk(self, part: slice) -> _Prescribed | _Machine:
+        """Return some instants' own; of all at once the same one every time."""
+        if self._kept is not None:
+            return self._kept
         y, yd, ydd = (x[part] for x in self.rates)
         system, t = self.system, self.t[part]
+        chunk: _Prescribed | _Machine
         if isinstance(system, MachineSystem):
-            return _Machine(system.at(t), (y, yd, ydd))
-        return _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
+            chunk = _Machine(system.at(t), (y, yd, ydd))
+        else:
+            chunk = _Prescribed(system.mechanism, system.motion(t), (y, yd, ydd))
+        self._kept = chunk if len(self._parts) == 1 else None
+        return chunk
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.measured import (
     CLOSURE_COMPLIANCE_SHARE,
-    DEVIATION_ROUNDING,
+    EXACT,
 )
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.tables import motion_at_stages
@@ -532,7 +532,8 @@ class MachineSystem:
         scale, joints = self.rigid_scale, self.drives.springs.joints
         squares = np.square(scale * y[..., :R]).sum(axis=-1)
         squares += np.square(scale[joints] * y[..., self.ends[2] :]).sum(axis=-1)
-        rigid = np.sqrt(squares).max(axis=-1) - DEVIATION_ROUNDING * scale.max()
+        # rad, or lengths over the reach: a thousand times their own rounding.
+        rigid = np.sqrt(squares).max(axis=-1) - 10.0 * EXACT * scale.max()
         return np.concatenate([np.maximum(rigid, 0.0)[..., None], arms], axis=-1)
 
     def slowest_frequency(self) -> float:

@@ -66,10 +66,6 @@ CLOSURE_COMPLIANCE_SHARE = 1e-6
 # and damping beside what is in proportion to the stiffness.
 ROUNDING = 1e-9
 EXACT = 1e-13  # what rounding leaves of a solution, beside its terms
-# rad, or lengths over the reach, of free coordinates: a thousand times their own rounding.
-DEVIATION_ROUNDING = 1e-12
-
-
 FILE_ROUNDING = 1e-6  # relative, of limits in files, and of instants that are one
 
 # -- build, trajectory -----------------------------------------------------------------------
@@ -79,9 +75,8 @@ RESPONSE_INSTANTS_LIMIT = 1_000_000  # at `RESPONSE_INTERVAL`: they take 1 GB an
 # Of the largest elastic deflection, by which an extreme may exceed its neighbouring instants: the
 # default simulation.tolerance.
 EXTREME_EXCESS_SHARE = 1e-4
-# Desired motions kept, and instants of one: an iteration asks for eight, with up to 3 000 instants.
+# Of a motion that is kept: an iteration asks for eight, with up to 3 000 instants each.
 KEPT_INSTANTS_LIMIT = 20_000
-DRIVES_CHUNK = 512  # instants whose matrices are made at once for the drives' derivatives
 
 # -- state_space -----------------------------------------------------------------------------
 
