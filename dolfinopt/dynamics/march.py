@@ -16,7 +16,6 @@ from dolfinopt.dynamics.estimate import Estimate, estimate
 from dolfinopt.dynamics.measured import (
     DEFLECTION_LIMIT,
     LEAST_STEP_SHARE,
-    MARCH_ITERATIONS,
     STEPS_LIMIT,
     WINDOW_STEPS,
 )
@@ -127,7 +126,8 @@ class March:
         horizon = self._system.breakpoints[-1]
         for end in self._system.breakpoints[1:]:
             while self.t < end:
-                too_many = self._iterations > MARCH_ITERATIONS or len(self._ends) > STEPS_LIMIT
+                # Newton's iterations of a window take as long as ten steps over the horizon.
+                too_many = max(len(self._ends), 10 * self._iterations) > STEPS_LIMIT
                 if too_many or self._h < LEAST_STEP_SHARE * horizon:
                     raise GivenUp(
                         f"the simulation gets no further than t = {self.t:.4g} s with "

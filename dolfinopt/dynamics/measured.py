@@ -33,7 +33,6 @@ SETTLED_SHARE = 1e-2  # step, of the tolerance, that no matrix shortens: roundin
 
 MARCH_ERROR_SHARE = 0.1  # of the tolerance, that a step may add; with 0.3 one grid more follows
 WINDOW_STEPS = (4, 32)  # solved together, fewest and most
-MARCH_ITERATIONS = 3000  # of Newton's method, of all windows: a pendulum takes 1000
 LEAST_STEP_SHARE = 1e-7  # of the horizon: where shorter ones fail the motion has no continuation
 # Deflection over a body's length beyond which its motion is refused. A cantilever that linear
 # elasticity bends by 0.5 of its length bends by 0.41, and comes 0.11 closer, which a floating frame
