@@ -280,7 +280,6 @@ CASES = [
     case("boom", "", *YIELDING_BOOM, BOOM_HELD, slow=True),
     case("loop", "", BENT, "control={stiffness=[100.0], damping=[2.0]}"),
     case("bennett", ""),
-    case("bennett", "peak_force", slow=True),
     # Settling in every rest.
     case("two_arm", "settling", *IN_STROKES, "constraints.settling_after=0.05"),
     case("two_arm", "settling", "motion.dwells=[[0.5,0.7],[1.0,1.2]]"),

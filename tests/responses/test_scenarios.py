@@ -49,9 +49,10 @@ def test_scaled_bodies_are_those_reduced_anew(method):
         anew = there.arms[k].reduce(x[k])
         # Modes are normalised to the mass: another density is another length of theirs.
         size = np.sqrt(np.diag(anew.K) / np.diag(body.K))
-        rows, square = dict.fromkeys(("C", "outboard", "j", "r"), size), np.outer(size, size)
-        factors = dict.fromkeys(("mass", "moment", "inertia"), 1.0) | rows
-        for name, factor in (factors | dict.fromkeys("MKDG", square)).items():
+        every = np.append(1.0, size)  # of the reference position, then of the modes
+        factors = {"mass": 1.0, "w": every, "W": np.outer(every, every), "outboard": size}
+        factors |= dict.fromkeys("KD", np.outer(size, size))
+        for name, factor in factors.items():
             expected = getattr(anew, name)
             # Eigenvectors are right to 1e-10, see reduction.basis.
             close = 1e-8 * np.abs(expected).max()
