@@ -94,4 +94,6 @@ def test_a_jerk_in_a_table_of_a_motion_is_not_lost() -> None:
     right = radau.integrate(stepped, 1e-6, 4, Profile())
     tabulated = ElasticSystem(unloaded, LoadedMotion(jerk, rows=corners), (0.0, 1.0))
     found = radau.integrate(tabulated, 1e-4, 4, Profile())
-    assert distance(stepped, found, right) <= 5e-4
+    # Accelerations count by their moments, places and speeds by their values at the stages, which
+    # the estimate does not see: 2.3e-4; lost, it would be all of the motion.
+    assert distance(stepped, found, right) <= 3e-4
