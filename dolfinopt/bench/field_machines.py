@@ -10,7 +10,8 @@ from scipy.signal import butter, filtfilt
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.modes import Modes
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
@@ -99,11 +100,11 @@ class Crank(MachineSystem):
         """Return it."""
         return self.start
 
-    def preconditioner(self) -> MachineModes | Unchanged:
+    def preconditioner(self) -> Modes | Unchanged:
         """Return the rod's vibrations, the start in their coordinates."""
         modes = super().preconditioner()
         q, qd = (modes.to_modes(x) for x in self.start)
-        assert isinstance(modes, MachineModes) and isinstance(modes.system, Crank)
+        assert isinstance(modes, Modes) and isinstance(modes.system, Crank)
         return replace(modes, system=replace(modes.system, start=(q, qd)))
 
 
@@ -143,8 +144,8 @@ def crank_values(steps: int = STEPS) -> dict[str, float]:
     system = crank(rod())
     solution = solved(system, steps, STAGES)
     y, yd, ydd = unknowns(system, solution)
-    instants = system.at(np.array([END]))
-    motion = instants.motion(y, yd, ydd)
+    state = system.at(np.array([END])).state(y, yd, ydd)
+    motion = state.motion
     place = end_effector(system.mechanism, motion, y[:, 1:5])[0]
     t = np.linspace(0.0, END, 4001)
     bending = np.abs(solution.sample(t)[:, 1])
@@ -153,7 +154,7 @@ def crank_values(steps: int = STEPS) -> dict[str, float]:
         "slider": float(place[0]),
         **{f"q{k + 1}": float(y[0, 1 + k]) for k in range(4)},
         "force across the line": float(-ydd[0, 5]),
-        "moment of the crank": float(-instants.forces(y, yd, ydd)[0, 1]),
+        "moment of the crank": float(-state.forces()[0, 1]),
         "largest bending": float(bending.max()),
         "its instant": float(t[bending.argmax()]),
     }

@@ -8,7 +8,6 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
     FILE_ROUNDING,
@@ -83,7 +82,7 @@ def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
     return rigid_motion(np.frombuffer(instants), scene)
 
 
-def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> ElasticSystem | MachineSystem:
+def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
     """Return the equations of a scene and its bodies, from the base outwards."""
     motion = desired_motion(scene)
     mechanism, instants = build_mechanism(scene, bodies), breakpoints(scene)
@@ -94,7 +93,7 @@ def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> ElasticSystem | 
         tables = [load.table for load in loads if load.table is not None]
         instants = with_ends(instants, tables, scene.motion.horizon)
     if not is_machine(scene):
-        return ElasticSystem(mechanism, motion, instants)
+        return MachineSystem(mechanism, motion, instants)
     drives = _drives(scene)
     if drives.table is not None:
         instants = with_ends(instants, [drives.table], scene.motion.horizon)

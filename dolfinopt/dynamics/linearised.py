@@ -51,10 +51,9 @@ class Linearised:
     @cached_property
     def motion(self) -> np.ndarray:
         """All coordinates of the mechanism, their rates and accelerations (3, C)."""
-        instants, parts = self.system.at(self.t), self.rates[:, None]
-        rigid = instants.motion(*parts)
-        elastic = [instants.split(x)[1] for x in parts]
-        return np.hstack([np.concatenate([rigid.q, rigid.qd, rigid.qdd]), np.concatenate(elastic)])
+        state = self.system.at(self.t).state(*self.rates[:, None])
+        rigid = state.motion.q, state.motion.qd, state.motion.qdd
+        return np.hstack([np.concatenate(rigid), np.concatenate(state.elastic)])
 
     def loops(self, poses: np.ndarray) -> ClosedLoops:
         """Return the closed loops at poses (n, C)."""

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.machine_system import Problem
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.multibody.dimension import SPACE
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.tree import Mechanism
@@ -66,7 +66,7 @@ class LoadGradient:
 
 
 def load_gradient(
-    system: Problem,
+    system: MachineSystem,
     t: np.ndarray,
     rates: Rates,
     by_coefficients: Sequence[np.ndarray],
@@ -87,8 +87,7 @@ def load_gradient(
     instants = probe.system.at(t)
     tangent = instants.linearise(*at)
     by_rates = np.stack(tangent.transposed(multipliers))[:, :, probe.own]
-    y, yd, ydd = at
-    wide = probe.system.body_gradient(instants, y, yd, ydd, multipliers)
+    wide = instants.state(*at).body_gradient(multipliers)
     parts = [
         by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)
@@ -99,7 +98,7 @@ def load_gradient(
 class _Probe:
     """A system whose bodies have a coordinate more for every load, which stays at zero."""
 
-    def __init__(self, system: Problem):
+    def __init__(self, system: MachineSystem):
         mechanism: Mechanism = system.mechanism
         first = system.elastic_columns.start or 0
         own = list(range(first))

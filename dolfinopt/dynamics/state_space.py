@@ -83,14 +83,13 @@ def free_machine(trajectory: Trajectory, t: float) -> Linearised:
     scene, problem = trajectory.scene, trajectory.problem
     check_instant(scene, t)
     seen = trajectory.at(np.array([t]))
-    if isinstance(problem, MachineSystem) and scene.control is not None:
+    if scene.control is not None:
         return linearised(problem, t, seen.unknowns)
     bodies = list(problem.mechanism.bodies[: len(scene.arms)])  # bearings follow from the scene
     # Drives on all driven coordinates, whose forces nothing asks for.
     none = (0.0,) * len(scene.driven)
     control = Control(feed_forward="none", stiffness=none, damping=none)
     system = build_system(scene.model_copy(update={"control": control}), bodies)
-    assert isinstance(system, MachineSystem)
     # Drives that nothing controls are where the motion has them; so are motors before springs.
     rates = np.zeros((3, 1, system.num_coordinates))
     R, moving, last = system.ends
@@ -99,8 +98,7 @@ def free_machine(trajectory: Trajectory, t: float) -> Linearised:
     for k, (actual, wanted) in enumerate(pairs):
         rates[k, :, :R] = (actual - wanted)[:, system.drives.free]
         rates[k, :, R:moving] = seen.unknowns[k][:, problem.elastic_columns]
-    if isinstance(problem, MachineSystem):
-        rates[2, :, moving:last] = problem.at(seen.t).split(seen.unknowns[2])[2]
+    rates[2, :, moving:last] = seen.state.multipliers
     return linearised(system, t, tuple(rates))
 
 
@@ -169,11 +167,13 @@ def _driven(system: MachineSystem) -> np.ndarray:
 def _wrench(one: Linearised) -> np.ndarray:
     """Return what unit forces and moments on the end-effector are on every unknown (S, d + r)."""
     system, instants = one.system, one.system.at(one.t)
-    motion, q = instants.motion(*one.rates[:, None]), instants.split(one.rates[:1])[1]
+    state = instants.state(*one.rates[:, None])
     d, r = system.mechanism.dim.d, system.mechanism.dim.r
     found = np.zeros((system.num_coordinates, d + r))
     for k, unit in enumerate(np.eye(d + r)):
         parts = unit[None, :d], unit[None, d:]
-        by_q, by_rigid, _ = end_effector_gradient(system.mechanism, motion, q, *parts)
+        by_q, by_rigid, _ = end_effector_gradient(
+            system.mechanism, state.motion, state.elastic[0], *parts
+        )
         found[: system.ends[1], k] = np.hstack([by_rigid[:, system.drives.free], by_q])[0]
     return found

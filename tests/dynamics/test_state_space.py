@@ -81,9 +81,8 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     y[0, independent], yd[0, independent] = x[:n], x[n:]
 
     def jacobian(y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
-        here = system.loops.at(system.mechanism, motion.q, q)
-        speeds = np.hstack([motion.qd, instants.split(yd)[1]])[0]
+        state = instants.state(y, yd, rest)
+        here, speeds = state.closed, np.hstack([state.motion.qd, state.elastic[1]])[0]
         bias = [
             speeds @ here.hessian(one[None])[0] @ speeds for one in np.eye(len(here.jacobian[0]))
         ]
@@ -91,8 +90,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
 
     if system.loops is not None:
         for _ in range(8):
-            motion, q = instants.motion(y, yd, rest), instants.split(y)[1]
-            gap = system.loops.at(system.mechanism, motion.q, q).gap[0]
+            gap = instants.state(y, yd, rest).closed.gap[0]
             y[0, dependent] -= np.linalg.solve(jacobian(y, yd)[0][:, dependent], gap)
         J = jacobian(y, yd)[0]
         free = np.setdiff1d(np.arange(moving), dependent)

@@ -11,7 +11,6 @@ from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution, Stages, Strategy, radau_iia
-from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.estimate import _free_vibrations, _lost
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
@@ -131,7 +130,7 @@ def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
 def test_drives_follow_their_law() -> None:
     """u = Kp (q_d - q) + Kd (qd_d - qd), of cart and joint."""
     e, ed = np.random.default_rng(1).normal(size=(2, 5, 3))
-    found = controlled(1.0).at(np.linspace(0.0, 0.5, 5)).drive_forces(e, ed)
+    found = controlled(1.0).at(np.linspace(0.0, 0.5, 5)).state(e, ed, ed).drive_forces
     expected = -np.array([4e3, 100.0]) * e[:, :2] - np.array([40.0, 0.5]) * ed[:, :2]
     np.testing.assert_allclose(found, expected, rtol=1e-14)
 
@@ -184,7 +183,7 @@ def still(t: np.ndarray) -> RigidMotion:
 def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
     """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
     method, h = radau_iia(3), np.full(10, 0.1)
-    nothing = ElasticSystem(plane_chain((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
+    nothing = MachineSystem(plane_chain((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
     known = Unchanged(nothing)
     known.uncoupled = tuple(np.full(1, x) for x in (1.0, damping, 1e-290))
     stages = Stages(known, method, h, nothing.at(np.zeros(30)))
