@@ -316,9 +316,9 @@ class MachineSystem:
         that feed-forward moves.
         """
         arms = self.mechanism.norm(y[..., self.elastic_columns])
-        R, scale = self.ends[0], self.rigid_scale
-        if R == 0:
+        if (R := self.ends[0]) == 0:
             return arms
+        scale = self.rigid_scale
         squares = np.square(scale * y[..., :R]).sum(axis=-1)
         motors = scale[self.drives.springs.joints] * y[..., self.motor_columns]
         squares += np.square(motors).sum(axis=-1)

@@ -122,7 +122,7 @@ class Trajectory:
     @cached_property
     def q_e(self) -> np.ndarray:
         """Elastic coordinates (n, N)."""
-        return self.unknowns[0][:, self.problem.elastic_columns]
+        return self.solution.sample(self.t, 0)[:, self.problem.elastic_columns]
 
     @cached_property
     def q_r(self) -> np.ndarray:
@@ -257,7 +257,7 @@ class Trajectory:
     @cached_property
     def motion(self) -> RigidMotion:
         """Rigid coordinates at the instants, as they move."""
-        return self.state.motion
+        return self.state.motion if self.is_machine else self.desired
 
     @cached_property
     def desired(self) -> RigidMotion:
