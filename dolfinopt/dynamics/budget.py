@@ -9,7 +9,6 @@ import numpy as np
 
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.multibody.kinematics import end_effector_gradient
-from dolfinopt.multibody.ranks import least_norm
 
 # Kinds of parts, and the words for all of a kind.
 KINDS = {
@@ -95,13 +94,11 @@ def _derivatives(seen: Trajectory, direction: np.ndarray) -> tuple[np.ndarray, n
     mechanism, problem, desired = seen.mechanism, seen.problem, seen.desired
     none = np.zeros((1, mechanism.num_coordinates))
     by_q, by_rigid, _ = end_effector_gradient(mechanism, desired, none, direction)
-    every = np.concatenate([by_rigid[0], by_q[0]])
+    every = np.hstack([by_rigid, by_q])
     if problem.loops is not None:
-        G = problem.loops.at(mechanism, desired.q, none).jacobian
-        dependent = problem.drives.dependent
-        weights = least_norm(G[:, :, dependent].swapaxes(1, 2), every[None, dependent])
-        every -= (weights @ G[0])[0]
-    return every[: by_rigid.shape[1]], every[by_rigid.shape[1] :]
+        closed = problem.loops.at(mechanism, desired.q, none)
+        every -= closed.generalised_force(closed.closing(every, problem.drives.dependent))
+    return every[0, : mechanism.num_rigid], every[0, mechanism.num_rigid :]
 
 
 def _elastic(seen: Trajectory, by_q: np.ndarray) -> Iterator[tuple[str, str, float]]:

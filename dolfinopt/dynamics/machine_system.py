@@ -224,17 +224,15 @@ class MachineSystem:
         """Places of the unknowns that the equilibrium at t = 0 determines: all but held drives."""
         return np.setdiff1d(np.arange(self.num_coordinates), self.drive_columns[self.is_held])
 
-    def _rest(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return y and ydd (1, S) at rest at t = 0, multipliers in ydd, by Newton's method."""
-        instants, some = self.at(np.zeros(1)), self._at_start
-        ground = self.constraint_columns
+    def _rest(self, y: np.ndarray) -> Rates:
+        """Return unknowns at rest at t = 0, (1, S) each, near y; multipliers in the last ones."""
+        instants, some, ground = self.at(np.zeros(1)), self._at_start, self.constraint_columns
 
         def states(x: np.ndarray) -> Rates:
-            at, ydd = y.copy(), np.zeros_like(y)
+            at, yd, ydd = y.copy(), np.zeros_like(y), np.zeros_like(y)
             at[0, some] = x
-            ydd[:, ground] = at[:, ground]
-            at[:, ground] = 0.0
-            return at, np.zeros_like(y), ydd
+            ydd[:, ground], at[:, ground] = at[:, ground], 0.0
+            return at, yd, ydd
 
         x = equilibrium(
             lambda x: instants.residual(*states(x))[0, some],
@@ -244,8 +242,7 @@ class MachineSystem:
         )
         if x is None:
             raise self._no_equilibrium()
-        at, _, ydd = states(x)
-        return at, ydd
+        return states(x)
 
     def _stiffness(self, instants: MachineInstants, rates: Rates) -> np.ndarray:
         """Return the derivative by the coordinates of `_at_start`, multipliers among them."""
@@ -278,8 +275,7 @@ class MachineSystem:
         if not y.any() and not is_loaded_at_rest(self.mechanism, self.motion(np.zeros(1))):
             return []
         instants, some = self.at(np.zeros(1)), self._at_start
-        rates = y[None], np.zeros((1, len(y))), self._rest(y[None])[1]
-        right = -by_y
+        rates, right = self._rest(y[None]), -by_y
         right[self.constraint_columns] = 0.0
         multipliers = np.zeros((1, len(y)))
         multipliers[0, some] = np.linalg.solve(self._stiffness(instants, rates).T, right[some])

@@ -24,7 +24,6 @@ from dolfinopt.multibody.kinematics import (
     lengths,
 )
 from dolfinopt.multibody.loads import load_coefficients
-from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates
 from dolfinopt.multibody.tree import Mechanism
@@ -300,16 +299,13 @@ class Trajectory:
             indices: (n,) of the instants.
             by: (n, S) derivatives by the system's coordinates, each held.
         """
-        problem = self.problem
-        by_q = by[:, problem.elastic_columns]
-        if problem.loops is None:
-            return by_q
-        q_r, q = self.motion.q[indices], self.q_e[indices]
-        here = problem.loops.at(self.mechanism, q_r, q)
-        J = here.jacobian[:, :, problem.columns]
-        dependent = np.flatnonzero(~problem.drives.driven)
-        by_g = least_norm(J[:, :, dependent].swapaxes(1, 2), by[:, dependent])
-        return by_q - np.einsum("nm,nmk->nk", by_g, J[:, :, problem.elastic_columns])
+        problem, rigid = self.problem, self.mechanism.num_rigid
+        every = np.zeros((len(by), rigid + self.mechanism.num_coordinates))
+        every[:, problem.columns] = by[:, : problem.ends[1]]
+        if problem.loops is not None:
+            closed = problem.loops.at(self.mechanism, self.motion.q[indices], self.q_e[indices])
+            every -= closed.generalised_force(closed.closing(every, problem.drives.dependent))
+        return every[:, rigid:]
 
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
@@ -318,29 +314,34 @@ class Trajectory:
 
     def _joint_limits(self) -> Iterator[JointLimit]:
         for k, joint in enumerate(self.scene.movable):
-            slides = joint.type == "prismatic"
-            length, force = ("m", "N") if slides else ("rad", "N m")
+            unit, force = ("m", "N") if joint.type == "prismatic" else ("rad", "N m")
             if joint.position_limits is not None:
-                q = self.motion.q[:, k]
-                width = joint.position_limits[1] - joint.position_limits[0]
-                ends = zip(joint.position_limits, (-1.0, 1.0), strict=True)
-                beyond = [(sign * (q - limit), limit) for limit, sign in ends]
-                over, limit = max(beyond, key=lambda one: float(one[0].max()))
-                at = int(np.argmax(over))
-                met = bool(over[at] <= FILE_ROUNDING * max(width, abs(limit)))
-                value, instant = float(q[at]), float(self.t[at])
-                yield JointLimit(joint.name, "position", limit, value, instant, length, met)
-            for quantity, limit, values, unit in (
-                ("velocity", joint.velocity_limit, self.motion.qd, f"{length}/s"),
+                (lower, upper), q = joint.position_limits, self.motion.q[:, k]
+                sides = (lower - q, lower), (q - upper, upper)
+                over, limit = max(sides, key=lambda side: float(side[0].max()))
+                size = max(upper - lower, abs(limit)) or 1.0
+                yield self._nearest(joint.name, "position", limit, q, over / size, unit)
+            for quantity, bound, values, of in (
+                ("velocity", joint.velocity_limit, self.motion.qd, f"{unit}/s"),
                 ("effort", joint.effort_limit, self.joint_forces, force),
             ):
-                if limit is None:
-                    continue
-                size = np.abs(values[:, k])
-                at = int(np.argmax(size))
-                value, met = float(size[at]), bool(size[at] <= (1.0 + FILE_ROUNDING) * limit)
-                instant = float(self.t[at])
-                yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)
+                if bound is not None:
+                    size = np.abs(values[:, k])
+                    yield self._nearest(joint.name, quantity, bound, size, size / bound - 1.0, of)
+
+    def _nearest(
+        self,
+        joint: str,
+        quantity: str,
+        limit: float,
+        values: np.ndarray,
+        over: np.ndarray,
+        unit: str,
+    ) -> JointLimit:
+        """Return where values (n,) are nearest to a limit; `over` is relative, above 0 beyond."""
+        k = int(np.argmax(over))
+        met = bool(over[k] <= FILE_ROUNDING)
+        return JointLimit(joint, quantity, limit, float(values[k]), float(self.t[k]), unit, met)
 
     @property
     def settling(self) -> float:

@@ -111,7 +111,7 @@ def test_crank_without_stiffness_starts_closed_and_at_rest(kind: str) -> None:
     y, yd = system.initial_state()
     assert y[0, 0] == 0.0  # of the crank
     assert np.abs(y[0, 1:]).max() > 0.0
-    ydd = system._rest(y)[1]
+    ydd = system._rest(y)[2]
     left = system.at(np.zeros(1)).residual(y, yd, ydd)[0]
     size = np.abs(
         feed_forward(system, trajectory.desired[:1])[0]

@@ -69,6 +69,11 @@ def test_stiff_drive_clamps_the_beam(tmp_path) -> None:
     assert found.arrays()["frequencies"][:6:2] == pytest.approx(exact, rel=5e-3)
 
 
+def machine_at(trajectory: Trajectory, t: float) -> Linearised:
+    rates = trajectory.at(np.array([t])).unknowns
+    return free_machine(trajectory.scene, trajectory.problem, t, rates)
+
+
 def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     """Return z'' (n,) for independent coordinates and rates x (2 n,), by the equations alone."""
     system, instants = one.system, one.system.at(one.t)
@@ -156,7 +161,7 @@ def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
     """By central differences of accelerations that are solved for, loops closed anew each time."""
     make, t = MACHINES[kind]
     trajectory = make()
-    found, one = state_space(trajectory, t), free_machine(trajectory, t)
+    found, one = state_space(trajectory, t), machine_at(trajectory, t)
     independent = one.independent
     x = one.rates[:2, independent].ravel()
     n = len(independent)
@@ -196,7 +201,7 @@ def test_least_damping_follows_the_control() -> None:
         again = result.state_space(1.0)
         assert again is not None and np.array_equal(again.A, state_space(result.trajectory, 1.0).A)
         poles = [
-            poles_of(free_machine(result.trajectory, t)).values
+            poles_of(machine_at(result.trajectory, t)).values
             for t in scene.constraints.pole_instants(scene.motion)
         ]
         every = np.concatenate(poles)
