@@ -1,8 +1,8 @@
 """A machine linearised with as many coordinates as its poles need.
 
 The error of a number of coordinates is that of the poles against those of the same machine with
-twice as many Craig-Bampton coordinates. For it the motion is simulated once, with the scene's
-coordinates: others move as the nearest in energy.
+twice as many Craig-Bampton coordinates. A number is looked for about one motion, with twice as many
+coordinates as the scene has: others move as the nearest in energy. Then its own is simulated.
 """
 
 from __future__ import annotations
@@ -66,36 +66,31 @@ def linearised_machine(
     decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
     machines = _Machines(scene, partition, arms, t, profile)
     own = max((arm.coordinates or 0 for arm in arms.values()), default=0)
-    least = partition.world.allreduce(own, max)
+    count = partition.world.allreduce(own, max)
+    reference = machines.simulated(RICHER_METHOD, machines.richer(count))
     if not scene.cell_counts:
-        return replace(machines.linearised(RICHER_METHOD, least), accurate_below=np.inf)
-    found = machines.judged(least)
-    if below is None or found.accurate_below >= below:
-        return found
-    limit = min(POLE_COORDINATES_LIMIT, machines.reductions.limit)
-    low = high = least
-    while found.accurate_below < below:
-        if high >= limit:
+        return replace(reference, accurate_below=np.inf)
+    found = machines.judged(count)
+    while below is not None and found.accurate_below < below:
+        limit = min(POLE_COORDINATES_LIMIT, machines.reductions.limit)
+        if count >= limit:
             raise ConvergenceError(
-                f"--below {below:g}: with {high} coordinates of an arm the poles hold "
+                f"--below {below:g}: with {count} coordinates of an arm the poles hold "
                 f"{100.0 * POLE_ERROR:g} % below {found.accurate_below:.4g} Hz, and no more are "
                 "tried; ask for a lower frequency"
             )
-        low, high = high, min(2 * high, limit)
-        found = machines.judged(high)
-    while high - low > 1:
-        middle = (low + high) // 2
-        tried = machines.judged(middle)
-        if tried.accurate_below >= below:
-            high, found = middle, tried
-        else:
-            low = middle
-    exact = machines.simulated(high)
-    return replace(exact, accurate_below=found.accurate_below)
+        count = machines.fewest(count + 1, limit, below)
+        found = machines.judged(count)
+    return found
 
 
 class _Machines:
-    """Owns the motion of a scene's machine, and gives it other coordinates at an instant."""
+    """Owns the motion of a scene's machine, and gives it other coordinates at an instant.
+
+    Attributes:
+        scene, partition, t, profile: as for `linearised_machine`.
+        reductions: of the arms.
+    """
 
     def __init__(
         self,
@@ -105,48 +100,75 @@ class _Machines:
         t: float,
         profile: Profile,
     ) -> None:
-        """Simulate it with the scene's coordinates (collective)."""
+        """Take the scene and its arms (collective)."""
         self.scene, self.partition, self.t, self.profile = scene, partition, t, profile
         self.reductions = Reductions(scene, partition, arms, profile)
-        with together(partition.world):
-            self.bases = {k: arm.current.basis for k, arm in arms.items()}
-            bodies = {k: arm.current.body for k, arm in arms.items()}
-        self.motion: list[Trajectory] = []  # on the root
-        on_root(partition.world, self._move, gather_arms(partition, bodies))
-        self.known: dict[tuple[str, int], StateSpace] = {}
+        self._count = 0  # coordinates of the richest motion, its bases, itself (on the root)
+        self._bases: dict[int, Basis] = {}
+        self._motion: list[Trajectory] = []
+        self._known: dict[tuple[str, int], StateSpace] = {}  # about it
 
-    def _move(self, owned: Mapping[int, ShapeIntegrals]) -> StateSpace:
-        """Simulate the machine of these bodies, and linearise it (root only)."""
-        trajectory = simulate(self.scene, chain_of(self.scene, owned), self.profile)
-        self.motion.append(trajectory.at(np.array([self.t])))
-        return state_space(trajectory, self.t)
+    def richer(self, count: int) -> int:
+        """Return the number of coordinates with which so many are compared."""
+        return min(RICHER_RATIO * count, self.reductions.limit)
 
-    def simulated(self, count: int) -> StateSpace:
-        """Return the machine about its motion with so many coordinates (collective)."""
-        bases = self.reductions.reduced(self.scene.reduction.method, count)
-        bodies = gather_arms(self.partition, self.reductions.bodies(bases))
-        found: StateSpace = on_root(self.partition.world, self._move, bodies)
+    def simulated(self, method: str, count: int) -> StateSpace:
+        """Return the machine about its own motion with so many coordinates (collective)."""
+        bases = self.reductions.reduced(method, count)
+        owned = gather_arms(self.partition, self.reductions.bodies(bases))
+        if count > self._count:
+            self._count, self._bases = count, bases
+            self._motion.clear()
+            self._known.clear()
+
+        def run() -> StateSpace:
+            trajectory = simulate(self.scene, chain_of(self.scene, owned), self.profile)
+            if not self._motion:
+                self._motion.append(trajectory.at(np.array([self.t])))
+            return state_space(trajectory, self.t)
+
+        found: StateSpace = on_root(self.partition.world, run)
         return found
 
     def judged(self, count: int) -> StateSpace:
-        """Return the machine with so many coordinates, and how far they hold (collective)."""
-        richer = min(RICHER_RATIO * count, self.reductions.limit)
-        exact = self.linearised(RICHER_METHOD, richer).poles
-        found = self.linearised(self.scene.reduction.method, count)
-        held = accurate_below(found.poles, exact, 1.0 / self.scene.motion.horizon)
-        return replace(found, accurate_below=held)
+        """Return that, and the frequency below which its poles hold (collective)."""
+        found = self.simulated(self.scene.reduction.method, count)
+        return replace(found, accurate_below=self._held(found, count))
 
-    def linearised(self, method: str, count: int) -> StateSpace:
-        """Return the machine with so many coordinates (collective)."""
-        if (method, count) not in self.known:
+    def fewest(self, low: int, high: int, below: float) -> int:
+        """Return the fewest coordinates that seem to hold poles below a frequency (collective).
+
+        Of numbers from `low`, which is doubled at first, to `high`; all about the richest motion.
+        """
+
+        def holds(count: int) -> bool:
+            found = self._linearised(self.scene.reduction.method, count)
+            return self._held(found, count) >= below
+
+        last = low
+        while last < high and not holds(last):
+            low, last = last + 1, min(2 * last, high)
+        while low < last:
+            middle = (low + last) // 2
+            low, last = (low, middle) if holds(middle) else (middle + 1, last)
+        return last
+
+    def _held(self, found: StateSpace, count: int) -> float:
+        """Return the frequency below which poles are those of a richer machine, Hz (collective)."""
+        exact = self._linearised(RICHER_METHOD, self.richer(count)).poles
+        return accurate_below(found.poles, exact, 1.0 / self.scene.motion.horizon)
+
+    def _linearised(self, method: str, count: int) -> StateSpace:
+        """Return the machine with so many coordinates about the richest motion (collective)."""
+        if (method, count) not in self._known:
             bases = self.reductions.reduced(method, count)
             bodies = gather_arms(self.partition, self.reductions.bodies(bases))
             with together(self.partition.world):
                 mine = {k: self._change(k, basis) for k, basis in bases.items()}
             changes = gather_arms(self.partition, mine)
             found = on_root(self.partition.world, self._changed, bodies, changes)
-            self.known[method, count] = found
-        return self.known[method, count]
+            self._known[method, count] = found
+        return self._known[method, count]
 
     def _change(self, k: int, new: Basis) -> np.ndarray:
         """Return C (q', q), which makes of an arm's coordinates the nearest in another basis.
@@ -154,14 +176,14 @@ class _Machines:
         Nearest in energy; collective on the arm.
         """
         elastic, count = self.reductions.arms[k].elastic, new.V.shape[2]
-        energy = elastic.energy_matrix(np.concatenate([new.V, self.bases[k].V], axis=2))
+        energy = elastic.energy_matrix(np.concatenate([new.V, self._bases[k].V], axis=2))
         return np.linalg.solve(energy[:count, :count], energy[:count, count:])
 
     def _changed(
         self, owned: Mapping[int, ShapeIntegrals], changes: Mapping[int, np.ndarray]
     ) -> StateSpace:
         """Return the machine of other bodies, bent as in the motion (root only)."""
-        seen = self.motion[0]
+        [seen] = self._motion
         known, system = seen.problem, build_system(self.scene, chain_of(self.scene, owned))
         old, owners = np.stack(seen.unknowns), self.scene.owners
         new = np.zeros((3, 1, system.num_coordinates))
