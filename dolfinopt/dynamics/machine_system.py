@@ -203,10 +203,9 @@ class MachineInstants:
         springs, every = machine.drives.springs, machine.drive_columns
         motors = every[springs.joints]
         rigid = np.concatenate([machine.drives.free, machine.motor_coordinates])
-        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, rigid).dense()
+        tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, rigid)
         places = np.concatenate([np.arange(R), motors, np.arange(R, moving)])
-        parts = tangent.reshape(count, len(places), 3, len(places)).swapaxes(2, 3)
-        matrix[:, places[:, None], places] = parts
+        matrix[:, places[:, None], places] = tangent.matrix
         matrix[:, every, every, 0] += passing * machine.drives.stiffness
         matrix[:, every, every, 1] += passing * machine.drives.damping
         for order, value in enumerate((springs.stiffness, springs.damping)):
@@ -225,7 +224,8 @@ class MachineInstants:
             if self.redundant is not None:
                 given = CLOSURE_COMPLIANCE_SHARE * self.redundant[0]
                 matrix[:, moving:last, moving:last, 2] += given
-        return Tangent.of_matrix(matrix, keep)
+        own = np.arange(S) if keep is None else keep
+        return Tangent(matrix[:, :, own], own)
 
 
 @dataclass(frozen=True, eq=False)

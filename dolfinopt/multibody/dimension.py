@@ -51,20 +51,23 @@ def transposed_product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     return product(A.swapaxes(0, 1), B)
 
 
-Bilinear: TypeAlias = "Callable[[np.ndarray, np.ndarray], np.ndarray]"
+class Bilinear:
+    """The function sum_jk T_...jk x_j y_k (..., n) of x (j, ..., n) and y (k, ..., n)."""
 
+    def __init__(self, T: np.ndarray) -> None:
+        """Take T."""
+        self._shape, flat = T.shape, T.reshape(-1, *T.shape[-2:]).swapaxes(1, 2)
+        self._rows, self._by_x = len(flat), flat.reshape(-1, T.shape[-2])
 
-def _bilinear(T: np.ndarray) -> Bilinear:
-    """Return the function sum_jk T_...jk x_j y_k (..., n) of x (j, ..., n) and y (k, ..., n)."""
-    flat, (j, k) = T.reshape(-1, *T.shape[-2:]), T.shape[-2:]
-    rows, by_x = len(flat), flat.swapaxes(1, 2).reshape(-1, j)
+    def matrix(self, x: np.ndarray) -> np.ndarray:
+        """Return its derivative by y (i, k, ..., n), of T's first axes as one."""
+        found = self._by_x.dot(x.reshape(len(x), -1))
+        return found.reshape(self._rows, self._shape[-1], *x.shape[1:])
 
-    def function(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        matrix = by_x.dot(x.reshape(j, -1)).reshape(rows, k, *x.shape[1:])
-        out: np.ndarray = np.einsum("ij...,j...->i...", matrix, y)
-        return out.reshape(*T.shape[:-2], *out.shape[1:])
-
-    return function
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return its value."""
+        out: np.ndarray = np.einsum("ij...,j...->i...", self.matrix(x), y)
+        return out.reshape(*self._shape[:-2], *out.shape[1:])
 
 
 def components(E: np.ndarray) -> np.ndarray:
@@ -108,13 +111,13 @@ class Dimension:
         torque = np.einsum("eab,rda,cdb->rce", in_E, S, E)
         by_w = squares + squares.swapaxes(1, 2)
         self._inertia = np.einsum("rce,cs->rse", torque, self._spin).reshape(-1, self.g)
-        self._square, self.velocity = _bilinear(squares), _bilinear(S.swapaxes(0, 1))
-        self.moment, self.apply = _bilinear(S.swapaxes(1, 2)), _bilinear(E.swapaxes(0, 1))
-        self.torque, self.turned = _bilinear(torque), _bilinear(torque.transpose(2, 0, 1))
-        self.commutator = _bilinear(np.einsum("tab,rad,sdb->trs", S, S, S))
-        self.centripetal_by_spin = _bilinear(np.einsum("cij,crs->irsj", E, by_w))
-        self._torque_by_w = _bilinear(np.einsum("tce,crs->trse", torque, by_w))
-        self._contracted = _bilinear(by_w.transpose(1, 2, 0))
+        self._square, self.velocity = Bilinear(squares), Bilinear(S.swapaxes(0, 1))
+        self.moment, self.apply = Bilinear(S.swapaxes(1, 2)), Bilinear(E.swapaxes(0, 1))
+        self.torque, self.turned = Bilinear(torque), Bilinear(torque.transpose(2, 0, 1))
+        self.commutator = Bilinear(np.einsum("tab,rad,sdb->trs", S, S, S))
+        self.centripetal_by_spin = Bilinear(np.einsum("cij,crs->irsj", E, by_w))
+        self._torque_by_w = Bilinear(np.einsum("tce,crs->trse", torque, by_w))
+        self._contracted = Bilinear(by_w.transpose(1, 2, 0))
 
     def skew(self, w: np.ndarray) -> np.ndarray:
         """Return w~ (d, d, ...) of angular velocities (r, ...)."""
@@ -139,6 +142,11 @@ class Dimension:
     def applied_transposed(self, alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Return A' p (d, n)."""
         return self.apply(self.transposed(alpha), p)
+
+    @property
+    def axis_of_moments(self) -> np.ndarray:
+        """The matrix (r, g, 1) of `axial`."""
+        return -self._spin.T[:, :, None]
 
     def axial(self, G: np.ndarray) -> np.ndarray:
         """Return `torque` (r, ..., n) of second moments with accelerations themselves."""
@@ -202,6 +210,8 @@ class PlaneTurning:
     def __init__(self, theta: np.ndarray, rate: np.ndarray, second: np.ndarray) -> None:
         """Take the angle and its rates."""
         self.theta, self.velocity, self.acceleration = theta, rate, second
+
+    J = np.ones((1, 1, 1))
 
     @cached_property
     def R(self) -> np.ndarray:

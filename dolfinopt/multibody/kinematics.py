@@ -32,8 +32,8 @@ class Section:
             return
         places, d = constants.outboard(number), constants.dim.d
         moved = constants.T[places] @ e
-        if constants.K0 is not None:
-            self.bent = np.tensordot(constants.K0[places], e, 1)
+        if constants.bent is not None:
+            self.bent = np.tensordot(constants.bent[places], e, 1)
             moved -= 0.5 * np.einsum("pkn,kn->pn", self.bent, e)
         self.place = self.place + moved[:d]
         self.turning = constants.dim.turning(*(moved[d:],) * 3)  # of its rates none is asked for
@@ -63,7 +63,7 @@ class Posed:
             k = joint.coordinate
             moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
             if moving.is_offset:
-                place = place + product(R, moving.r)
+                place = place + product(R, moving.place)
             self._bodies[i] = moving, place, compose(R, moving.R)
         return self._bodies[i]
 
@@ -223,9 +223,9 @@ class SiteMotion:
         if by_theta is not None:
             theta = self.modes(i, number)[d:]
             found += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
-        if constants.K0 is not None:
-            K0 = constants.K0[constants.outboard(number)]
-            found -= np.einsum("pn,pkl->nkl", pull, K0)
+        if constants.bent is not None:
+            bent = constants.bent[constants.outboard(number)]
+            found -= np.einsum("pn,pkl->nkl", pull, bent)
         return found
 
     def load_on(self, point: np.ndarray, R: np.ndarray, load: np.ndarray) -> np.ndarray:
