@@ -205,7 +205,7 @@ class MachineInstants:
         rigid = np.concatenate([machine.drives.free, machine.motor_coordinates])
         tangent = linearise(machine.mechanism, motion, q, qd, qdd, None, rigid)
         places = np.concatenate([np.arange(R), motors, np.arange(R, moving)])
-        matrix[:, places[:, None], places] = tangent.matrix
+        matrix[:, places[:, None], places[np.argsort(tangent.order)]] = tangent.matrix
         matrix[:, every, every, 0] += passing * machine.drives.stiffness
         matrix[:, every, every, 1] += passing * machine.drives.damping
         for order, value in enumerate((springs.stiffness, springs.damping)):
@@ -225,7 +225,7 @@ class MachineInstants:
                 given = CLOSURE_COMPLIANCE_SHARE * self.redundant[0]
                 matrix[:, moving:last, moving:last, 2] += given
         own = np.arange(S) if keep is None else keep
-        return Tangent(matrix[:, :, own], own)
+        return Tangent(matrix[:, :, own], own, np.arange(len(own)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -281,7 +281,8 @@ class MovingJoint(CarriedFrame):
         self.slides = joint.kind == "prismatic"
         place = joint.origin[:, None]
         if rates is not None and self.slides:
-            self.shift_rates = self._axis * rates[1], self._axis * rates[2]
+            if len(rates) == 3:
+                self.shift_rates = self._axis * rates[1], self._axis * rates[2]
             place = place + self._axis * rates[0]
         self.place = np.broadcast_to(place, (self.dim.d, carrier[0].shape[1]))
         self.is_offset = bool(place.any())
