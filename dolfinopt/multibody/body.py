@@ -146,12 +146,12 @@ class BodyMotion:
 
     @cached_property
     def _every(self) -> np.ndarray:
-        """Conjugates of all pushes and z, with their rates (P + q, 3, n)."""
+        """Conjugates of all pushes and, if it is not e, z, with their rates (P + q, 3, n)."""
         q, _, count = self.rates.shape
         linear = (self.constants.T @ self.rates.reshape(q, 3 * count)).reshape(-1, 3, count)
-        linear = np.concatenate([linear, self.rates])
         if self.constants.bent is None:
             return linear
+        linear = np.concatenate([linear, self.rates])
         e, ed, edd = self.rates.swapaxes(0, 1)
         bent = np.empty(linear.shape, dtype=self._bent.dtype)
         bent[:, 0] = 0.5 * np.einsum("pkn,kn->pn", self._bent, e)
@@ -168,7 +168,7 @@ class BodyMotion:
     @property
     def z(self) -> np.ndarray:
         """Displacement along the modes and its rates (q, 3, n)."""
-        return self._every[len(self.constants.T) :]
+        return self.rates if self.constants.bent is None else self._every[len(self.constants.T) :]
 
     @cached_property
     def _by_e(self) -> np.ndarray:

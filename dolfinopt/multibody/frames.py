@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion, Motion
+from dolfinopt.multibody.body import BodyMotion, Motion, by_instant
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension, PlaneTurning, Turning, product
 from dolfinopt.multibody.tree import Joint
 
@@ -117,7 +117,7 @@ class CarriedFrame:
 
     @cached_property
     def transform(self) -> np.ndarray:
-        """Derivative of its motion by the carrier's (d + 2 r, d + 2 r, n)."""
+        """Derivative of its motion by the carrier's (n, d + 2 r, d + 2 r)."""
         dim, (a, w, _) = self.dim, self.carrier
         d, s, size = dim.d, dim.b, dim.b + dim.r
         out = np.zeros((size, size, a.shape[1]))
@@ -129,7 +129,14 @@ class CarriedFrame:
             out[:d, d:s] += 2.0 * dim.by_spin(self.shift_rates[0])
         if self.spin is not None and dim.r > 1:
             out[s:, d:s] = -dim.skew(self.spin[0])
-        return self.in_own(out)
+        return by_instant(self.in_own(out))
+
+    @cached_property
+    def of_loads(self) -> np.ndarray:
+        """What `load_on_carrier` does, as matrices (n, d + r, d + r)."""
+        # Forces and moments work on displacements and rotations as a and wd go.
+        kept = np.r_[0 : self.dim.d, self.dim.b : self.dim.b + self.dim.r]
+        return self.transform[:, kept[:, None], kept].swapaxes(1, 2)
 
     @property
     def spin_by_rotation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.multibody.dimension import product
-from dolfinopt.multibody.frames import Interface
+from dolfinopt.multibody.frames import CarriedFrame, Interface
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -57,13 +57,13 @@ def body_gradient(
         for s, interface in link.interfaces.items():
             on_interface = np.zeros_like(by)
             for k in tree.hanging[i, s]:
-                on_interface += _motion_gradient(links[k].joint.transform, by_motion[k])
+                on_interface += _carried(links[k].joint, by_motion[k])
                 if (rotor := links[k].rotor) is not None:
                     on_interface += _motion_gradient(rotor.load_by_motion, ends[i, s])
                     on_interface += rotor.force_by_motion[:, None] * drives[:, tree.rotors[k]]
             if s in link.carried:
                 on_interface += _motion_gradient(link.carried[s].load_by_motion, ends[i, s])
-            by += _motion_gradient(interface.transform, on_interface)
+            by += _carried(interface, on_interface)
             if not link.body.is_flexible:
                 continue
             load, turning = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
@@ -115,6 +115,11 @@ def _by_rotation(
 def _motion_gradient(by: np.ndarray, virtual: np.ndarray) -> np.ndarray:
     """Return the derivatives (j, n) of sum_i virtual_i f_i from those of f (i, j, n)."""
     return np.asarray(np.einsum("ijn,in->jn", by, virtual))
+
+
+def _carried(frame: CarriedFrame, by: np.ndarray) -> np.ndarray:
+    """Return derivatives (d + 2 r, n) by the carrier's motion from those by a frame's."""
+    return np.asarray(np.einsum("nij,in->jn", frame.transform, by))
 
 
 def _virtual_motion(

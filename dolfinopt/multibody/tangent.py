@@ -133,6 +133,21 @@ def _columns(
     return places, np.array([places[k] for k in wanted], dtype=int)
 
 
+@dataclass(frozen=True, eq=False)
+class _LoadDerivative:
+    """Derivatives of the load on a frame or an interface, in its components.
+
+    Attributes:
+        by_motion: by its own motion, all that hangs on it moving along (n, d + r, d + 2 r).
+        by_columns: by the columns from `first` on (n, d + r, .).
+        first: where those that do not move it begin.
+    """
+
+    by_motion: np.ndarray
+    by_columns: np.ndarray
+    first: int
+
+
 class _Passes:
     """Both passes.
 
@@ -147,145 +162,157 @@ class _Passes:
         self.tree, self.links, self.dim = tree, links, tree.dim
         self.loads = inward_pass(tree, links, driven=len(asked) > 0)
         self.rows: dict[int | None, int] = {int(k): row for row, k in enumerate(asked)}
-        self.count, rows = links[0].body.a.shape[1], len(asked) + tree.num_coordinates
         self.places, self.order = _columns(tree, asked, keep)
         ends = np.searchsorted(keep, [0, *(part.stop for part in tree.slices)])
         parts = zip(pairwise(ends), tree.slices, strict=True)
         self.kept = [keep[a:b] - part.start for (a, b), part in parts]
-        places = self.order[len(asked) :]
-        self.columns = [slice(3 * p[0], 3 * p[-1] + 3) if len(p:=places[a:b]) else slice(0, 0) for a, b in pairwise(ends)]
+        self.count, rows = links[0].body.a.shape[1], len(asked) + tree.num_coordinates
         self.matrix = np.zeros((self.count, rows, 3 * len(self.order)))
-        # Of the motions of frames and interfaces by all coordinates inboard of them and their own.
+        # Of the motions of frames by all columns before their body's, of interfaces by these, too.
         self.frames: dict[int, np.ndarray] = {}
         self.ends: dict[Site, np.ndarray] = {}
         self._outwards()
-        self.on_frames: dict[int, np.ndarray] = {}  # derivatives of loads by all coordinates
+        self.on_frames: dict[int, _LoadDerivative] = {}
         self._inwards()
 
     def _outwards(self) -> None:
-        size = self.dim.b + self.dim.r
-        cart = self.tree.cart is not None and 0 in self.rows
-        ground = np.zeros((self.count, size, 3 * cart))
+        tree = self.tree
+        cart = tree.cart is not None and 0 in self.rows
+        ground = np.zeros((self.count, self.dim.b + self.dim.r, 3 * cart))
         ground[:, 0, 2::3] = 1.0
         self.ends[GROUND, 0] = ground
-        for i in self.tree.order:
-            link, joint, own = self.links[i], self.tree.joints[i], self.columns[i]
-            inner = self.ends[joint.parent, joint.interface]
-            place, width = self.places.get(joint.coordinate), inner.shape[2]
-            stop = width if place is None else max(width, 3 * place + 3)
-            frame = np.zeros((self.count, size, stop))
-            np.matmul(by_instant(link.joint.transform), inner, out=frame[:, :, :width])
-            if place is not None:
-                by_joint = link.joint.by_coordinates[:, :, 0].transpose(2, 0, 1)
-                frame[:, :, 3 * place : 3 * place + 3] += by_joint
+        stop = ground.shape[2]
+        for i in tree.order:
+            link, joint, kept = self.links[i], tree.joints[i], self.kept[i]
+            stop += 3 * sum(k in self.rows for k in {joint.coordinate, tree.rotors.get(i)})
+            frame = self._moved(link.joint, self.ends[joint.parent, joint.interface], stop)
+            if (place := self.places.get(joint.coordinate)) is not None:
+                frame[:, :, 3 * place : 3 * place + 3] = self._by_joint(i)
             self.frames[i] = frame
+            stop += 3 * len(kept)
             for s, interface in link.interfaces.items():
-                width = frame.shape[2]
-                end = np.zeros((self.count, size, max(width, own.stop)))
-                np.matmul(by_instant(interface.transform), frame, out=end[:, :, :width])
+                end = self.ends[i, s] = self._moved(interface, frame, stop)
                 if link.body.is_flexible:
-                    moved = interface.by_coordinates
-                    by_own = link.body.by_rates(moved, interface.places, self.kept[i])
-                    end[:, :, own] += by_own.reshape(self.count, size, -1)
-                self.ends[i, s] = end
+                    by_own = link.body.by_rates(interface.by_coordinates, interface.places, kept)
+                    end[:, :, frame.shape[2] :] = by_own.reshape(*end.shape[:2], -1)
+
+    def _moved(self, frame: CarriedFrame, carrier: np.ndarray, width: int) -> np.ndarray:
+        """Return the derivatives of a frame's motion through that of its carrier."""
+        out = np.zeros((*carrier.shape[:2], width))
+        np.matmul(frame.transform, carrier, out=out[:, :, : carrier.shape[2]])
+        return out
+
+    def _by_joint(self, i: int) -> np.ndarray:
+        """Return the derivatives of a frame's motion by its joint's coordinate (n, d + 2 r, 3)."""
+        return self.links[i].joint.by_coordinates[:, :, 0].transpose(2, 0, 1)
 
     def _inwards(self) -> None:
         for i in reversed(self.tree.order):
-            link = self.links[i]
             felt = len(self.rows) > 0 or self.tree.is_felt(i)
-            if felt or link.body.is_flexible:
+            if felt or self.links[i].body.is_flexible:
                 self._add_body(i, felt)
         if self.rows:
             on_ground = self._on_interface((GROUND, 0))
             if self.tree.cart is not None and 0 in self.rows:
-                self.matrix[:, 0] += on_ground[:, 0]
-                self.matrix[:, 0, 2] += self.tree.cart
+                self.matrix[:, 0, on_ground.first :] += on_ground.by_columns[:, 0]
+                self.matrix[:, 0, 2] += on_ground.by_motion[:, 0, 0] + self.tree.cart
 
-    def _on_interface(self, site: Site) -> np.ndarray:
-        """Return the derivative of the load on an interface (n, d + r, 3 S), in its components."""
-        tree, dim, end, by_motion = self.tree, self.dim, self.ends[site], []
-        on_it = [self._carrier(self.links[k].joint) @ self.on_frames[k] for k in tree.hanging[site]]
-        none = np.zeros((self.count, dim.b, self.matrix.shape[2]))
-        out = sum(on_it[1:], on_it[0]) if on_it else none
+    def _first(self, width: int) -> int:
+        """Return the first column by which loads behind a frame of so many are differentiated."""
+        return 0 if self.tree.forces else width  # those of the world turn with what is inboard
+
+    def _on_interface(self, site: Site) -> _LoadDerivative:
+        """Return the derivative of the load on an interface by all that is not inboard."""
+        tree, end = self.tree, self.ends[site]
+        first = self._first(end.shape[2])
+        by_motion = np.zeros((self.count, self.dim.b, end.shape[1]))
+        by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
         for k in tree.hanging[site]:
-            joint, rotor = self.links[k].joint, self.links[k].rotor
+            joint, on_frame, rotor = self.links[k].joint, self.on_frames[k], self.links[k].rotor
+            by_motion += joint.of_loads @ (on_frame.by_motion @ joint.transform)
+            by_columns[:, :, on_frame.first - first :] += joint.of_loads @ on_frame.by_columns
             if (place := self.places.get(joint.joint.coordinate)) is not None:
-                load = joint.in_carrier(self.loads.joints[k])
-                out[:, :, 3 * place] += joint.load_by_coordinates(load, load)[:, 0].T
-            if rotor is None:
-                continue
-            by_motion.append(rotor.load_by_motion)
-            if (place := self.places.get(tree.rotors[k])) is not None:
-                row, columns = self.rows[tree.rotors[k]], slice(3 * place, 3 * place + 3)
-                out[:, :, columns] += rotor.load_by_motor.transpose(2, 0, 1)
+                load, start = joint.in_carrier(self.loads.joints[k]), 3 * place - first
+                by_joint = on_frame.by_motion @ self._by_joint(k)
+                by_columns[:, :, start : start + 3] += joint.of_loads @ by_joint
+                by_columns[:, :, start] += joint.load_by_coordinates(load, load)[:, 0].T
+            if rotor is not None:
+                by_motion += by_instant(rotor.load_by_motion)
+            if rotor is not None and (row := self.rows.get(tree.rotors[k])) is not None:
+                place = self.places[tree.rotors[k]]
+                start = 3 * place - first
+                by_columns[:, :, start : start + 3] += rotor.load_by_motor.transpose(2, 0, 1)
                 self.matrix[:, row, : end.shape[2]] += rotor.force_by_motion @ end
                 self.matrix[:, row, 3 * place + 2] += rotor.force_by_motor
         i, s = site
         if i != GROUND and s in self.links[i].carried:
-            by_motion.append(self.links[i].carried[s].load_by_motion)
-        if by_motion:
-            out[:, :, : end.shape[2]] += by_instant(sum(by_motion[1:], by_motion[0])) @ end
-        return out
+            by_motion += by_instant(self.links[i].carried[s].load_by_motion)
+        return _LoadDerivative(by_motion, by_columns, first)
 
     def _add_body(self, i: int, felt: bool) -> None:
         """Add the rows of a body and of its joint's drive."""
-        link, part, first = self.links[i], self.tree.slices[i], len(self.rows)
+        link, frame = self.links[i], self.frames[i]
         outboard = {s: self._on_interface((i, s)) for s in link.interfaces}
         if link.body.is_flexible:
-            self._add_rows(i, self.matrix[:, first + part.start : first + part.stop], outboard)
+            self._add_rows(i, outboard)
         if felt:
             self.on_frames[i] = self._on_frame(i, outboard)
         if (row := self.rows.get(self.tree.joints[i].coordinate)) is not None:
-            self.matrix[:, row] += link.joint.drive_axis @ self.on_frames[i]
+            on_frame, axis = self.on_frames[i], link.joint.drive_axis
+            by_inboard = (axis @ on_frame.by_motion)[:, None] @ frame
+            self.matrix[:, row, : frame.shape[2]] += by_inboard[:, 0]
+            self.matrix[:, row, on_frame.first :] += axis @ on_frame.by_columns
 
-    def _add_rows(self, i: int, rows: np.ndarray, outboard: dict[int, np.ndarray]) -> None:
+    def _add_rows(self, i: int, outboard: dict[int, _LoadDerivative]) -> None:
         """Add the derivative of a body's elastic rows."""
-        link, kept, frame = self.links[i], self.kept[i], self.frames[i]
+        link, kept, part, frame = self.links[i], self.kept[i], self.tree.slices[i], self.frames[i]
         body, loads, width = link.body, self.loads.outboard[i], frame.shape[2]
+        rows = self.matrix[:, len(self.rows) + part.start : len(self.rows) + part.stop]
         by_rates = body.rows_by_rates(kept, interface_coefficients(link, loads))
-        np.matmul(by_instant(body.rows_by_motion.swapaxes(0, 1)), frame, out=rows[:, :, :width])
+        by_motion = by_instant(body.rows_by_motion.swapaxes(0, 1))
+        own = slice(width, width + 3 * len(kept))
         for s, interface in link.interfaces.items():
-            rows += by_instant(interface.rows_by_load.swapaxes(0, 1)) @ outboard[s]
-            V = by_instant(interface.V)
-            turning = carried_load(link, loads, s)
+            by_load, on = by_instant(interface.rows_by_load.swapaxes(0, 1)), outboard[s]
+            by_end = by_load @ on.by_motion
+            by_motion += by_end @ interface.transform
+            rows[:, :, own] += by_end @ self.ends[i, s][:, :, width:]
+            rows[:, :, on.first :] += by_load @ on.by_columns
+            V, turning = by_instant(interface.V), carried_load(link, loads, s)
             by_displacement = interface.coefficients_by_coordinates(loads[s], turning)
-            by_e = by_instant(by_displacement) @ V[:, :, kept]
-            by_rates[..., 0] += V.swapaxes(1, 2) @ by_e
+            by_rates[..., 0] += V.swapaxes(1, 2) @ (by_instant(by_displacement) @ V[:, :, kept])
             if s in link.applied:
                 given = by_instant(interface.coefficients(_given(link, s)))
                 rows[:, :, 0:width:3] += V.swapaxes(1, 2) @ (given @ self._rotation(i))
-        rows[:, :, self.columns[i]] += by_rates.reshape(*rows.shape[:2], -1)
+        rows[:, :, :width] += by_motion @ frame
+        rows[:, :, own] += by_rates.reshape(*rows.shape[:2], -1)
 
-    def _on_frame(self, i: int, outboard: dict[int, np.ndarray]) -> np.ndarray:
+    def _on_frame(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
         """Return the derivative of what a joint feels of the body and all behind it."""
         link, kept, frame = self.links[i], self.kept[i], self.frames[i]
         body, loads, width = link.body, self.loads.outboard[i], frame.shape[2]
-        on_it = [self._carrier(link.interfaces[s]) @ load for s, load in outboard.items()]
-        none = np.zeros((self.count, self.dim.b, self.matrix.shape[2]))
-        out = sum(on_it[1:], on_it[0]) if on_it else none
-        out[:, :, :width] += by_instant(body.load_by_motion) @ frame
-        by_rates = body.load_by_rates(kept) if body.is_flexible else None
+        first = self._first(width)
+        by_motion = by_instant(body.load_by_motion)
+        by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
+        own = by_columns[:, :, width - first : width - first + 3 * len(kept)]
+        if body.is_flexible:
+            own += body.load_by_rates(kept).reshape(*own.shape)
         for s, interface in link.interfaces.items():
-            if by_rates is not None:
+            of_loads, on = interface.of_loads, outboard[s]
+            by_motion += of_loads @ (on.by_motion @ interface.transform)
+            own += of_loads @ (on.by_motion @ self.ends[i, s][:, :, width:])
+            by_columns[:, :, on.first - first :] += of_loads @ on.by_columns
+            if body.is_flexible:
                 turning = carried_load(link, loads, s)
                 by_displacement = by_instant(interface.load_by_coordinates(loads[s], turning))
-                by_rates[..., 0] += by_displacement @ by_instant(interface.V[:, kept])
+                own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
             if s in link.applied:
                 given = by_instant(self.dim.shifted(interface.place, _given(link, s)))
-                out[:, :, 0:width:3] += given @ self._rotation(i)
-        if by_rates is not None:
-            out[:, :, self.columns[i]] += by_rates.reshape(*out.shape[:2], -1)
-        return out
+                by_columns[:, :, 0:width:3] += given @ self._rotation(i)
+        return _LoadDerivative(by_motion, by_columns, first)
 
     def _rotation(self, i: int) -> np.ndarray:
         """Return the derivative of a body's rotation by all coordinates inboard (n, r, .)."""
         return self.frames[i][:, self.dim.d : self.dim.b, 1::3]  # as its spin's by their rates
-
-    def _carrier(self, frame: CarriedFrame) -> np.ndarray:
-        """Return what carries a load on a frame to the origin of its carrier (n, d + r, d + r)."""
-        # Forces and moments work on displacements and rotations as a and wd go.
-        kept = np.r_[0 : self.dim.d, self.dim.b : self.dim.b + self.dim.r]
-        return by_instant(frame.transform[kept[:, None], kept].swapaxes(0, 1))
 
 
 def _given(link: Link, s: int) -> np.ndarray:
