@@ -38,7 +38,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.dimension import DIMENSIONS, product
+from dolfinopt.multibody.dimension import DIMENSIONS, compose, product
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -127,6 +127,11 @@ class BodyMotion:
     def beta(self) -> np.ndarray:
         """Entries of 2 Omega (g, n)."""
         return self.dim.beta(self.w)
+
+    @cached_property
+    def alpha_by_spin(self) -> np.ndarray:
+        """Derivative of the entries of A by w (g, r, n)."""
+        return self.dim.alpha_by_spin(self.w)
 
     # -- conjugates of the pushes, displacement along the modes -------------------------------
 
@@ -317,16 +322,20 @@ class BodyMotion:
         out = np.zeros((d + r, d + 2 * r, self.a.shape[1]))
         out[range(d), range(d)] = self.constants.mass
         spun = dim.by_spin(s)
-        out[:d, d : d + r] = dim.centripetal_by_spin(self.w, s) + 2.0 * dim.by_spin(sd)
+        out[:d, d : d + r] = product(dim.applied.matrix(s), self.alpha_by_spin)
+        out[:d, d : d + r] += 2.0 * dim.by_spin(sd)
         out[:d, d + r :], out[d:, :d] = spun, spun.swapaxes(0, 1)
-        out[d:, d : d + r], out[d:, d + r :] = dim.torque_by_spin(self.w, G, H)
+        of_G, of_H = dim.torque_of.matrix(G), dim.torque_of.matrix(H)
+        out[d:, d : d + r] = product(of_G, self.alpha_by_spin) + 2.0 * compose(of_H, dim.spin)
+        out[d:, d + r :] = compose(of_G, dim.spin)
         return out
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:
         """Derivative of the rows by (a, w, wd), (d + 2 r, q, n)."""
-        by_w, by_wd = self.dim.contracted_by_spin(self.w, self.Y, self.Yd)
-        return np.concatenate([self.V[: self.dim.d], by_w, by_wd])
+        dim = self.dim
+        by_w = product(self.alpha_by_spin.swapaxes(0, 1), self.Y) - 2.0 * dim.axial(self.Yd)
+        return np.concatenate([self.V[: dim.d], by_w, -dim.axial(self.Y)])
 
     @cached_property
     def load_by_conjugates(self) -> np.ndarray:

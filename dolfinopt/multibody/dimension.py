@@ -30,7 +30,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from dolfinopt.multibody.measured import SERIES_LIMIT, SERIES_TERMS
+from dolfinopt.multibody.measured import COMPLEX_STEP, SERIES_LIMIT, SERIES_TERMS
 
 
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
@@ -44,11 +44,6 @@ def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 def compose(R: np.ndarray, S: np.ndarray) -> np.ndarray:
     """Return R S of rotations (d, d, n), or one (d, d)."""
     return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)
-
-
-def transposed_product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Return A' B (j, ..., n) likewise."""
-    return product(A.swapaxes(0, 1), B)
 
 
 class Bilinear:
@@ -90,10 +85,10 @@ class Dimension:
         velocity: w x p.
         moment: p x f.
         commutator: w x v of angular velocities.
-        apply: A p of the entries alpha of A.
-        centripetal_by_spin: its derivative (d, r, n) by w, of w and p.
-        torque: the moment of accelerations alpha by second moments G.
+        apply: A p of the entries alpha of A; applied: the same of p and alpha.
+        torque: the moment of accelerations alpha by second moments G; torque_of: of G and alpha.
         turned: its adjoint, the entries of (w~)' y.
+        spin: (g, r) entries of w~ by w.
     """
 
     def __init__(
@@ -103,29 +98,25 @@ class Dimension:
         self.E, self.loads, self.turning = E, np.array(loads), turning
         self.d, self.r, self.g, self.b = E.shape[1], len(S), len(E), E.shape[1] + len(S)
         in_E = components(E)
-        self._spin = np.einsum("cab,rab->cr", in_E, S)
+        self.spin = np.einsum("cab,rab->cr", in_E, S)
         self._transposed = np.einsum("cab,eba->ce", in_E, E)
         self.trace = np.trace(in_E, axis1=1, axis2=2)[:, None]
-        self._skew, self._by_spin = S.reshape(self.r, -1).T, S.swapaxes(0, 1).reshape(-1, self.d)
         squares = np.einsum("cab,rad,sdb->crs", in_E, S, S)
         torque = np.einsum("eab,rda,cdb->rce", in_E, S, E)
-        by_w = squares + squares.swapaxes(1, 2)
-        self._inertia = np.einsum("rce,cs->rse", torque, self._spin).reshape(-1, self.g)
-        self._square, self.velocity = Bilinear(squares), Bilinear(S.swapaxes(0, 1))
-        self.moment, self.apply = Bilinear(S.swapaxes(1, 2)), Bilinear(E.swapaxes(0, 1))
-        self.torque, self.turned = Bilinear(torque), Bilinear(torque.transpose(2, 0, 1))
+        self._square, self._by_spin = Bilinear(squares), Bilinear(squares + squares.swapaxes(1, 2))
+        self.velocity, self.moment = Bilinear(S.swapaxes(0, 1)), Bilinear(S.swapaxes(1, 2))
         self.commutator = Bilinear(np.einsum("tab,rad,sdb->trs", S, S, S))
-        self.centripetal_by_spin = Bilinear(np.einsum("cij,crs->irsj", E, by_w))
-        self._torque_by_w = Bilinear(np.einsum("tce,crs->trse", torque, by_w))
-        self._contracted = Bilinear(by_w.transpose(1, 2, 0))
+        self.apply, self.applied = Bilinear(E.swapaxes(0, 1)), Bilinear(E.transpose(1, 2, 0))
+        self.torque, self.torque_of = Bilinear(torque), Bilinear(torque.swapaxes(1, 2))
+        self.turned = Bilinear(torque.transpose(2, 0, 1))
 
     def skew(self, w: np.ndarray) -> np.ndarray:
         """Return w~ (d, d, ...) of angular velocities (r, ...)."""
-        return product(self._skew, w).reshape(self.d, self.d, *w.shape[1:])
+        return self.velocity.matrix(w)
 
     def by_spin(self, p: np.ndarray) -> np.ndarray:
         """Return the derivative of w x p by w (d, r, n)."""
-        return product(self._by_spin, p).reshape(self.d, self.r, *p.shape[1:])
+        return self.moment.matrix(p).swapaxes(0, 1)
 
     def transposed(self, x: np.ndarray) -> np.ndarray:
         """Return the entries (g, ..., n) of the transposed matrices."""
@@ -133,37 +124,24 @@ class Dimension:
 
     def alpha(self, w: np.ndarray, wd: np.ndarray) -> np.ndarray:
         """Return the entries (g, n) of A."""
-        return self._square(w, w) + self._spin.dot(wd)
+        return self._square(w, w) + self.spin.dot(wd)
 
     def beta(self, w: np.ndarray) -> np.ndarray:
         """Return the entries (g, n) of 2 Omega."""
-        return product(self._spin, 2.0 * w)
+        return product(self.spin, 2.0 * w)
 
-    def applied_transposed(self, alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return A' p (d, n)."""
-        return self.apply(self.transposed(alpha), p)
+    def alpha_by_spin(self, w: np.ndarray) -> np.ndarray:
+        """Return the derivative of `alpha` by w (g, r, n)."""
+        return self._by_spin.matrix(w)
 
     @property
     def axis_of_moments(self) -> np.ndarray:
         """The matrix (r, g, 1) of `axial`."""
-        return -self._spin.T[:, :, None]
+        return -self.spin.T[:, :, None]
 
     def axial(self, G: np.ndarray) -> np.ndarray:
         """Return `torque` (r, ..., n) of second moments with accelerations themselves."""
-        return product(-self._spin.T, G)
-
-    def torque_by_spin(
-        self, w: np.ndarray, G: np.ndarray, H: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives (r, r, n) of torque(alpha, G) + torque(beta, H) by w and wd."""
-        of_G, of_H = (product(self._inertia, x).reshape(self.r, self.r, -1) for x in (G, H))
-        return self._torque_by_w(w, G) + 2.0 * of_H, of_G
-
-    def contracted_by_spin(
-        self, w: np.ndarray, Y: np.ndarray, Yd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives (r, q, n) of alpha_c Y_c + beta_c Yd_c by w and wd."""
-        return self._contracted(w, Y) - 2.0 * self.axial(Yd), -self.axial(Y)
+        return product(-self.spin.T, G)
 
     def rotated(self, R: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return angular velocities (r, ..., n) in other components; in the plane the same."""
@@ -253,12 +231,6 @@ class SpaceTurning:
         return _derivative(self._c, 2), _derivative(self._c, 3)
 
     @cached_property
-    def _second(self) -> tuple[np.ndarray, np.ndarray]:
-        """c_2'', c_3''."""
-        first = {k: _derivative(self._c, k) for k in (3, 4, 5)}
-        return 0.5 * (2 * first[4] - first[3]), 0.5 * (3 * first[5] - first[4])
-
-    @cached_property
     def R(self) -> np.ndarray:
         """The rotation (3, 3, n)."""
         return rotation(self.theta, self._c, 1)
@@ -274,7 +246,7 @@ class SpaceTurning:
 
     def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x (3, ..., n)."""
-        return transposed_product(self.J, x)
+        return product(self.J.swapaxes(0, 1), x)
 
     @cached_property
     def velocity(self) -> np.ndarray:
@@ -293,46 +265,26 @@ class SpaceTurning:
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray:
         """Return the derivative of J v by theta (3, 3, n); of J' v with `sign` = -1."""
-        theta, c = self.theta, self._c
-        x, along = (theta * theta).sum(axis=0), (theta * v).sum(axis=0)
-        first, second = self._first
-        turned = 2.0 * sign * first * SPACE.velocity(theta, v)
-        turned += 2.0 * second * (along * theta - x * v) - 2.0 * c[3] * v
-        out = turned[:, None] * theta + (c[3] * theta)[:, None] * v
-        out[[0, 1, 2], [0, 1, 2]] += c[3] * along
-        out += SPACE.skew(-sign * c[2] * v)
-        return out
+        # J' is J of the opposite rotation.
+        v = np.tile(v, 3)
+        return self._derivative(lambda one: SpaceTurning(sign * one.theta, v, v).velocity, 0)
 
     @cached_property
     def acceleration_by_theta(self) -> np.ndarray:
         """Derivative of `acceleration` by theta (3, 3, n)."""
-        theta, v, c = self.theta, self.rate, self._c
-        x, s, square = (theta * theta).sum(axis=0), (theta * v).sum(axis=0), (v * v).sum(axis=0)
-        (d2, d3), (dd2, dd3) = self._first, self._second
-        turned, plane = SPACE.velocity(theta, v), s * theta - x * v
-        left = 4.0 * s * (dd2 * turned + dd3 * plane) + 2.0 * d3 * (square * theta - 2.0 * s * v)
-        out = self.by_theta(self.second) + left[:, None] * theta
-        left = 2.0 * d2 * turned + 2.0 * d3 * (plane + s * theta) - c[3] * v
-        out += left[:, None] * v
-        out -= (2.0 * d3 * s * v)[:, None] * theta
-        out[[0, 1, 2], [0, 1, 2]] += c[3] * square + 2.0 * d3 * s * s
-        out += SPACE.skew(-2.0 * d2 * s * v)
-        return out
+        return self._derivative(lambda one: one.acceleration, 0)
 
     @cached_property
     def acceleration_by_rate(self) -> np.ndarray:
-        """Derivative of `acceleration` by theta' (3, 3, n): d(J theta')/d theta + J'."""
-        theta, v, c = self.theta, self.rate, self._c
-        s = (theta * v).sum(axis=0)
-        first, second = self._first
-        out = self.by_theta(v)
-        out += SPACE.skew(c[2] * v + 2.0 * s * first * theta)
-        # theta~ theta~ = theta theta' - x, theta~ v~ + v~ theta~ = v theta' + theta v' - 2 s
-        x = (theta * theta).sum(axis=0)
-        out += (2.0 * s * second * theta + c[3] * v)[:, None] * theta
-        out += (c[3] * theta)[:, None] * v
-        out[[0, 1, 2], [0, 1, 2]] -= 2.0 * s * (second * x + c[3])
-        return out
+        """Derivative of `acceleration` by theta' (3, 3, n)."""
+        return self._derivative(lambda one: one.acceleration, 1)
+
+    def _derivative(self, f: Callable[[SpaceTurning], np.ndarray], which: int) -> np.ndarray:
+        """Return the derivative (3, 3, n) of f by theta, or by its rate, by complex steps."""
+        every: list[np.ndarray] = [np.tile(x, 3) for x in (self.theta, self.rate, self.second)]
+        step = COMPLEX_STEP * np.repeat(np.eye(3), self.theta.shape[1], axis=1)
+        every[which] = every[which] + 1j * step
+        return f(SpaceTurning(*every)).imag.reshape(3, 3, -1) / COMPLEX_STEP
 
 
 def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
@@ -343,7 +295,7 @@ def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
     return out
 
 
-def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
+def series(x: np.ndarray, orders: int = 6) -> list[np.ndarray]:
     """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of large angles closed."""
     far = np.abs(x) > SERIES_LIMIT
     if not far.any():

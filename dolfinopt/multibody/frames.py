@@ -123,7 +123,7 @@ class CarriedFrame:
         out = np.zeros((size, size, a.shape[1]))
         out[range(size), range(size)] = 1.0
         if self.is_offset:
-            out[:d, d:s] = dim.centripetal_by_spin(w, self.place)
+            out[:d, d:s] = product(dim.applied.matrix(self.place), dim.alpha_by_spin(w))
             out[:d, s:] = dim.by_spin(self.place)
         if self.shift_rates is not None:
             out[:d, d:s] += 2.0 * dim.by_spin(self.shift_rates[0])
