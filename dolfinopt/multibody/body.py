@@ -202,9 +202,7 @@ class BodyMotion:
         every = self._by_e, -self._bent_rate, -self._bent_by(2)
         return tuple(by_instant(x[places][:, kept]) for x in every)
 
-    def by_rates(
-        self, by: np.ndarray, places: np.ndarray | slice, kept: np.ndarray
-    ) -> np.ndarray:
+    def by_rates(self, by: np.ndarray, places: np.ndarray | slice, kept: np.ndarray) -> np.ndarray:
         """Return the derivative by those e, e', e'' kept of what conjugates displace (n, i, k, 3).
 
         Args:
@@ -422,7 +420,9 @@ class BodyMotion:
             outboard=by_T[ends:],
             outboard_point=np.zeros(d),
             K0=inertial,
-            K0_outboard=bent[ends:P] if constants.bent is not None else np.zeros_like(body.K0_outboard),
+            K0_outboard=bent[ends:P]
+            if constants.bent is not None
+            else np.zeros_like(body.K0_outboard),
             further_points=np.zeros_like(body.further_points),
             along_modes=along,
         )

@@ -30,7 +30,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from dolfinopt.multibody.measured import COMPLEX_STEP, SERIES_LIMIT, SERIES_TERMS
+from dolfinopt.multibody.measured import SERIES_LIMIT, SERIES_TERMS
 
 
 def product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
@@ -231,6 +231,12 @@ class SpaceTurning:
         return _derivative(self._c, 2), _derivative(self._c, 3)
 
     @cached_property
+    def _second(self) -> tuple[np.ndarray, np.ndarray]:
+        """c_2'', c_3''."""
+        first = {k: _derivative(self._c, k) for k in (3, 4, 5)}
+        return 0.5 * (2 * first[4] - first[3]), 0.5 * (3 * first[5] - first[4])
+
+    @cached_property
     def R(self) -> np.ndarray:
         """The rotation (3, 3, n)."""
         return rotation(self.theta, self._c, 1)
@@ -265,26 +271,46 @@ class SpaceTurning:
 
     def by_theta(self, v: np.ndarray, sign: float = 1.0) -> np.ndarray:
         """Return the derivative of J v by theta (3, 3, n); of J' v with `sign` = -1."""
-        # J' is J of the opposite rotation.
-        v = np.tile(v, 3)
-        return self._derivative(lambda one: SpaceTurning(sign * one.theta, v, v).velocity, 0)
+        theta, c = self.theta, self._c
+        x, along = (theta * theta).sum(axis=0), (theta * v).sum(axis=0)
+        first, second = self._first
+        turned = 2.0 * sign * first * SPACE.velocity(theta, v)
+        turned += 2.0 * second * (along * theta - x * v) - 2.0 * c[3] * v
+        out = turned[:, None] * theta + (c[3] * theta)[:, None] * v
+        out[[0, 1, 2], [0, 1, 2]] += c[3] * along
+        out += SPACE.skew(-sign * c[2] * v)
+        return out
 
     @cached_property
     def acceleration_by_theta(self) -> np.ndarray:
         """Derivative of `acceleration` by theta (3, 3, n)."""
-        return self._derivative(lambda one: one.acceleration, 0)
+        theta, v, c = self.theta, self.rate, self._c
+        x, s, square = (theta * theta).sum(axis=0), (theta * v).sum(axis=0), (v * v).sum(axis=0)
+        (d2, d3), (dd2, dd3) = self._first, self._second
+        turned, plane = SPACE.velocity(theta, v), s * theta - x * v
+        left = 4.0 * s * (dd2 * turned + dd3 * plane) + 2.0 * d3 * (square * theta - 2.0 * s * v)
+        out = self.by_theta(self.second) + left[:, None] * theta
+        left = 2.0 * d2 * turned + 2.0 * d3 * (plane + s * theta) - c[3] * v
+        out += left[:, None] * v
+        out -= (2.0 * d3 * s * v)[:, None] * theta
+        out[[0, 1, 2], [0, 1, 2]] += c[3] * square + 2.0 * d3 * s * s
+        out += SPACE.skew(-2.0 * d2 * s * v)
+        return out
 
     @cached_property
     def acceleration_by_rate(self) -> np.ndarray:
-        """Derivative of `acceleration` by theta' (3, 3, n)."""
-        return self._derivative(lambda one: one.acceleration, 1)
-
-    def _derivative(self, f: Callable[[SpaceTurning], np.ndarray], which: int) -> np.ndarray:
-        """Return the derivative (3, 3, n) of f by theta, or by its rate, by complex steps."""
-        every: list[np.ndarray] = [np.tile(x, 3) for x in (self.theta, self.rate, self.second)]
-        step = COMPLEX_STEP * np.repeat(np.eye(3), self.theta.shape[1], axis=1)
-        every[which] = every[which] + 1j * step
-        return f(SpaceTurning(*every)).imag.reshape(3, 3, -1) / COMPLEX_STEP
+        """Derivative of `acceleration` by theta' (3, 3, n): d(J theta')/d theta + J'."""
+        theta, v, c = self.theta, self.rate, self._c
+        s = (theta * v).sum(axis=0)
+        first, second = self._first
+        out = self.by_theta(v)
+        out += SPACE.skew(c[2] * v + 2.0 * s * first * theta)
+        # theta~ theta~ = theta theta' - x, theta~ v~ + v~ theta~ = v theta' + theta v' - 2 s
+        x = (theta * theta).sum(axis=0)
+        out += (2.0 * s * second * theta + c[3] * v)[:, None] * theta
+        out += (c[3] * theta)[:, None] * v
+        out[[0, 1, 2], [0, 1, 2]] -= 2.0 * s * (second * x + c[3])
+        return out
 
 
 def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
@@ -295,7 +321,7 @@ def rotation(theta: np.ndarray, c: list[np.ndarray], k: int) -> np.ndarray:
     return out
 
 
-def series(x: np.ndarray, orders: int = 6) -> list[np.ndarray]:
+def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
     """Return c_0 ... c_(orders-1) at x (n,): by their series, or those of large angles closed."""
     far = np.abs(x) > SERIES_LIMIT
     if not far.any():

@@ -7,6 +7,7 @@ a function inwards by its transpose.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,8 @@ class CarriedFrame:
         spin: v, v' (r, n); None: zero.
         shifts: (d, k, 1) derivative of the place by x.
         spins: (r, k, n) that of the angular velocity by x'.
+        spin_by_rotation: derivatives of v and w x v + v' by the rotations among x, of the latter
+            by x' but for w x v; None: zero.
     """
 
     dim: Dimension
@@ -40,14 +43,11 @@ class CarriedFrame:
     shift_rates: tuple[np.ndarray, np.ndarray] | None = None
     is_offset = True  # whether the place is not the carrier's origin
 
-    @property
-    def R(self) -> np.ndarray | None: ...
-    @property
-    def spin(self) -> tuple[np.ndarray, np.ndarray] | None: ...
-    @property
-    def shifts(self) -> np.ndarray: ...
-    @property
-    def spins(self) -> np.ndarray: ...
+    R: Any
+    spin: Any
+    shifts: Any
+    spins: Any
+    spin_by_rotation: Any = None
 
     @cached_property
     def alpha(self) -> np.ndarray:
@@ -137,11 +137,6 @@ class CarriedFrame:
         # Forces and moments work on displacements and rotations as a and wd go.
         kept = np.r_[0 : self.dim.d, self.dim.b : self.dim.b + self.dim.r]
         return self.transform[:, kept[:, None], kept].swapaxes(1, 2)
-
-    @property
-    def spin_by_rotation(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Derivatives of v and w x v + v' by the rotations among x, and of the latter by x'."""
-        return None
 
     @cached_property
     def by_coordinates(self) -> np.ndarray:
@@ -307,7 +302,9 @@ class MovingJoint(CarriedFrame):
         # Of a column NumPy takes other instructions, and another last bit, where the end of its
         # stride touches the memory of the result.
         angle = np.ascontiguousarray(self.rates[0])
-        return self.joint.turns @ np.stack([np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)])
+        return self.joint.turns @ np.stack(
+            [np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)]
+        )
 
     @cached_property
     def spin(self) -> tuple[np.ndarray, np.ndarray] | None:

@@ -163,9 +163,7 @@ class SiteMotion:
         part, first = posed.mechanism.slices[i], posed.mechanism.num_rigid
         columns = slice(first + part.start, first + part.stop)
         place, R = posed.interface(i, number)[0], posed.body(i)[2]
-        self.flexible.append(
-            FlexibleLink(i, number, section, turning, place, R, columns, order)
-        )
+        self.flexible.append(FlexibleLink(i, number, section, turning, place, R, columns, order))
         self.order[columns] = order
         spin = dim.rotated(R, turning.jacobian_times(section.V[dim.d :]))
         lever = (self.place - place)[:, None]

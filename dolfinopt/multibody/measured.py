@@ -9,7 +9,6 @@ Each stands with its unit, what it rules, and what was measured.
 # 1e-24 there. Interfaces turn by less.
 SERIES_TERMS = 10
 SERIES_LIMIT = 1.0
-COMPLEX_STEP = 1e-30  # of derivatives by rotation vectors: its square vanishes beside any angle
 
 # -- mechanism, inverse_dynamics -------------------------------------------------------------
 

@@ -230,7 +230,8 @@ class _Passes:
         for k in tree.hanging[site]:
             joint, on_frame, rotor = self.links[k].joint, self.on_frames[k], self.links[k].rotor
             by_motion += joint.of_loads @ (on_frame.by_motion @ joint.transform)
-            by_columns[:, :, on_frame.first - first :] += joint.of_loads @ on_frame.by_columns
+            behind = by_columns[:, :, on_frame.first - first :]
+            _add_product(joint.of_loads, on_frame.by_columns, behind, len(tree.hanging[site]) == 1)
             if (place := self.places.get(joint.joint.coordinate)) is not None:
                 load, start = joint.in_carrier(self.loads.joints[k]), 3 * place - first
                 by_joint = on_frame.by_motion @ self._by_joint(k)
@@ -270,21 +271,21 @@ class _Passes:
         rows = self.matrix[:, len(self.rows) + part.start : len(self.rows) + part.stop]
         by_rates = body.rows_by_rates(kept, interface_coefficients(link, loads))
         by_motion = by_instant(body.rows_by_motion.swapaxes(0, 1))
-        own = slice(width, width + 3 * len(kept))
+        by_own = by_rates.reshape(*rows.shape[:2], -1)
         for s, interface in link.interfaces.items():
             by_load, on = by_instant(interface.rows_by_load.swapaxes(0, 1)), outboard[s]
             by_end = by_load @ on.by_motion
             by_motion += by_end @ interface.transform
-            rows[:, :, own] += by_end @ self.ends[i, s][:, :, width:]
-            rows[:, :, on.first :] += by_load @ on.by_columns
+            by_own += by_end @ self.ends[i, s][:, :, width:]
+            _add_product(by_load, on.by_columns, rows[:, :, on.first :], len(outboard) == 1)
             V, turning = by_instant(interface.V), carried_load(link, loads, s)
             by_displacement = interface.coefficients_by_coordinates(loads[s], turning)
-            by_rates[..., 0] += V.swapaxes(1, 2) @ (by_instant(by_displacement) @ V[:, :, kept])
+            by_own[:, :, ::3] += V.swapaxes(1, 2) @ (by_instant(by_displacement) @ V[:, :, kept])
             if s in link.applied:
                 given = by_instant(interface.coefficients(_given(link, s)))
                 rows[:, :, 0:width:3] += V.swapaxes(1, 2) @ (given @ self._rotation(i))
-        rows[:, :, :width] += by_motion @ frame
-        rows[:, :, own] += by_rates.reshape(*rows.shape[:2], -1)
+        _add_product(by_motion, frame, rows[:, :, :width], not self.tree.forces)
+        rows[:, :, width : width + 3 * len(kept)] += by_own
 
     def _on_frame(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
         """Return the derivative of what a joint feels of the body and all behind it."""
@@ -293,21 +294,23 @@ class _Passes:
         first = self._first(width)
         by_motion = by_instant(body.load_by_motion)
         by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
-        own = by_columns[:, :, width - first : width - first + 3 * len(kept)]
+        by_own = np.zeros((self.count, self.dim.b, 3 * len(kept)))
         if body.is_flexible:
-            own += body.load_by_rates(kept).reshape(*own.shape)
+            by_own = body.load_by_rates(kept).reshape(by_own.shape)
         for s, interface in link.interfaces.items():
             of_loads, on = interface.of_loads, outboard[s]
             by_motion += of_loads @ (on.by_motion @ interface.transform)
-            own += of_loads @ (on.by_motion @ self.ends[i, s][:, :, width:])
-            by_columns[:, :, on.first - first :] += of_loads @ on.by_columns
+            by_own += of_loads @ (on.by_motion @ self.ends[i, s][:, :, width:])
+            behind = by_columns[:, :, on.first - first :]
+            _add_product(of_loads, on.by_columns, behind, len(outboard) == 1)
             if body.is_flexible:
                 turning = carried_load(link, loads, s)
                 by_displacement = by_instant(interface.load_by_coordinates(loads[s], turning))
-                own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
+                by_own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
             if s in link.applied:
                 given = by_instant(self.dim.shifted(interface.place, _given(link, s)))
                 by_columns[:, :, 0:width:3] += given @ self._rotation(i)
+        by_columns[:, :, width - first : width - first + 3 * len(kept)] += by_own
         return _LoadDerivative(by_motion, by_columns, first)
 
     def _rotation(self, i: int) -> np.ndarray:
@@ -321,3 +324,11 @@ def _given(link: Link, s: int) -> np.ndarray:
     force, moment = np.split(link.applied[s].in_world, [dim.d])
     of_moment = dim.by_spin(moment) if dim.r > 1 else np.zeros((1, 1, moment.shape[1]))
     return -np.concatenate([dim.by_spin(force), of_moment])
+
+
+def _add_product(A: np.ndarray, B: np.ndarray, out: np.ndarray, alone: bool) -> None:
+    """Add A B; where it is alone nothing stands there yet."""
+    if alone:
+        np.matmul(A, B, out=out)
+    else:
+        out += A @ B
