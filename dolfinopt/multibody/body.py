@@ -349,7 +349,7 @@ class BodyMotion:
         on_s[d:, 0] = -dim.by_spin(self.a).swapaxes(0, 1)
         # G, H and I have v and its transpose, v' and v'' transposed; W_c z takes the place of v.
         of_alpha, of_beta = dim.torque.matrix(self.alpha), dim.torque.matrix(self.beta)
-        for rate, matrix in enumerate((of_alpha, of_beta, dim.axis_of_moments)):
+        for rate, matrix in enumerate((of_alpha, of_beta, -dim.spin.T[:, :, None])):
             on_v[:, rate] = dim.transposed(matrix.swapaxes(0, 1)).swapaxes(0, 1)
         on_v[:, 0] += of_alpha
         on_z[:] = np.einsum("rtgn,gqn->rtqn", on_v, self._Wz[:, :, 0])
@@ -404,13 +404,10 @@ class BodyMotion:
         W = np.zeros_like(body.W)
         W[:, 0, 0] = self.dim.turned(virtual[d:], self.alpha).sum(axis=1)
         W[:, 1:, 0], W[:, 1:, 1:] = by_T[d:ends], self._by_second_moments(virtual[d:], zeta)
-        inertial, bent = np.zeros_like(body.K0), np.zeros((P, *body.K.shape))
-        along = np.zeros_like(body.along_modes)
+        bent = np.zeros((len(every), *body.K.shape))
         if constants.bent is not None:
             self._add_modal(every[P:], zeta)
             bent = self._by_bending(every, x)
-            inertial[self.dim.loads] = bent[:ends]
-            along = bent[P : P + len(along)]
         return ShapeIntegrals(
             mass=float((virtual[:d] * self.a).sum()),
             w=np.column_stack([every[:d, 0].sum(axis=1), by_T[:d]]),
@@ -419,12 +416,10 @@ class BodyMotion:
             D=zeta @ self.rates[:, 1].T,
             outboard=by_T[ends:],
             outboard_point=np.zeros(d),
-            K0=inertial,
-            K0_outboard=bent[ends:P]
-            if constants.bent is not None
-            else np.zeros_like(body.K0_outboard),
+            K0=bent[np.argsort(self.dim.loads)][: len(body.K0)],
+            K0_outboard=bent[ends:P][: len(body.K0_outboard)],
             further_points=np.zeros_like(body.further_points),
-            along_modes=along,
+            along_modes=bent[P:][: len(body.along_modes)].reshape(body.along_modes.shape),
         )
 
     @property

@@ -134,11 +134,6 @@ class Dimension:
         """Return the derivative of `alpha` by w (g, r, n)."""
         return self._by_spin.matrix(w)
 
-    @property
-    def axis_of_moments(self) -> np.ndarray:
-        """The matrix (r, g, 1) of `axial`."""
-        return -self.spin.T[:, :, None]
-
     def axial(self, G: np.ndarray) -> np.ndarray:
         """Return `torque` (r, ..., n) of second moments with accelerations themselves."""
         return product(-self.spin.T, G)
