@@ -77,7 +77,8 @@ class MachineInstants:
         here = self.state(y, yd, ydd)
         if self.machine.is_prescribed:
             return linearise(self.machine.mechanism, here.motion, *here.elastic, keep)
-        return Tangent.of_matrix(here.matrix(), keep)
+        own = np.arange(self.machine.num_coordinates) if keep is None else keep
+        return Tangent(here.matrix()[:, :, own], own, np.arange(len(own)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,10 +224,9 @@ class MachineState:
         (R, moving, _), S = machine.ends, machine.num_coordinates
         rigid = np.concatenate([drives.free, machine.motor_coordinates])
         places = np.r_[:R, machine.motor_columns, R:moving]
-        tangent = linearise(machine.mechanism, self.motion, *self.elastic, None, rigid).dense()
-        matrix = np.zeros((len(tangent), S, S, 3))
-        parts = tangent.reshape(len(tangent), len(places), 3, len(places)).swapaxes(2, 3)
-        matrix[:, places[:, None], places] = parts
+        tangent = linearise(machine.mechanism, self.motion, *self.elastic, None, rigid)
+        matrix = np.zeros((len(tangent.matrix), S, S, 3))
+        matrix[:, places[:, None], places[np.argsort(tangent.order)]] = tangent.matrix
         passing, every = self.passing, machine.drive_columns
         matrix[:, every, every, 0] += passing * drives.stiffness
         matrix[:, every, every, 1] += passing * drives.damping

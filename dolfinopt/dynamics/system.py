@@ -31,9 +31,6 @@ class Linearisation(Protocol):
     Of m rows or changes, a multiple of n, each instant stands for as many in turn.
     """
 
-    def window(self, first: int, last: int) -> Linearisation:
-        """Return it at the instants first..last - 1."""
-
     def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Linearisation:
         """Return it by coordinates `keep` of the S, at m instants between every s by (m, s)."""
 

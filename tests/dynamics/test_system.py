@@ -64,7 +64,8 @@ class Pendulum:
         matrix[:, [0, 1], [0, 1], 0] = qdd[:, 2:]
         matrix[:, 2, :2, 0] = matrix[:, :2, 2, 2] = q[:, :2]
         matrix[:, [0, 1], [0, 1], 2] = 1.0
-        return Tangent.of_matrix(matrix, keep)
+        own = np.arange(matrix.shape[2]) if keep is None else keep
+        return Tangent(matrix[:, :, own], own, np.arange(len(own)))
 
     def initial_state(self) -> State:
         return np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 3))
