@@ -74,9 +74,12 @@ def estimate(
     slow, b = up_to_angle(richer, SLOW_ANGLES[0]), values @ a
     corrections = None
     if matrix is not None:
+        # One tangent a step mostly does: their mean, instead of one at each of its stages.
         keep = np.searchsorted(matrix.slow, slow)
-        nearby = matrix_of(richer, matrix.tangent.interpolated(values, keep), slow)
-        corrections = _corrected(nearby, begin, b)
+        for weights in (np.full_like(values[:1], 1.0 / values.shape[1]), values):
+            if corrections is None:
+                nearby = matrix_of(richer, matrix.tangent.interpolated(weights, keep), slow)
+                corrections = _corrected(nearby, begin, b)
     every, alone = corrections or _corrections(richer, begin, b, slow)
     q, _ = stage_values(richer, *begin, b)
     reached = system.norm(q.reshape(-1, q.shape[2]))
