@@ -24,12 +24,7 @@ from dolfinopt.dynamics.collocation import (
     step_beginnings,
     step_ends,
 )
-from dolfinopt.dynamics.measured import (
-    COMPARED_STEP_COUNTS,
-    EXACT,
-    KEPT_CONTRACTION,
-    SLOW_ANGLES,
-)
+from dolfinopt.dynamics.measured import KEPT_CONTRACTION, SLOW_ANGLES
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, matrix_of, up_to_angle
 from dolfinopt.dynamics.system import State, inverse_size
 
@@ -133,26 +128,53 @@ def _corrections(
 # asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
 
 
-def unresolved(stages: Stages, time_grid: np.ndarray, state: State, a: np.ndarray) -> float:
-    """Return the relative error of free vibrations that the steps do not resolve."""
-    preconditioner = stages.preconditioner
+@np.errstate(all="ignore")  # of what has no mass or does not vibrate
+def unresolved(
+    stages: Stages, time_grid: np.ndarray, state: State, a: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return the relative error of free vibrations that the steps do not resolve, and each's (n,).
+
+    The stability function R(z) of the method makes R(z_1) .. R(z_j) of a free vibration
+    exp(z_1 + .. + z_j), z its eigenvalue times the steps.
+    """
+    preconditioner, count = stages.preconditioner, len(stages.h)
     vibrates = preconditioner.frequencies > 0.0
     if not vibrates.any():
-        return 0.0  # nothing is known of single coordinates
+        return 0.0, np.zeros(count)  # nothing is known of single coordinates
     q, qd = stage_values(stages, *step_beginnings(stages, state, a), a)
-    steps = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
-    missed = _free_vibrations(stages, (q, qd, a), state[0][0], steps)
-    return stages.relative(np.where(vibrates, missed, 0.0)[None, None], q)
+    breaks = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
+    amplitudes, rate = _free_vibrations(stages, (q, qd, a), state[0][0], breaks)
+    z = rate * stages.h[:, None]
+    exact, kept = np.exp(z), _stability(radau_iia(len(stages.method.c) + 1), z)
+    lost, steps = np.zeros_like(exact[0].real), np.zeros(exact.shape)
+    for first, amplitude in zip(breaks, amplitudes, strict=True):
+        true, found = np.cumprod(exact[first:], axis=0), np.cumprod(kept[first:], axis=0)
+        lost += np.square(amplitude * np.abs(true - found).max(axis=0))
+        begin = np.abs(np.concatenate([np.ones_like(true[:1]), true[:-1]]))
+        steps[first:] += np.square(amplitude * begin * np.abs(exact - kept)[first:])
+    error, each = (np.where(vibrates, np.sqrt(x), 0.0) for x in (lost, steps))
+    system = preconditioner.system
+    scale = inverse_size(system.norm(q.reshape(-1, q.shape[2])))
+    return (
+        float((system.norm(error[None]) * scale).max()),
+        (system.norm(each[:, None]) * scale).max(axis=-1),
+    )
 
 
-@np.errstate(all="ignore")  # of what has no mass or does not vibrate
+def _stability(method: Collocation, z: np.ndarray) -> np.ndarray:
+    """Return R(z) = 1 + z b' (1 - z A)^-1 1 of eigenvalues times steps."""
+    values, X = np.linalg.eig(method.A)
+    weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
+    return 1.0 + z * sum(w / (1.0 - z * x) for w, x in zip(weights, values, strict=True))
+
+
 def _free_vibrations(
     stages: Stages,
     states: tuple[np.ndarray, np.ndarray, np.ndarray],
     rest: np.ndarray,
     breakpoint_steps: np.ndarray,
-) -> np.ndarray:
-    """Return the error of every coordinate's free vibrations (N,), in its units.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the amplitudes (P, N) of free vibrations, and their eigenvalues (N,), 1/s.
 
     With the load F = m a + d qd + k q that a coordinate feels, and w^2 = k / m, a jump of F, F',
     F'' excites (F - F'' / w^2) / k and F' / (k w) of cosine and sine.
@@ -170,11 +192,7 @@ def _free_vibrations(
     square = np.minimum(k / m, fastest**2)
     amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
     decay = np.minimum(0.5 * (d / m), fastest)
-    rate = -decay + np.sqrt((decay * decay - square).astype(complex))
-    h = stages.h[breakpoint_steps, None]
-    richer = radau_iia(len(stages.method.c) + 1)
-    lost = _lost(richer, rate * h, len(stages.h) - breakpoint_steps)
-    return np.sqrt(np.square(amplitude * lost).sum(axis=0))
+    return amplitude, -decay + np.sqrt((decay * decay - square).astype(complex))
 
 
 def _jumps(
@@ -196,16 +214,3 @@ def _jumps(
     after, before = sides
     after[:, 1:] -= before
     return after
-
-
-def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return the largest |exp(j z) - R(z)^j| of free vibrations, j steps on."""
-    # R(z) = 1 + z b' (1 - z A)^-1 1 is the method's stability function, z (P, N) are eigenvalues
-    # times step.
-    values, X = np.linalg.eig(method.A)
-    weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
-    R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)
-    j = np.unique(np.geomspace(1.0, steps.max(), COMPARED_STEP_COUNTS).round())
-    apart = np.abs(np.exp(z[..., None] * j) - R[..., None] ** j)
-    seen = (j <= steps[:, None, None]) & (apart > EXACT * j)
-    return np.where(seen, apart, 0.0).max(axis=-1)
