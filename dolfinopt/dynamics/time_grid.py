@@ -56,7 +56,8 @@ def finer(
 ) -> np.ndarray:
     """Return steps of like errors whose sum is a share of what it was.
 
-    A step's error has order s + 2 within it (2 s at its end: by that it takes one grid more).
+    A step's error has order s + 2 within it, and falls less where vibrations are not resolved: with
+    s + 1 all cases tried take as few grids, with s + 2 or s some take one to three more.
 
     Args:
         system: what is solved.
@@ -66,7 +67,7 @@ def finer(
         stages: s.
         least: growth of their number.
     """
-    order = stages + 2
+    order = stages + 1
     errors = np.maximum(errors, 1e-4 * errors.max() + np.finfo(float).tiny)
     aim = (errors.sum() * share / (errors ** (1.0 / order)).sum()) ** (order / (order - 1.0))
     density = (errors / aim) ** (1.0 / order)
