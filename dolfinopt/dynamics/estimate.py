@@ -128,14 +128,12 @@ def _corrections(
 # asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
 
 
-@np.errstate(all="ignore")  # of what has no mass or does not vibrate
 def unresolved(
     stages: Stages, time_grid: np.ndarray, state: State, a: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """Return the relative error of free vibrations that the steps do not resolve, and each's (n,).
 
-    The stability function R(z) of the method makes R(z_1) .. R(z_j) of a free vibration
-    exp(z_1 + .. + z_j), z its eigenvalue times the steps.
+    The second is what every step adds of it.
     """
     preconditioner, count = stages.preconditioner, len(stages.h)
     vibrates = preconditioner.frequencies > 0.0
@@ -144,30 +142,44 @@ def unresolved(
     q, qd = stage_values(stages, *step_beginnings(stages, state, a), a)
     breaks = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
     amplitudes, rate = _free_vibrations(stages, (q, qd, a), state[0][0], breaks)
-    z = rate * stages.h[:, None]
-    exact, kept = np.exp(z), _stability(radau_iia(len(stages.method.c) + 1), z)
-    lost, steps = np.zeros_like(exact[0].real), np.zeros(exact.shape)
-    for first, amplitude in zip(breaks, amplitudes, strict=True):
-        true, found = np.cumprod(exact[first:], axis=0), np.cumprod(kept[first:], axis=0)
-        lost += np.square(amplitude * np.abs(true - found).max(axis=0))
-        begin = np.abs(np.concatenate([np.ones_like(true[:1]), true[:-1]]))
-        steps[first:] += np.square(amplitude * begin * np.abs(exact - kept)[first:])
-    error, each = (np.where(vibrates, np.sqrt(x), 0.0) for x in (lost, steps))
+    method, z = radau_iia(len(stages.method.c) + 1), rate * stages.h[:, None]
+    error, steps = (np.where(vibrates, x, 0.0) for x in _lost(method, z, amplitudes, breaks))
     system = preconditioner.system
     scale = inverse_size(system.norm(q.reshape(-1, q.shape[2])))
-    return (
-        float((system.norm(error[None]) * scale).max()),
-        (system.norm(each[:, None]) * scale).max(axis=-1),
-    )
+    largest = (system.norm(error[None]) * scale).max()
+    return float(largest), (system.norm(steps[:, None]) * scale).max(axis=-1)
 
 
-def _stability(method: Collocation, z: np.ndarray) -> np.ndarray:
-    """Return R(z) = 1 + z b' (1 - z A)^-1 1 of eigenvalues times steps."""
+@np.errstate(all="ignore")  # of what has no mass or does not vibrate
+def _lost(
+    method: Collocation, z: np.ndarray, amplitudes: np.ndarray, breakpoint_steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest error (N,) of free vibrations over all steps, and each step's own (n, N).
+
+    Of exp(z_1 + .. + z_j) the method makes R(z_1) .. R(z_j) with its stability function
+    R(z) = 1 + z b' (1 - z A)^-1 1.
+
+    Args:
+        method: collocation.
+        z: (n, N) eigenvalues times steps.
+        amplitudes: (P, N) of the vibrations that each breakpoint excites.
+        breakpoint_steps: (P,) steps that they begin with.
+    """
     values, X = np.linalg.eig(method.A)
     weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
-    return 1.0 + z * sum(w / (1.0 - z * x) for w, x in zip(weights, values, strict=True))
+    parts = (w / (1.0 - z * x) for w, x in zip(weights, values, strict=True))
+    exact, found = np.exp(z), 1.0 + z * sum(parts)
+    largest, steps = np.zeros(z.shape[1]), np.zeros(z.shape)
+    for first, amplitude in zip(breakpoint_steps, amplitudes, strict=True):
+        true = np.cumprod(exact[first:], axis=0)
+        apart = np.abs(true - np.cumprod(found[first:], axis=0)).max(axis=0)
+        largest += np.square(amplitude * apart)
+        begins = np.concatenate([np.ones_like(true[:1]), true[:-1]])
+        steps[first:] += np.square(amplitude * np.abs(begins * (exact - found)[first:]))
+    return np.sqrt(largest), np.sqrt(steps)
 
 
+@np.errstate(all="ignore")  # of what has no mass or does not vibrate
 def _free_vibrations(
     stages: Stages,
     states: tuple[np.ndarray, np.ndarray, np.ndarray],
