@@ -202,7 +202,9 @@ def _free_vibrations(
     jumps[0, 0] -= k * rest
     fastest = 1e30  # rad/s: beyond, squares overflow
     square = np.minimum(k / m, fastest**2)
-    amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
+    # Asymptotic for fast ones: of slower ones that the steps resolve, what changes within a step.
+    fast = np.maximum(square, stages.h[breakpoint_steps, None] ** -2.0)
+    amplitude = np.hypot(jumps[0] - jumps[2] / fast, jumps[1] / np.sqrt(fast)) / k
     decay = np.minimum(0.5 * (d / m), fastest)
     return amplitude, -decay + np.sqrt((decay * decay - square).astype(complex))
 
