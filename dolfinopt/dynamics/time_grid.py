@@ -56,8 +56,8 @@ def finer(
 ) -> np.ndarray:
     """Return steps of like errors whose sum is a share of what it was.
 
-    A step's error has order s + 2 within it, and falls less where vibrations are not resolved: with
-    s + 1 all cases tried take as few grids, with s + 2 or s some take one to three more.
+    A step's error has order s + 2 within it, and falls less where vibrations are not resolved. Of 18
+    cases s takes mostly fewer grids, and up to twice the steps; s + 2 more grids at small tolerances.
 
     Args:
         system: what is solved.
