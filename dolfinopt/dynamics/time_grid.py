@@ -56,8 +56,9 @@ def finer(
 ) -> np.ndarray:
     """Return steps of like errors whose sum is a share of what it was.
 
-    A step's error has order s + 2 within it, and falls less where vibrations are not resolved. Of 18
-    cases s takes mostly fewer grids, and up to twice the steps; s + 2 more grids at small tolerances.
+    A step's error has order s + 2 within it, and falls less where vibrations are not resolved. Of
+    18 cases s takes mostly fewer grids and up to twice the steps, s + 2 more grids at small
+    tolerances.
 
     Args:
         system: what is solved.
