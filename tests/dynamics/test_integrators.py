@@ -339,7 +339,7 @@ def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share: float) -
     """Where finer steps have no room, an error between the aim and the tolerance is accepted."""
     honest = radau.estimate
     monkeypatch.setattr(radau, "estimate", lambda *of: replace(honest(*of), error=share * 1e-4))
-    monkeypatch.setattr(radau, "unresolved", lambda *_: 0.0)
+    monkeypatch.setattr(radau, "unresolved", lambda *_: (0.0, 0.0))
     monkeypatch.setattr(radau, "STEPS_LIMIT", 10)
     problem, _ = two_arms()
     if share < 1.0:

@@ -190,9 +190,10 @@ def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
     stages = Stages(known, method, h, nothing.at(np.zeros(30)))
     t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]
     states = (t**2, np.zeros_like(t), np.zeros_like(t))
-    found = _free_vibrations(stages, states, np.zeros(1), np.array([0]))
-    assert found.shape == (1,)
-    assert 0.0 <= found[0] < 1e-12
+    amplitudes, rate = _free_vibrations(stages, states, np.zeros(1), np.array([0]))
+    lost, steps = _lost(method, rate * h[:, None], amplitudes, np.array([0]))
+    assert 0.0 <= lost[0] < 1e-12
+    assert steps.shape == (10, 1)
 
 
 @pytest.mark.parametrize("stages", [2, 3, 4])
@@ -200,10 +201,13 @@ def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
 def test_lost_is_what_collocation_makes_of_a_free_vibration(stages: int, z: complex) -> None:
     """y' = z y over unit steps, the stages' equations solved one step after the other."""
     method = radau_iia(stages)
-    y, apart = 1.0 + 0.0j, []
+    y, apart, each = 1.0 + 0.0j, [], []
     for n in range(1, 6):
-        k = np.linalg.solve(np.eye(stages) - z * method.A, np.full(stages, z * y))
-        y = y + method.A[-1] @ k
-        apart.append(abs(np.exp(n * z) - y))
-    found = _lost(method, np.array([[z]]), np.array([5]))
-    assert found[0, 0] == pytest.approx(max(apart), rel=1e-9)
+        k = np.linalg.solve(np.eye(stages) - z * method.A, np.full(stages, z))
+        factor = 1.0 + method.A[-1] @ k
+        each.append(2.0 * abs(np.exp((n - 1) * z) * (np.exp(z) - factor)))
+        y = y * factor
+        apart.append(2.0 * abs(np.exp(n * z) - y))
+    found, steps = _lost(method, np.full((6, 1), z), np.array([[2.0]]), np.array([1]))
+    assert found[0] == pytest.approx(max(apart), rel=1e-9)
+    np.testing.assert_allclose(steps[:, 0], [0.0, *each], rtol=1e-9, atol=1e-12)
