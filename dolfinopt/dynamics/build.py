@@ -29,7 +29,7 @@ from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tree import AppliedForce, Drives, Springs
-from dolfinopt.paths import TIME, read_table
+from dolfinopt.scene.csv_table import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import interface_number, joint_parts

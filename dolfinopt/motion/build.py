@@ -16,6 +16,17 @@ from dolfinopt.motion.measured import (
     DENSE_INSTANTS,
     TABLE_CORNERS_LIMIT,
 )
+from dolfinopt.motion.paths import (
+    Curve,
+    along,
+    arc,
+    curve_by_chord,
+    curve_by_laws,
+    curve_in_time,
+    inverse,
+    moves,
+    rotation,
+)
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
 from dolfinopt.motion.task import Words
 from dolfinopt.multibody.build import loops_of, skeleton
@@ -23,20 +34,7 @@ from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.rotations import roll_pitch_yaw
 from dolfinopt.multibody.tree import repeated
-from dolfinopt.paths import (
-    TIME,
-    Curve,
-    Limits,
-    Table,
-    Values,
-    along,
-    column_names,
-    curve_by_chord,
-    curve_by_laws,
-    curve_in_time,
-    moves,
-    read_table,
-)
+from dolfinopt.scene.csv_table import TIME, Table, column_names, read_table
 from dolfinopt.scene.duration import (
     POINT,
     SAME_TIME,
@@ -47,6 +45,7 @@ from dolfinopt.scene.duration import (
     time_law,
     too_short,
 )
+from dolfinopt.scene.laws import Limits, Values
 from dolfinopt.scene.load import Motion, Scene
 
 if TYPE_CHECKING:
@@ -170,7 +169,7 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
 def _when(s: np.ndarray, motion: Motion) -> np.ndarray:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration
-    return plane.inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
+    return inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
 
 
 # -- tables ----------------------------------------------------------------------------------
@@ -308,7 +307,7 @@ def desired_path(t: np.ndarray, scene: Scene) -> Values:
     """Return what path or table prescribe and two derivatives: the end-effector's place, joints."""
     motion = scene.motion
     if motion.path == "arc":
-        path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
+        path = partial(arc, radius=motion.radius, flattening=motion.flattening)
         return along(path, time_law(motion), t, motion.duration)
     curve, timed = curve_of(scene)
     return curve(t) if timed else along(curve, time_law(motion), t, motion.duration)
@@ -338,7 +337,7 @@ def _prescribed(t: np.ndarray, scene: Scene) -> Values:
         joints = desired_path(t, scene)
     else:
         law = time_law(motion)
-        joints = plane.rotation(t, law, motion.speed, motion.start_angle, motion.duration)
+        joints = rotation(t, law, motion.speed, motion.start_angle, motion.duration)
     if scene.is_spatial or motion.base == "cart":
         return joints
     return _with_fixed(joints, [motion.base_position], [])

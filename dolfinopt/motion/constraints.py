@@ -19,7 +19,7 @@ from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.tree import Mechanism
-from dolfinopt.paths import Values
+from dolfinopt.scene.laws import Values
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from dolfinopt.motion.measured import SAMPLES, TURNS_LIMIT
 from dolfinopt.motion.singular import Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached
 from dolfinopt.motion.task import Task
-from dolfinopt.paths import Values
+from dolfinopt.scene.laws import Values
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The arc, and the coordinates of a chain of arms that follow a path of the plane in closed form.
+"""The coordinates of a chain of arms that follow a path of the plane in closed form.
 
 Of two and more arms all elbows bend by the same angle; one arm follows the path's height, and its
 cart the rest. Plane vectors are complex numbers, v = v_x + i v_y, where arms are turned.
@@ -6,7 +6,6 @@ cart the rest. Plane vectors are complex numbers, v = v_x + i v_y, where arms ar
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -15,36 +14,9 @@ from numpy.polynomial import chebyshev
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion.measured import SINGULAR_DISTANCE_SHARE
+from dolfinopt.motion.paths import inverse
 from dolfinopt.motion.task import Words
-from dolfinopt.paths import Law, Values
-
-
-def arc(s: np.ndarray, radius: float, flattening: float) -> Values:
-    """Return the flattened semicircle about the origin and two derivatives by s (n, 2).
-
-    From (-r, 0) over the top to (r, 0), p = r (cos phi, flattening sin phi), phi = pi (1 - s).
-    """
-    phi = np.pi * (1.0 - s)
-    scale = radius * np.array([1.0, flattening])
-    p = scale * np.column_stack([np.cos(phi), np.sin(phi)])
-    return p, np.pi * scale * np.column_stack([np.sin(phi), -np.cos(phi)]), -(np.pi**2) * p
-
-
-def rotation(t: np.ndarray, law: Law, speed: float, start_angle: float, duration: float) -> Values:
-    """Return the angle of a joint that runs up to constant speed, and two derivatives (n, 1).
-
-    The law is that of the speed: speed s(t / duration); for the quintic the angle is
-    start + speed duration (2.5 u^4 - 3 u^5 + u^6).
-
-    Args:
-        t: (n,) instants, s.
-        law: time law.
-        speed: rad/s.
-        start_angle: rad.
-        duration: of the run-up, s.
-    """
-    s, sd, _ = (x[:, None] for x in law(t, duration))
-    return start_angle + speed * law.integral(t, duration)[:, None], speed * s, speed * sd
+from dolfinopt.scene.laws import Values
 
 
 @dataclass(frozen=True)
@@ -101,36 +73,6 @@ class Bend:
         order = np.arange(len(self.lengths))
         turned = np.exp(1j * np.outer(beta, order)) * self.lengths
         return turned.sum(axis=1), turned @ (1j * order), turned @ (-1.0 * order**2)
-
-
-def inverse(
-    function: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    values: np.ndarray,
-    guess: np.ndarray,
-    ends: tuple[float, float],
-    accuracy: float,
-) -> np.ndarray:
-    """Return where an increasing function has these values (n,), all at once.
-
-    Newton's method, halving the bracket instead where a step would leave it.
-
-    Args:
-        function: x (n,) -> values and slopes (n,).
-        values: wanted, within those at the ends.
-        guess: (n,) first x.
-        ends: least and largest x.
-        accuracy: of the values; 0 of x to rounding.
-    """
-    u, low, high = guess, np.full_like(guess, ends[0]), np.full_like(guess, ends[1])
-    for _ in range(60):  # halving alone would need as many
-        found, slope = function(u)
-        excess = found - values
-        if np.abs(excess).max(initial=0.0) <= accuracy:
-            break
-        low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
-        u = u - excess / np.where(slope > 0.0, slope, np.inf)
-        u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
-    return u
 
 
 bend_of = lru_cache(Bend)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.paths import SAME, Values
+from dolfinopt.scene.laws import SAME, Values
 
 RPY = ("roll", "pitch", "yaw")
 VECTOR = ("rx", "ry", "rz")

@@ -36,8 +36,8 @@ from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
 from dolfinopt.multibody.tree import plane_chain
-from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # arrays of one process
 

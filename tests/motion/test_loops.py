@@ -36,8 +36,8 @@ from runs import refused
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.motion.build import follower, loop_start, rigid_motion
-from dolfinopt.motion.plane import rotation
-from dolfinopt.paths import Limits, law_for
+from dolfinopt.motion.paths import rotation
+from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

@@ -22,7 +22,7 @@ from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid
 from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
 from dolfinopt.motion.plane import Bend
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.paths import Limits, law_for
+from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is

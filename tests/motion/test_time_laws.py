@@ -17,17 +17,10 @@ from runs import TWO_ARM, refusal
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
-from dolfinopt.paths import (
-    Curve,
-    Law,
-    Limits,
-    Table,
-    curve_by_chord,
-    curve_in_time,
-    law_for,
-    read_table,
-)
+from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
 from dolfinopt.responses.evaluation import evaluate_batch
+from dolfinopt.scene.csv_table import Table, read_table
+from dolfinopt.scene.laws import Law, Limits, law_for
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
