@@ -43,7 +43,7 @@ def rotation(t: np.ndarray, law: Law, speed: float, start_angle: float, duration
 
 # -- curves through a table's rows: in its time, by a law from stop to stop, over their distance ---
 
-Function = Callable[[np.ndarray], Sequence[np.ndarray]]  # of a parameter (n,), as `Curve` returns
+Function = Callable[[np.ndarray], Any]  # of a parameter (n,), as `Curve` returns
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Curve:
         u: (n,) the rows' parameters: instants, s, or shares of the way.
         rows: (n, k) where the curve is there.
         moves: first and last row of every move, and the curve between.
-        kinks: parameters inside where the second or third derivative jumps.
+        knots: parameters within moves where the second or third derivative jumps.
         ends_move: whether the ends belong to the moves, whose acceleration may jump there, else
             it rests there.
     """
@@ -62,13 +62,19 @@ class Curve:
     u: np.ndarray
     rows: np.ndarray
     moves: tuple[tuple[int, int, Function], ...]
-    kinks: tuple[float, ...]
-    ends_move: bool
+    knots: tuple[float, ...] = ()
+    ends_move: bool = True
 
     @property
     def end(self) -> float:
         """The last parameter; the first is 0."""
         return float(self.u[-1])
+
+    @property
+    def kinks(self) -> np.ndarray:
+        """Parameters inside where a derivative jumps: the knots, and where moves begin and end."""
+        ends = [self.u[k] for i, j, _ in self.moves for k in (i, j)]
+        return np.setdiff1d([*self.knots, *ends], self.u[[0, -1]])
 
     @property
     def stops(self) -> tuple[tuple[float, float], ...]:
@@ -117,17 +123,14 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
     found, degree = [], 5
     for i, j in moves(table.rows):
         t, rows = table.t[i : j + 1], table.rows[i : j + 1]
-        rates = np.zeros((2, 2, rows.shape[1]))  # first and last instant; speed, acceleration
+        rates = np.zeros((2, 2, rows.shape[1]))  # speed and acceleration; first and last instant
         if moving:
-            own = make_interp_spline(
-                t, rows, k=degree if len(t) > degree else 3 if len(t) > 3 else 1
-            )
+            own = max(k for k in (1, 3, degree) if k < len(t))
             free = [i == 0, j == len(table.t) - 1]
-            for order in range(1, min(own.k, 2) + 1):
-                rates[free, order - 1] = own(t[[0, -1]], order)[free]
-        ends = tuple([(1, first), (2, second)] for first, second in rates)
+            rates[:, free] = _values_of(make_interp_spline(t, rows, k=own))(t[[0, -1]])[1:][:, free]
+        ends = tuple([(1, v), (2, a)] for v, a in zip(*rates, strict=True))
         found.append((i, j, _values_of(make_interp_spline(t, rows, k=degree, bc_type=ends))))
-    return _in_time(table, found, (), moving)
+    return Curve(table.t, table.rows, tuple(found), ends_move=moving)
 
 
 def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
@@ -142,19 +145,9 @@ def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
 
         return values
 
-    found = [(i, j, straight(i, j, law)) for i, j, law in laws]
     knots = [x for i, j, law in laws for x in t[i] + law.knots * (t[j] - t[i])]
-    return _in_time(table, found, knots, ends_move=True)
-
-
-def _in_time(
-    table: Table, found: list[tuple[int, int, Function]], knots: Sequence[float], ends_move: bool
-) -> Curve:
-    """Return a curve over time, whose moves begin and end at kinks."""
-    assert table.t is not None
-    t = table.t
-    kinks = {*knots, *(t[k] for i, j, _ in found for k in (i, j))} - {t[0], t[-1]}
-    return Curve(t, table.rows, tuple(found), tuple(map(float, sorted(kinks))), ends_move)
+    found = tuple((i, j, straight(i, j, law)) for i, j, law in laws)
+    return Curve(t, rows, found, tuple(knots))
 
 
 def curve_by_chord(table: Table, measured: int | None = None) -> Curve:
@@ -172,21 +165,20 @@ def curve_by_chord(table: Table, measured: int | None = None) -> Curve:
     from scipy.interpolate import CubicSpline  # takes as long to import as NumPy
 
     chords = np.linalg.norm(np.diff(table.rows[:, :measured], axis=0), axis=1)
-    same = np.flatnonzero(chords == 0.0)
-    if same.size:
+    if (same := np.flatnonzero(chords == 0.0)).size:
         raise InputError(
             f"{table.file}: line {table.lines[same[0] + 1]}: the same values as in the row before; "
             f"leave the row out, or add a column {TIME} to stay there for a while"
         )
     way = np.append(0.0, np.cumsum(chords))
     u = way / way[-1]
-    every = 0, len(u) - 1, _values_of(CubicSpline(u, table.rows, bc_type="natural"))
-    return Curve(u, table.rows, (every,), tuple(u[1:-1].tolist()), ends_move=True)
+    spline = _values_of(CubicSpline(u, table.rows, bc_type="natural"))
+    return Curve(u, table.rows, ((0, len(u) - 1, spline),), tuple(u[1:-1]))
 
 
 def _values_of(spline: Any) -> Function:
-    """Return the function of a spline and its two derivatives."""
-    return lambda u: [spline(u, order) for order in range(3)]
+    """Return the function of a spline and its two derivatives (3, n, k)."""
+    return lambda u: np.stack([spline(u, order) for order in range(3)])
 
 
 def along(function: Function, law: Law, t: np.ndarray, duration: float) -> Values:

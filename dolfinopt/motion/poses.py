@@ -6,6 +6,8 @@ R = R_0 exp(theta~), whose angular velocity and acceleration `SpaceTurning` know
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -39,7 +41,7 @@ def relative_vectors(R: np.ndarray) -> np.ndarray:
     return vectors
 
 
-def turning(start: np.ndarray, vectors: Values) -> Values:
+def turning(start: np.ndarray, vectors: Sequence[np.ndarray]) -> Values:
     """Return R (n, 3, 3), angular velocity and acceleration (n, 3) in the ground's frame.
 
     Args:

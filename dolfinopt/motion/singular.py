@@ -89,7 +89,7 @@ class Regularity:
 
     def refusal(self, q: np.ndarray, t: float) -> InputError:
         """Return which closure leaves which joints undetermined at a pose (R,), and when."""
-        task, words = self.task, self.task.words
+        task = self.task
         matrices = self._matrices(task.constraints.at(q[None]).rows())
         G, columns = matrices[int(np.argmin(self.sizes(q[None])[0]))]
         null = np.abs(np.linalg.svd(G[0])[2][-1])
@@ -99,8 +99,8 @@ class Regularity:
         by_path = task.constraints.has_path and not (acting > SINGULAR_SHARE).any()
         if by_path or not loops.ties:
             return InputError(
-                f"{words.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
-                f"where rates of joints ({joints}) have no bounds; change {words.motion}, or "
+                f"{task.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
+                f"where rates of joints ({joints}) have no bounds; change {task.keys}, or "
                 'prescribe the joints, motion.path = "joints"'
             )
         ties = ", ".join(
@@ -109,7 +109,7 @@ class Regularity:
             if size >= SINGULAR_SHARE * acting.max()
         )
         return InputError(
-            f"{words.source}: closures: at t = {t:.4g} s the loop of {ties} is at a dead centre, a "
+            f"{task.source}: closures: at t = {t:.4g} s the loop of {ties} is at a dead centre, a "
             f"singular position: joints {joints} are undetermined there; drive one of them, or "
-            f"change {words.motion} or the arms' lengths"
+            f"change {task.keys} or the arms' lengths"
         )
