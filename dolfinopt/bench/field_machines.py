@@ -10,6 +10,7 @@ from scipy.signal import butter, filtfilt
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution
+from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import InputError
@@ -27,11 +28,9 @@ from dolfinopt.multibody.shape_integrals import (
 )
 from dolfinopt.multibody.tree import (
     GROUND,
-    Drives,
     Joint,
     Mechanism,
     plane_chain,
-    spatial_mechanism,
 )
 
 # -- the flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices
@@ -239,7 +238,8 @@ def machine(file: Path) -> Mechanism:
             )
         )
     bodies = [rigid_spatial_body(1.0, np.zeros(3), np.zeros(6)) for _ in found]
-    return spatial_mechanism(bodies, tuple(joints), {}, GRAVITY, (len(found) - 1, 0))
+    down, end = np.array(GRAVITY)[:, None], (len(found) - 1, 0)
+    return Mechanism(tuple(bodies), tuple(joints), {}, down, end, np.zeros(3))
 
 
 def regressor(mechanism: Mechanism, motion: RigidMotion) -> np.ndarray:

@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
+from dolfinopt.dynamics.drives import Drives, Springs
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
@@ -28,7 +29,7 @@ from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, so
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tree import AppliedForce, Drives, Springs
+from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.scene.csv_table import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene

@@ -160,7 +160,7 @@ class ElasticSystem:
 
     def deflection(self, q: np.ndarray) -> float:
         """Return the largest deflection of a body in a motion q (n, N), over its length."""
-        return float(self.mechanism.deflections(q).max(initial=0.0))
+        return float(self.mechanism.deflections(q)[0].max(initial=0.0))
 
     def body_gradient(
         self,

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.elastic_system import ElasticSystem, Modes
 from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.measured import (
@@ -43,7 +44,7 @@ from dolfinopt.multibody.ranks import complement, least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.multibody.tangent import Tangent, linearise
-from dolfinopt.multibody.tree import Drives, Mechanism
+from dolfinopt.multibody.tree import Mechanism
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,11 +126,11 @@ class MachineInstants:
 
     def drive_forces(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
         """Return u (n, R) of the free coordinates."""
-        return self.machine.drives.force(self.ahead, *self._errors(y, yd))
+        return self.machine.drives.force(self.ahead, *self._errors(y, yd))[0]
 
     def passing(self, y: np.ndarray, yd: np.ndarray) -> np.ndarray:
-        """Return du / d(wanted force) (n, R), see `Drives.passing`."""
-        return self.machine.drives.passing(self.ahead, *self._errors(y, yd))
+        """Return du / d(wanted force) (n, R), see `Drives.force`."""
+        return self.machine.drives.force(self.ahead, *self._errors(y, yd))[1]
 
     def _errors(self, y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far the drives are from where they are asked to be, and the rate (n, R)."""

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution, Stages, Strategy, radau_iia
+from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.estimate import _free_vibrations, _lost
 from dolfinopt.dynamics.machine_system import MachineSystem
@@ -18,7 +19,7 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import Tangent
-from dolfinopt.multibody.tree import Drives, plane_chain
+from dolfinopt.multibody.tree import plane_chain
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.laws import Limits, law_for
 

@@ -1,6 +1,6 @@
 """Bodies made of point masses, whose shape integrals are sums, in the plane and in space."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.rotations import skew
 from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
 from dolfinopt.multibody.tree import (
@@ -18,8 +19,8 @@ from dolfinopt.multibody.tree import (
     JointHardware,
     Mechanism,
     Rotor,
+    Site,
     plane_chain,
-    spatial_mechanism,
 )
 
 # By which integrals a function of a body is differentiated.
@@ -270,7 +271,22 @@ class Chain:
 
 
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+
+
 # Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
+def spatial_mechanism(
+    bodies: Sequence[ShapeIntegrals],
+    joints: Sequence[Joint],
+    carried: Mapping[Site, ShapeIntegrals],
+    gravity: Sequence[float] | np.ndarray,
+    end: Site,
+) -> Mechanism:
+    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
+    loads = {site: Constants(one) for site, one in carried.items()}
+    down = np.array(gravity, dtype=float)[:, None]
+    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
+
+
 HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, Rotor(0.2 / k, 0.5 * k)) for k in (1, 2, 3))
 
 

@@ -17,6 +17,7 @@ from bodies import (
     derivative,
     random_chain,
     random_tree,
+    spatial_mechanism,
     stiffened,
 )
 from mpi4py import MPI
@@ -47,7 +48,6 @@ from dolfinopt.multibody.tree import (
     Mechanism,
     Rotor,
     plane_chain,
-    spatial_mechanism,
 )
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
