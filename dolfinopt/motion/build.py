@@ -167,7 +167,7 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
 def _when(s: np.ndarray, motion: Motion) -> np.ndarray:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration
-    return inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
+    return inverse(lambda t: law(t, last)[0], s, 0.0, last)
 
 
 # -- tables ----------------------------------------------------------------------------------

@@ -189,30 +189,12 @@ def along(function: Function, law: Law, t: np.ndarray, duration: float) -> Value
 
 
 def inverse(
-    function: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    values: np.ndarray,
-    guess: np.ndarray,
-    ends: tuple[float, float],
-    accuracy: float,
+    function: Callable[[np.ndarray], np.ndarray], values: np.ndarray, low: float, high: float
 ) -> np.ndarray:
-    """Return where an increasing function has these values (n,), all at once.
-
-    Newton's method, halving the bracket instead where a step would leave it.
-
-    Args:
-        function: x (n,) -> values and slopes (n,).
-        values: wanted, within those at the ends.
-        guess: (n,) first x.
-        ends: least and largest x.
-        accuracy: of the values; 0 of x to rounding.
-    """
-    u, low, high = guess, np.full_like(guess, ends[0]), np.full_like(guess, ends[1])
-    for _ in range(60):  # halving alone would need as many
-        found, slope = function(u)
-        excess = found - values
-        if np.abs(excess).max(initial=0.0) <= accuracy:
-            break
-        low, high = np.where(excess < 0.0, u, low), np.where(excess < 0.0, high, u)
-        u = u - excess / np.where(slope > 0.0, slope, np.inf)
-        u = np.where((u > low) & (u < high), u, 0.5 * (low + high))
-    return u
+    """Return where an increasing function has these values (n,) between two x, by bisection."""
+    a, b = np.full_like(values, low), np.full_like(values, high)
+    for _ in range(60):  # to rounding
+        middle = 0.5 * (a + b)
+        less = function(middle) < values
+        a, b = np.where(less, middle, a), np.where(less, b, middle)
+    return 0.5 * (a + b)

@@ -51,13 +51,10 @@ class Bend:
 
     def angle(self, distance: np.ndarray) -> np.ndarray:
         """Return beta (n,) where |z| is `distance`, within reach, to rounding."""
-        # The guess is dense towards both ends.
-        u = self.least + (1.0 - self.least) * np.sin(np.linspace(0.0, np.pi / 2.0, 101)) ** 2
-        guess = np.interp(distance**2, self.square(u), u)
-        slope, rounding = self.square.deriv(), float(4.0 * np.finfo(float).eps) * self.reach[1] ** 2
-        ends = self.least, 1.0
-        u = inverse(lambda u: (self.square(u), slope(u)), distance**2, guess, ends, rounding)
-        return np.arccos(np.clip(u, -1.0, 1.0))
+        if len(self.lengths) == 2:
+            own, product = self.square.coef
+            return np.arccos((distance**2 - own) / product)
+        return np.arccos(inverse(self.square, distance**2, self.least, 1.0))
 
 
 @dataclass(frozen=True)

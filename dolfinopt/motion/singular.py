@@ -10,7 +10,6 @@ it. Poses that only touch one are minima of the singular value.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -58,15 +57,10 @@ class Regularity:
 
     def sizes(self, q: np.ndarray) -> np.ndarray:
         """Return smallest singular values at poses (n, R) over those of a usual pose (n, m)."""
-        return self._sizes(q) / self._usual
-
-    @cached_property
-    def _usual(self) -> np.ndarray:
-        return self._sizes(self.start.usual[None])[0]
-
-    def _sizes(self, q: np.ndarray) -> np.ndarray:
-        matrices = self._matrices(self.task.constraints.at(q).rows())
-        return np.stack([np.linalg.svd(G, compute_uv=False)[:, -1] for G, _ in matrices], axis=1)
+        every = np.concatenate([self.start.usual[None], q])
+        matrices = self._matrices(self.task.constraints.at(every).rows())
+        least = [np.linalg.svd(G, compute_uv=False)[:, -1] for G, _ in matrices]
+        return (np.stack(least, axis=1) / np.array(least)[:, 0])[1:]
 
     def _matrices(self, G: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the m parts (n, k, u) of G that must stay regular, with their columns."""

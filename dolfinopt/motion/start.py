@@ -22,7 +22,6 @@ from dolfinopt.motion.measured import (
     STARTS,
 )
 from dolfinopt.motion.task import Task
-from dolfinopt.multibody.closures import Distance
 from dolfinopt.multibody.measured import RANK_SHARE
 from dolfinopt.multibody.ranks import rank
 
@@ -125,7 +124,7 @@ def start_of(task: Task) -> Start:
 
 def _nearest_of_many(task: Task, target: Target) -> tuple[np.ndarray, float]:
     """Return the pose near the guess that is reached first, and how far off it is, m."""
-    guess = task.with_given(_with_lengths(task)[None], target)[0]
+    guess = task.with_given(task.guess[None], target)[0]
     random, enough = np.random.default_rng(0), REACHED_SHARE * task.constraints.reach
     turning = task.unknown[~task.constraints.slides[task.unknown]]
     best, least = guess, (np.inf, 0.0, np.inf)
@@ -149,16 +148,6 @@ def _off_branch(task: Task, q: np.ndarray) -> float:
     angle = float(np.angle(np.exp(1j * q[-1])))
     wrong = angle * task.side < -1e-9
     return np.round(abs(angle) + 2.0 * np.pi * wrong, 9) if task.side else 0.0
-
-
-def _with_lengths(task: Task) -> np.ndarray:
-    """Return the guess with rods as long as its joints have them."""
-    guess, loops = task.guess.copy(), task.constraints.loops
-    gaps = task.constraints.at(guess[None]).closed.gap[0]
-    for gap, one in zip(gaps, loops.equations, strict=True):
-        if isinstance(one, Distance) and one.coordinate is not None:
-            guess[one.coordinate] += gap
-    return guess
 
 
 def _usual(task: Task, pose: np.ndarray, target: Target, misfit: float, share: float) -> np.ndarray:

@@ -300,25 +300,18 @@ class Mechanism:
 
     def base(self, q_r: np.ndarray) -> np.ndarray:
         """Return where the ground's frame is (d, n), m, for rigid coordinates (n, R)."""
-        place = np.repeat(self.origin[:, None], len(q_r), axis=1)
-        if self.cart is not None:
-            place[0] += q_r[:, 0]
-        return place
+        return self.origin[:, None] + self.virtual_ground(q_r)[: self.dim.d]
 
     def ground(self, motion: RigidMotion) -> Motion:
         """Return the motion of what the first joints sit on: that of the cart, less gravity."""
-        a = np.empty((self.dim.d, len(motion.q)), dtype=motion.qdd.dtype)
-        a[:] = -self.gravity
-        if self.cart is not None:
-            a[0] += motion.qdd[:, 0]
-        still = np.zeros((self.dim.r, len(motion.q)))
-        return a, still, still
+        a, still = np.split(self.virtual_ground(motion.qdd), [self.dim.d])
+        return a - self.gravity, still, still
 
-    def virtual_ground(self, of_forces: np.ndarray) -> np.ndarray:
-        """Return its displacement and rotation (d + r, n) for virtual coordinates (n, .)."""
-        out = np.zeros((self.dim.b, len(of_forces)))
+    def virtual_ground(self, x: np.ndarray) -> np.ndarray:
+        """Return displacement and rotation (d + r, n) of the ground for coordinates (n, .)."""
+        out = np.zeros((self.dim.b, len(x)), dtype=x.dtype)
         if self.cart is not None:
-            out[0] = of_forces[:, 0]
+            out[0] = x[:, 0]
         return out
 
     # -- how stiff and how large it is -------------------------------------------------------
