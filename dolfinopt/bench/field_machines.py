@@ -16,6 +16,7 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.newton_euler import inverse_dynamics
@@ -30,7 +31,6 @@ from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
     Mechanism,
-    plane_chain,
 )
 
 # -- the flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices
@@ -116,8 +116,18 @@ def crank(body: ShapeIntegrals) -> Crank:
     drives = Drives(np.array([2]), none, none, np.full(1, np.inf), np.array([False]))
     across = np.array([[0.0, 1.0]])
     loops = Loops((Tie("slider", (1, 0), None, np.zeros(2), np.eye(2), tuple(map(Along, across))),))
+    flat = np.ones(1), np.zeros(2), np.eye(2)
+    mechanism = Mechanism(
+        bodies=arms,
+        joints=tuple(Joint(f"joint {k}", "revolute", k - 1, k + 1, *flat) for k in range(2)),
+        loads={(1, 0): Constants.of_point(SLIDER_MASS, 0.0)},
+        gravity=np.zeros((2, 1)),
+        end=(1, 0),
+        origin=np.zeros(2),
+        cart=0.0,
+    )
     return Crank(
-        plane_chain(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
+        mechanism,
         desired,
         (0.0, END),
         drives,

@@ -33,7 +33,7 @@ from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.scene.csv_table import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import interface_number, joint_parts
+from dolfinopt.scene.tables.joints import interface_number
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
 
 
@@ -139,7 +139,7 @@ def _drives(scene: Scene) -> Drives:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
     motors = list(soft) if control else []
-    friction = friction_of(scene, [one if one.stiffness else None for one in joint_parts(scene)])
+    friction = friction_of(scene, soft=True)
     springs = Springs(
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
         stiffness=np.array([soft[k].stiffness for k in motors]),

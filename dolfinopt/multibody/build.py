@@ -35,11 +35,10 @@ Inertia = tuple[float, ...]
 
 def build_mechanism(scene: Scene, bodies: Sequence[ShapeIntegrals]) -> Mechanism:
     """Return the scene's machine, of bodies in the order of its arms."""
-    parts = joint_parts(scene)
-    friction = friction_of(scene, [one if one.stiffness == 0.0 else None for one in parts])
+    friction = friction_of(scene, soft=False)
     bearings = {
         k: bearing_body(one.bearing[0], one.bearing[1], scene.dimension)
-        for k, one in enumerate(parts)
+        for k, one in enumerate(joint_parts(scene))
         if one.bearing is not None
     }
     mechanism = _tree(scene, bodies, _loads(scene), friction if friction.acts else None)
@@ -165,11 +164,11 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     return tuple(joints)
 
 
-def friction_of(scene: Scene, parts: Sequence[JointParts | None]) -> Friction:
-    """Return the friction (R,) of all rigid coordinates by the parts of every arm's joint."""
+def friction_of(scene: Scene, soft: bool) -> Friction:
+    """Return the friction (R,) of joints, or of the motors before `soft` gears."""
     found = Friction.none(scene.num_rigid)
-    for k, one in zip(scene.joint_columns, parts, strict=True):
-        if k is not None and one is not None and one.friction is not None:
+    for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True):
+        if k is not None and one.friction is not None and (one.stiffness > 0.0) == soft:
             found.viscous[k], found.coulomb[k], found.speed[k] = one.friction
     return found
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from bodies import beam
+from bodies import beam, plane_chain
 from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import radau
@@ -19,7 +19,6 @@ from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import Tangent
-from dolfinopt.multibody.tree import plane_chain
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.laws import Limits, law_for
 

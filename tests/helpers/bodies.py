@@ -16,16 +16,68 @@ from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegral
 from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
-    JointHardware,
     Mechanism,
     Rotor,
     Site,
-    plane_chain,
 )
 
 # By which integrals a function of a body is differentiated.
 CONSTANTS = [one.name for one in TABLE if not one.name.endswith(("_point", "_points"))]
 STEP = 1e-30  # of a complex step
+
+
+@dataclass(frozen=True)
+class JointHardware:
+    """What sits at one arm's ends besides the arm itself.
+
+    Attributes:
+        mass, inertia: at the outboard interface, kg, kg m2.
+        rotor: that drives the inboard joint, or None.
+    """
+
+    mass: float = 0.0
+    inertia: float = 0.0
+    rotor: Rotor | None = None
+
+
+def plane_chain(
+    bodies: Sequence[ShapeIntegrals],
+    payload_mass: float,
+    payload_inertia: float,
+    gravity: Sequence[float],
+    joint_height: float,
+    *,
+    hardware: Sequence[JointHardware] = (),
+    cart_mass: float = 0.0,
+) -> Mechanism:
+    """Return a cart on a horizontal rail that carries a chain of arms and a payload.
+
+    Args:
+        bodies: from the cart outwards.
+        payload_mass: point mass at the last outboard interface, kg.
+        payload_inertia: its rotary inertia, kg m2.
+        gravity: (g_x, g_y), m/s2.
+        joint_height: y of the first joint, m.
+        hardware: what sits at every arm's ends, or none.
+        cart_mass: kg.
+    """
+    hardware, last = hardware or (JointHardware(),) * len(bodies), len(bodies) - 1
+    joints = [
+        Joint(f"joint {k}", "revolute", k - 1, 1 + k, np.ones(1), np.zeros(2), np.eye(2), one.rotor)
+        for k, one in enumerate(hardware)
+    ]
+    loads = {(k, 0): np.array([one.mass, one.inertia]) for k, one in enumerate(hardware)}
+    if bodies:
+        loads[last, 0] += payload_mass, payload_inertia
+    return Mechanism(
+        bodies=tuple(bodies),
+        joints=tuple(joints),
+        loads={at: Constants.of_point(*x) for at, x in loads.items() if x.any() or at[0] == last},
+        gravity=np.array(gravity, dtype=float)[:, None],
+        end=(last, 0),
+        origin=np.array([0.0, joint_height]),
+        cart=cart_mass,
+    )
 
 
 @dataclass(frozen=True)

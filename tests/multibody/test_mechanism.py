@@ -10,11 +10,13 @@ import pytest
 from bodies import (
     CONSTANTS,
     Chain,
+    JointHardware,
     assert_close,
     change_of,
     changed,
     complex_derivative,
     derivative,
+    plane_chain,
     random_chain,
     random_tree,
     spatial_mechanism,
@@ -44,10 +46,8 @@ from dolfinopt.multibody.tree import (
     GROUND,
     AppliedForce,
     Joint,
-    JointHardware,
     Mechanism,
     Rotor,
-    plane_chain,
 )
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
