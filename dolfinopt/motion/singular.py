@@ -90,20 +90,13 @@ class Regularity:
         joints = task.called(columns[null > 0.1 * null.max()])
         loops = task.constraints.loops
         acting = np.array(loops.by_tie(np.abs(G[0, : loops.count] * null).max(axis=1, initial=0.0)))
-        by_path = task.constraints.has_path and not (acting > SINGULAR_SHARE).any()
-        if by_path or not loops.ties:
-            return InputError(
-                f"{task.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
-                f"where rates of joints ({joints}) have no bounds; change {task.keys}, or "
-                'prescribe the joints, motion.path = "joints"'
-            )
-        ties = ", ".join(
-            tie.name
-            for tie, size in zip(loops.ties, acting, strict=True)
-            if size >= SINGULAR_SHARE * acting.max()
-        )
+        what, remedy = "motion: the machine", 'prescribe the joints, motion.path = "joints"'
+        if loops.ties and ((acting > SINGULAR_SHARE).any() or not task.constraints.has_path):
+            names = [tie.name for tie in loops.ties]
+            those = np.flatnonzero(acting >= SINGULAR_SHARE * acting.max())
+            what = f"closures: the loop of {', '.join(names[k] for k in those)}"
+            remedy = "drive one of them, or change the arms' lengths"
         return InputError(
-            f"{task.source}: closures: at t = {t:.4g} s the loop of {ties} is at a dead centre, a "
-            f"singular position: joints {joints} are undetermined there; drive one of them, or "
-            f"change {task.keys} or the arms' lengths"
+            f"{task.source}: {what} is at a dead centre, a singular position, at t = {t:.4g} s: "
+            f"joints {joints} are undetermined there; {remedy}, or change {task.keys}"
         )

@@ -210,27 +210,21 @@ def _check(task: Task, G: np.ndarray, share: float) -> None:
 
 def unreached(task: Task, t: float, q: np.ndarray, target: Target) -> InputError:
     """Return which closure stays open, or how far the end-effector is off, at pose q (R,)."""
-    error = task.constraints.error(q[None], target)[0]
-    reach, k = task.constraints.reach, task.constraints.loops.count
-    joints, start = task.called(task.unknown), "motion.initial_joints, " if t == 0.0 else ""
-    if k and np.abs(error[:k]).max() > 0.1 * np.abs(error).max():
-        gaps = task.constraints.loops.by_tie(error[:k])
+    error, loops = task.constraints.error(q[None], target)[0], task.constraints.loops
+    gaps, (place, turn) = loops.by_tie(error[: loops.count]), np.split(error[loops.count :], [3])
+    if max(gaps, default=0.0) > 0.1 * np.abs(error).max():
         worst = int(np.argmax(gaps))
-        name = task.constraints.loops.ties[worst].name
-        return InputError(
-            f"{task.source}: closures: at t = {t:.4g} s the loop of {name} cannot be closed: the "
-            f"joints that follow ({joints}) leave it open by {gaps[worst]:.4g} m at best; change "
-            f"{start}its point, the arms' lengths, or {task.keys}"
-        )
-    own = error[k:]
-    d = target.place[0].shape[1]
-    place = ", ".join(f"{x:.6g}" for x in target.place[0][0])
-    off, turned = f"{np.linalg.norm(own[:d]):.4g} m", ""
-    if len(own) > d:
-        turned = " turned as it is to be"
-        off += f" and {np.linalg.norm(own[d:]) / reach:.4g} rad"
+        what = f"closures: at t = {t:.4g} s the loop of {loops.ties[worst].name} cannot be closed"
+        off, remedy = f"{gaps[worst]:.4g} m", "its point, the arms' lengths, or "
+    else:
+        where = ", ".join(f"{x:.6g}" for x in target.place[0][0])
+        what = f"motion: at t = {t:.4g} s the end-effector cannot be at ({where}) m"
+        off, remedy = f"{np.linalg.norm(place):.4g} m", ""
+        if len(turn):
+            what += " turned as it is to be"
+            off += f" and {np.linalg.norm(turn) / task.constraints.reach:.4g} rad"
+    start = "motion.initial_joints, " if t == 0.0 else ""
     return InputError(
-        f"{task.source}: motion: at t = {t:.4g} s the end-effector cannot be at ({place}) m"
-        f"{turned}: the joints that follow the path ({joints}) leave it {off} off at best; change "
-        f"{start}{task.keys}"
+        f"{task.source}: {what}: the joints that follow ({task.called(task.unknown)}) leave it "
+        f"{off} off at best; change {start}{remedy}{task.keys}"
     )
