@@ -155,12 +155,12 @@ class MachineState:
     @property
     def drive_forces(self) -> np.ndarray:
         """Forces u (n, R) of the drives of the free coordinates."""
-        return self.machine.drives.force(*self._errors)
+        return self.machine.drives.force(*self._errors)[0]
 
     @property
     def passing(self) -> np.ndarray:
-        """du / d(wanted force) (n, R), see `Drives.passing`."""
-        return self.machine.drives.passing(*self._errors)
+        """du / d(wanted force) (n, R), see `Drives.force`."""
+        return self.machine.drives.force(*self._errors)[1]
 
     @property
     def spring_forces(self) -> np.ndarray:

@@ -25,6 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
+from dolfinopt.dynamics.drives import NOTHING, Drives
 from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.feed_forward import known_forces
 from dolfinopt.dynamics.machine_instants import MachineInstants
@@ -39,7 +40,7 @@ from dolfinopt.multibody.ranks import complement
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.tangent import linearise
-from dolfinopt.multibody.tree import NOTHING, Drives, Mechanism
+from dolfinopt.multibody.tree import Mechanism
 
 PRESCRIBED = Drives(
     free=np.zeros(0, dtype=int),
@@ -324,7 +325,7 @@ class MachineSystem:
 
     def deflection(self, y: np.ndarray) -> float:
         """Return the largest deflection of an arm in a motion y (n, S), over its length."""
-        return float(self.mechanism.deflections(y[:, self.elastic_columns]).max(initial=0.0))
+        return float(self.mechanism.deflections(y[:, self.elastic_columns])[0].max(initial=0.0))
 
     def elastic_mass(self, t: np.ndarray) -> np.ndarray:
         """Return the mass (n, N, N) of the undeformed mechanism at instants t (n,), s."""

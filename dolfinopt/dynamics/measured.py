@@ -79,3 +79,7 @@ KEPT_INSTANTS_LIMIT = 20_000
 # Largest displacement, m or rad, along a vibration or the motion over which sixth-order differences
 # are taken: what they leave out and rounding are both below 1e-10 of a first derivative.
 POLE_STEP = 3e-3
+
+# -- drives ----------------------------------------------------------------------------------
+
+LINEAR_DRIVE_SHARE = 0.95  # of its limit, up to which a drive gives what is wanted of it

@@ -160,12 +160,12 @@ class Trajectory:
     @cached_property
     def deflections(self) -> np.ndarray:
         """Largest deflection of every arm's end in its own frame, over its length (arms,)."""
-        return self.mechanism.deflections(self.q_e)
+        return self.mechanism.deflections(self.q_e)[0]
 
     @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
-        return self.mechanism.rotations(self.q_e)
+        return self.mechanism.deflections(self.q_e)[1]
 
     @cached_property
     def joint_forces(self) -> np.ndarray:

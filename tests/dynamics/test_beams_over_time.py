@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import plane_chain
 from remainders import substructure
 
 from dolfinopt.dynamics import radau
@@ -14,7 +15,6 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
-from dolfinopt.multibody.tree import plane_chain
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 

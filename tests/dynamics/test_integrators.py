@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
+from bodies import Chain, Cloud, assert_close, beam, derivative, plane_chain, random_cloud
 from machines import distance
 from remainders import build
 from scipy.integrate import solve_ivp
@@ -36,9 +36,8 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
-from dolfinopt.multibody.tree import plane_chain
-from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # arrays of one process
 

@@ -6,20 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from bodies import beam
+from bodies import beam, plane_chain
 from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution, Stages, Strategy, radau_iia
+from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.estimate import _free_vibrations, _lost
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import Tangent
-from dolfinopt.multibody.tree import Drives, plane_chain
-from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 

@@ -10,13 +10,16 @@ import pytest
 from bodies import (
     CONSTANTS,
     Chain,
+    JointHardware,
     assert_close,
     change_of,
     changed,
     complex_derivative,
     derivative,
+    plane_chain,
     random_chain,
     random_tree,
+    spatial_mechanism,
     stiffened,
 )
 from mpi4py import MPI
@@ -43,11 +46,8 @@ from dolfinopt.multibody.tree import (
     GROUND,
     AppliedForce,
     Joint,
-    JointHardware,
     Mechanism,
     Rotor,
-    plane_chain,
-    spatial_mechanism,
 )
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
