@@ -49,7 +49,8 @@ class Cell:
         nodal, scalar: spaces of the nodes' displacements, and of one component.
         modes: gradients of the incompatible modes; none of other elements.
         displacement: the space of nodes' displacements and modes' amplitudes.
-        u, v, p, w: coefficients: displacements u and v, nodal vectors p and w.
+        u, v, p, w, tau: coefficients: displacements u and v, nodal vectors p and w, stresses of a
+            cell tau.
     """
 
     def __init__(self, shape: str, element: str):
@@ -75,8 +76,9 @@ class Cell:
             amplitudes = lagrange_element(shape, 0, len(self.modes))
             nodal = lagrange_element(shape, self.degree, d)
             self.displacement = self._space(mixed_element(nodal, amplitudes))
-        spaces = self.displacement, self.displacement, self.nodal, self.nodal
-        self.u, self.v, self.p, self.w = (
+        stresses = self._space(lagrange_element(shape, 0, kinds))
+        spaces = self.displacement, self.displacement, self.nodal, self.nodal, stresses
+        self.u, self.v, self.p, self.w, self.tau = (
             ufl.Coefficient(space, count=3 + k) for k, space in enumerate(spaces)
         )
 
@@ -205,11 +207,11 @@ def geometric_product(cell: Cell) -> ufl.Form:
     return cell.weight * ufl.inner(cell.stress_tensor(cell.u), both) * dx_geometric(cell)
 
 
-def stress_component(cell: Cell, kind: int, point: np.ndarray) -> ufl.Form:
-    """Return a component of the stress of u at a point (d,) of the reference cell."""
+def stress_component(cell: Cell, *point: float) -> ufl.Form:
+    """Return sigma(u) . tau at a point (d,) of the reference cell, tau as stresses are."""
     rule = {"quadrature_rule": "custom", "quadrature_degree": 1, "quadrature_weights": np.ones(1)}
-    dx = ufl.dx(cell.mesh, metadata={**rule, "quadrature_points": point[None]})
-    return cell.stress(cell.u)[kind] / abs(ufl.det(cell.J)) * dx
+    dx = ufl.dx(cell.mesh, metadata={**rule, "quadrature_points": np.array([point])})
+    return ufl.inner(cell.stress(cell.u), cell.tau) / abs(ufl.det(cell.J)) * dx
 
 
 def by_corners(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
@@ -221,6 +223,6 @@ def by_corners(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
     return forms
 
 
-def by_displacement(cell: Cell, functional: ufl.Form) -> ufl.Form:
-    """Return the derivative of a functional by u."""
-    return ufl.derivative(functional, cell.u, ufl.TestFunction(cell.displacement))
+def by_displacement(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
+    """Return the derivative of a functional by u, as a list of one."""
+    return [ufl.derivative(functional, cell.u, ufl.TestFunction(cell.displacement))]

@@ -124,7 +124,7 @@ def _compiled(form: ufl.Form | Expression, folder: Path) -> tuple[Any, Any, Any]
 def _locked(folder: Path) -> Iterator[Path]:
     """Hold the folder's lock, which ends with the process; none where it cannot be written."""
     try:
-        lock = open(folder / "dolfinopt.lock", "w")  # noqa: SIM115
+        lock = open(folder / "dolfinopt.lock", "w")
     except OSError:
         yield folder
         return

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
+from typing import Any
 
 import basix
 import numpy as np
+import ufl
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.fem import forms
-from dolfinopt.fem.kernels import Kernel, Values, compile_kernels
+from dolfinopt.fem.kernels import Expression, Kernel, Values, compile_kernels
 from dolfinopt.fem.measured import ALIKE_CELLS_ERROR, KERNEL_CHUNK_ENTRIES
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT, SIMPLICES
 
 
@@ -32,6 +35,7 @@ class ElementTensors:
         space: vector-valued Lagrange space, its block dofs number the nodes.
         cells: (n_cells, n) local nodes of the owned cells, corners first.
         points: (n_nodes, d) reference positions, m.
+        corners: (n_cells, c, d) of the owned cells, m.
         thickness: t, m.
         law: C, see `laws`.
         stiffness: (1 or n_cells, dn, dn) m, thickness included; times E0 gives N/m.
@@ -40,7 +44,9 @@ class ElementTensors:
         recovery: (1 or n_cells, m, dn) their amplitudes by the nodal displacements.
     """
 
-    def __init__(self, mesh: ArmMesh, element: str, thickness: float, law: np.ndarray):
+    def __init__(
+        self, mesh: ArmMesh, element: str, thickness: float, law: np.ndarray, profile: Profile
+    ):
         """Compile the forms; compute stiffness and mass (collective on the arm's ranks).
 
         Args:
@@ -48,17 +54,40 @@ class ElementTensors:
             element: one of `forms.ELEMENTS` that these cells have, see `element_of`.
             thickness: t, m; 1 in space.
             law: C of unit Young's modulus.
+            profile: of this rank, which counts the forms.
         """
-        self.thickness, self.law = thickness, law
+        self.thickness, self.law, self.profile = thickness, law, profile
         self.cell = cell = forms.Cell(compat.cell_shape(mesh.mesh), element)
         self.space = compat.lagrange_space(mesh.mesh, cell.degree, components=mesh.dim)
         self.cells = compat.cell_nodes(self.space, mesh.num_cells)
         points = self.space.tabulate_dof_coordinates()[:, : mesh.dim].copy()
         with together(mesh.comm):
-            self._stiffness, self._mass, self._geometric = compile_kernels(
-                [forms.stiffness(cell), forms.mass(cell), forms.geometric_stiffness(cell)]
-            )
+            self._known = self._compiled()
         self._place(mesh, points)
+
+    def _compiled(self) -> dict[Hashable, list[Kernel]]:
+        """Return the kernels of every run, which are compiled together."""
+        cell, points = self.cell, stress_points(self.cell)
+        made: dict[Hashable, ufl.Form | Expression] = {
+            "stiffness": forms.stiffness(cell),
+            "mass": forms.mass(cell),
+            "geometric stiffness": forms.geometric_stiffness(cell),
+        }
+        made |= {at.tobytes(): forms.stress_at(cell, at) for at in (points[:1], points)}
+        kernels = self._counted(compile_kernels([*made.values()]))
+        return {key: [kernel] for key, kernel in zip(made, kernels, strict=True)}
+
+    def kernels(
+        self, key: Hashable, make: Callable[[], Sequence[ufl.Form | Expression]]
+    ) -> list[Kernel]:
+        """Return the kernels of forms; they are made and compiled when first asked for."""
+        if key not in self._known:
+            self._known[key] = self._counted(compile_kernels(make()))
+        return self._known[key]
+
+    def _counted(self, kernels: list[Kernel]) -> list[Kernel]:
+        self.profile.counts.forms += len(kernels)
+        return kernels
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> ElementTensors:
         """Return those of the same cells with their corners elsewhere (collective).
@@ -78,15 +107,19 @@ class ElementTensors:
         coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
         alike = single(mesh.comm, coordinates - coordinates.mean(axis=1, keepdims=True))
         self._coordinates = coordinates if alike is None else alike[None]
+        self.corners = coordinates[:, :, : mesh.dim]
         self.stiffness, self.recovery, self.modal = (
             np.concatenate(parts)
-            for parts in zip(*map(self._condensed, self._tabulated(self._stiffness)), strict=True)
+            for parts in zip(
+                *map(self._condensed, self._tabulated(self._known["stiffness"])), strict=True
+            )
         )
         self.stiffness *= self.thickness
-        self.mass = self.thickness * np.concatenate([*self._tabulated(self._mass)])
+        self.mass = self.thickness * np.concatenate([*self._tabulated(self._known["mass"])])
 
-    def _tabulated(self, kernel: Kernel) -> Iterator[np.ndarray]:
+    def _tabulated(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
         """Yield the tensors of runs of cells, so that not all are in memory at once."""
+        [kernel] = kernels
         step = max(1, KERNEL_CHUNK_ENTRIES // int(np.prod(kernel.shape)))
         for first in range(0, max(1, len(self._coordinates)), step):
             part = self._coordinates[first : first + step]
@@ -95,17 +128,17 @@ class ElementTensors:
     def _condensed(self, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return k_e with the modes at rest, symmetric, their recovery and their own stiffness.
 
-            k_e = k_uu - k_ua k_aa^-1 k_au.
+        k_e = k_uu - k_ua k_aa^-1 k_au.
         """
         n = self.cell.dim * self.cells.shape[1]
         recovery = -np.linalg.solve(k[:, n:, n:], k[:, n:, :n])
         condensed = k[:, :n, :n] + k[:, :n, n:] @ recovery
         return 0.5 * (condensed + condensed.swapaxes(1, 2)), recovery, k[:, n:, n:]
 
-    def _recovered(self, kernel: Kernel) -> Iterator[np.ndarray]:
+    def _recovered(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
         """Yield tensors (cells, ..., dn) by displacements, the modes' part included."""
         first = 0
-        for tensor in self._tabulated(kernel):
+        for tensor in self._tabulated(kernels):
             recovery = self.recovery[first : first + len(tensor)]
             rows, n = tensor.reshape(len(tensor), -1, tensor.shape[-1]), recovery.shape[2]
             rows = rows[:, :, :n] + rows[:, :, n:] @ recovery
@@ -114,8 +147,8 @@ class ElementTensors:
 
     def stress(self, points: np.ndarray) -> np.ndarray:
         """Return the stresses (1 or n_cells, p, s, dn) by displacements, 1/m, at points (p, d)."""
-        [kernel] = compile_kernels([forms.stress_at(self.cell, points)])
-        stress = np.concatenate([*self._recovered(kernel)])
+        kernels = self.kernels(points.tobytes(), lambda: [forms.stress_at(self.cell, points)])
+        stress = np.concatenate([*self._recovered(kernels)])
         return stress.reshape(len(stress), len(points), -1, stress.shape[-1])
 
     @cached_property
@@ -124,7 +157,10 @@ class ElementTensors:
         d, n = self.cell.dim, self.cells.shape[1]
         b, c = np.triu_indices(n - 1)
         twice = self.thickness * np.where(b == c, 1.0, 2.0)[:, None]
-        parts = [twice * T[:, b + 1, c + 1, d:] for T in self._recovered(self._geometric)]
+        parts = [
+            twice * T[:, b + 1, c + 1, d:]
+            for T in self._recovered(self._known["geometric stiffness"])
+        ]
         return np.concatenate(parts)
 
 
@@ -181,3 +217,19 @@ def stress_points(cell: forms.Cell) -> np.ndarray:
     """Return centre and 2 x 2 (x 2) Gauss points (p, d) of the reference cell."""
     gauss, _ = basix.make_quadrature(getattr(basix.CellType, cell.shape), 2)
     return np.concatenate([element_centre(cell), gauss])
+
+
+def corner_functions(cell: forms.Cell, points: np.ndarray) -> np.ndarray:
+    """Return the linear functions (p, c) of the corners at points (p, d) of the reference cell."""
+    return np.asarray(_lagrange(cell, 1).tabulate(0, points)[0, :, :, 0])
+
+
+def node_places(cell: forms.Cell) -> np.ndarray:
+    """Return the element's nodes (n, d) in the reference cell."""
+    return np.asarray(_lagrange(cell, cell.degree).points)
+
+
+def _lagrange(cell: forms.Cell, degree: int) -> Any:
+    kind = getattr(basix.CellType, cell.shape)
+    variant = basix.LagrangeVariant.gll_warped
+    return basix.create_element(basix.ElementFamily.P, kind, degree, variant)

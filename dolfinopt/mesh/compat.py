@@ -16,6 +16,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.parallel import on_root
 from dolfinopt.progress import log
+from dolfinopt.scene.tables.arms import CellShape
 
 # DOLFINx 0.5 logs each JIT compilation through the root logger; a handler set beforehand keeps
 # `logging.basicConfig` from being triggered by the first message.
@@ -144,7 +145,9 @@ def form_folder() -> Path:
 
 def _remove_interrupted() -> bool:
     """Remove what interrupted compilations left; return whether there was any."""
-    left = [path for path in form_folder().glob("*.c") if not path.with_suffix(".c.cached").exists()]
+    left = [
+        path for path in form_folder().glob("*.c") if not path.with_suffix(".c.cached").exists()
+    ]
     for path in left:
         log.info("%s: its compilation was interrupted and is repeated", path)
         path.unlink(missing_ok=True)
@@ -162,9 +165,10 @@ def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
     return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
 
 
-def cell_shape(mesh: Any) -> str:
+def cell_shape(mesh: Any) -> CellShape:
     """Return "triangle", "quadrilateral", "tetrahedron" or "hexahedron"."""
-    return str(mesh.topology.cell_type.name)
+    shape: CellShape = mesh.topology.cell_type.name
+    return shape
 
 
 def cell_corner_count(mesh: Any) -> int:

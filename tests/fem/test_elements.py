@@ -9,13 +9,6 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import solids
-from mpi4py import MPI
-from remainders import bulge
-from runs import ROOT, refusal
-from scipy.sparse.linalg import eigsh
-from solids import POISSON, elastic_link, link_mesh
-
-from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.elements import (
     ELEMENTS,
     LagrangeElement,
@@ -28,6 +21,13 @@ from dolfinopt.fem.elements import (
     jacobian,
     plane_stress,
 )
+from mpi4py import MPI
+from remainders import bulge
+from runs import ROOT, refusal
+from scipy.sparse.linalg import eigsh
+from solids import POISSON, elastic_link, link_mesh
+
+from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import arm_mesh, box_arm
 from dolfinopt.profiling import Profile
