@@ -122,19 +122,23 @@ def incompatible_modes(cell: Cell) -> list[Any]:
     Source: Taylor, Beresford & Wilson, Int. J. Numer. Methods Eng. 10 (1976) 1211-1219,
     doi:10.1002/nme.1620100602.
     """
-    d, n = cell.dim, cell.num_corners
-    signs = 2.0 * np.indices((2,) * d).reshape(d, -1)[::-1] - 1.0  # of the reference corners
-    rows = [
-        [sum(s[k] * cell.corners[d * k + i] for k in range(n)) for s in signs] for i in range(d)
-    ]
-    J0 = ufl.as_matrix(rows) / 2 ** (d - 1)
-    ratio = ufl.det(J0) / ufl.det(cell.J)
-    inverse, unit = ufl.inv(J0), np.eye(d)
+    J0, ratio = centre(cell)
+    inverse = ufl.inv(J0)
     return [
         ratio * (1.0 - 2.0 * cell.xi[k]) * ufl.outer(ufl.as_vector(way), inverse[k, :])
-        for k in range(d)
-        for way in unit
+        for k in range(cell.dim)
+        for way in np.eye(cell.dim)
     ]
+
+
+def centre(cell: Cell) -> tuple[Any, Any]:
+    """Return the Jacobian J_0 at the centre of a quadrilateral or hexahedron, det J_0 / det J."""
+    d, n = cell.dim, cell.num_corners
+    signs = 2.0 * np.indices((2,) * d).reshape(d, -1)[::-1] - 1.0  # of the reference corners
+    x = cell.corners
+    rows = [[sum(s[k] * x[d * k + i] for k in range(n)) for s in signs] for i in range(d)]
+    J0 = ufl.as_matrix(rows) / 2 ** (d - 1)
+    return J0, ufl.det(J0) / ufl.det(cell.J)
 
 
 # -- measures: Gauss points that are exact on parallelepipeds and simplices --------------------

@@ -108,13 +108,10 @@ class ElementTensors:
         alike = single(mesh.comm, coordinates - coordinates.mean(axis=1, keepdims=True))
         self._coordinates = coordinates if alike is None else alike[None]
         self.corners = coordinates[:, :, : mesh.dim]
-        self.stiffness, self.recovery, self.modal = (
-            np.concatenate(parts)
-            for parts in zip(
-                *map(self._condensed, self._tabulated(self._known["stiffness"])), strict=True
-            )
-        )
-        self.stiffness *= self.thickness
+        n = mesh.dim * self.cells.shape[1]
+        parts = [condensed(k, n) for k in self._tabulated(self._known["stiffness"])]
+        k, self.recovery, self.modal = map(np.concatenate, zip(*parts, strict=True))
+        self.stiffness = self.thickness * k
         self.mass = self.thickness * np.concatenate([*self._tabulated(self._known["mass"])])
 
     def _tabulated(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
@@ -124,16 +121,6 @@ class ElementTensors:
         for first in range(0, max(1, len(self._coordinates)), step):
             part = self._coordinates[first : first + step]
             yield kernel(part, geometry(self.cell, part, self.law))
-
-    def _condensed(self, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return k_e with the modes at rest, symmetric, their recovery and their own stiffness.
-
-        k_e = k_uu - k_ua k_aa^-1 k_au.
-        """
-        n = self.cell.dim * self.cells.shape[1]
-        recovery = -np.linalg.solve(k[:, n:, n:], k[:, n:, :n])
-        condensed = k[:, :n, :n] + k[:, :n, n:] @ recovery
-        return 0.5 * (condensed + condensed.swapaxes(1, 2)), recovery, k[:, n:, n:]
 
     def _recovered(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
         """Yield tensors (cells, ..., dn) by displacements, the modes' part included."""
@@ -153,15 +140,12 @@ class ElementTensors:
 
     @cached_property
     def geometric(self) -> np.ndarray:
-        """T (1 or n_cells, r (r + 1) / 2, d r), see `assembly.StressTensor`, thickness included."""
+        """T (1 or n_cells, r (r + 1) / 2, d r), see `assembly.StiffenedModes`, thickness included."""
         d, n = self.cell.dim, self.cells.shape[1]
         b, c = np.triu_indices(n - 1)
         twice = self.thickness * np.where(b == c, 1.0, 2.0)[:, None]
-        parts = [
-            twice * T[:, b + 1, c + 1, d:]
-            for T in self._recovered(self._known["geometric stiffness"])
-        ]
-        return np.concatenate(parts)
+        tensors = self._recovered(self._known["geometric stiffness"])
+        return np.concatenate([twice * T[:, b + 1, c + 1, d:] for T in tensors])
 
 
 def element_of(mesh: ArmMesh, name: str | None) -> str:
@@ -195,6 +179,16 @@ def single(comm: MPI.Comm, arrays: np.ndarray) -> np.ndarray | None:
     mean = first + comm.allreduce((arrays - first).sum(axis=0)) / count
     error = comm.allreduce(np.abs(arrays - mean).max(initial=0.0), op=MPI.MAX)
     return mean if error <= ALIKE_CELLS_ERROR * np.abs(mean).max() else None
+
+
+def condensed(k: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return k_e (n_cells, n, n) with the modes at rest, their recovery and their own stiffness.
+
+    k_e = k_uu - k_ua k_aa^-1 k_au, made symmetric, of n displacements and the amplitudes behind.
+    """
+    recovery = -np.linalg.solve(k[:, n:, n:], k[:, n:, :n])
+    stiffness = k[:, :n, :n] + k[:, :n, n:] @ recovery
+    return 0.5 * (stiffness + stiffness.swapaxes(1, 2)), recovery, k[:, n:, n:]
 
 
 def geometry(cell: forms.Cell, coordinates: np.ndarray, law: np.ndarray) -> Values:
