@@ -99,7 +99,7 @@ def compile_kernels(forms: Sequence[ufl.Form | Expression]) -> list[Kernel]:
 
     One process compiles at a time, others wait for it and then find the forms.
     """
-    with quiet_compilers(), _locked(form_folder()) as folder:
+    with _locked(form_folder()) as folder:
         missing = [form for form in forms if not is_compiled(form)]
         if missing:
             log.info("compiling %d forms, once", len(missing))
@@ -107,7 +107,8 @@ def compile_kernels(forms: Sequence[ufl.Form | Expression]) -> list[Kernel]:
             if at.exists():
                 log.info("%s: a compilation was interrupted there and is repeated", folder)
                 shutil.rmtree(at)
-        return [Kernel(form, _compiled(form, _folder(form))) for form in forms]
+        with quiet_compilers():
+            return [Kernel(form, _compiled(form, _folder(form))) for form in forms]
 
 
 def is_compiled(form: ufl.Form | Expression) -> bool:

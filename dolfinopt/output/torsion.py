@@ -12,7 +12,7 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 # Errors of the torsion constant of square sections of n x n cells, relative to Saint-Venant's:
-# 0.186, 0.186, 0.090, 0.052, 0.024, 0.014 for n = 1, 2, 3, 4, 6, 8. Oblong ones are a little better.
+# 0.186, 0.186, 0.090, 0.052, 0.024, 0.014 for n = 1, 2, 3, 4, 6, 8. Oblong ones have less.
 LARGEST_ERROR = 0.186
 ERROR_TIMES_CELLS = 0.86
 ERROR_LIMIT = 0.01  # of an arm's strain energy, from which on a warning tells of it
