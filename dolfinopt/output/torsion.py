@@ -53,7 +53,7 @@ def torsion_warnings(trajectory: Trajectory | None) -> list[str]:
         error, share = torsion_error(*arm.cells[1:]), torsion_share(body, q)
         if error * share > ERROR_LIMIT:
             found.append(
-                f"arm {arm.name!r}: torsion is {100.0 * share:.2g} % of its strain energy, and "
+                f"arm {arm.name!r}: torsion is {100.0 * share:.0f} % of its strain energy, and "
                 f"{arm.cells[1]} x {arm.cells[2]} cells over its section are too stiff in torsion "
                 f'by {100.0 * error:.2g} %; set element = "quadratic", or use more cells there'
             )
