@@ -336,7 +336,9 @@ def test_cantilever(kind, share, tmp_path):
                 for second, a in ((I_z, along_y), (I_y, along_z))]  # fmt: skip
     assert flexibility[1:3] == pytest.approx(expected, rel=0.01)
     if share < 0.1 or kind in ("round tube", "solid bar"):
-        assert flexibility[3] == pytest.approx(twist, rel=0.01)
+        # 6 x 4 cells over the bar's section: tests/fem/test_elements.py.
+        error = 0.035 if kind == "solid bar" else 0.01
+        assert flexibility[3] == pytest.approx(twist, rel=error)
 
 
 # -- solid arms: boxes of hexahedra, volumes and facets of cells in space, what cannot be a solid
