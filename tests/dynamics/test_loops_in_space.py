@@ -66,7 +66,7 @@ def free_motion(
     grid = np.linspace(0.0, system.breakpoints[-1], steps + 1)
     solution = radau.on_grid(system, grid, 1e-8, 4)
     y, yd = solution.sample(t), solution.sample(t, 1)
-    motion = system.at(t).motion(y, yd, yd)
+    motion = system.at(t).state(y, yd, yd).motion
     z = solution.sample(grid)
     q = system.at(grid).motion(z, z, z).q
     assert system.loops is not None
