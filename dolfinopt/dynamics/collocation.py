@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from dolfinopt.dynamics.system import Instants, Linearisation, Preconditioner, State, relative_error
+from dolfinopt.dynamics.system import Instants, Linearisation, Preconditioner, State, inverse_size
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,14 @@ class Stages:
         method: collocation.
         h: (n,) steps, s.
         instants: the system at the n s stages.
+        size: (groups,) of a longer motion of which these are a part, or None.
     """
 
     preconditioner: Preconditioner
     method: Collocation
     h: np.ndarray
     instants: Instants
+    size: np.ndarray | None = None
 
     @property
     def angles(self) -> np.ndarray:
@@ -65,18 +67,29 @@ class Stages:
         s = len(self.method.c)
         return replace(self, h=self.h[first:last], instants=self.instants[first * s : last * s])
 
+    def size_with(self, q: np.ndarray) -> np.ndarray:
+        """Return the size (groups,) of the motion if these steps have q (n, s, N)."""
+        own = self.preconditioner.system.norm(q.reshape(-1, q.shape[-1]))
+        return own if self.size is None else np.maximum(self.size, own)
+
     def relative(self, change: np.ndarray, q: np.ndarray) -> float:
         """Return the relative size of a change of q, both (n, s, N); inf of what is no number."""
-        flat = (-1, q.shape[-1])
         with np.errstate(all="ignore"):  # of what diverges
-            size = relative_error(self.preconditioner.system, change.reshape(flat), q.reshape(flat))
-        return size if np.isfinite(size) else np.inf
+            scale = inverse_size(self.size_with(q))
+            each = self.preconditioner.system.norm(change.reshape(-1, q.shape[-1])) * scale
+        largest = float(each.max(initial=0.0))
+        return largest if np.isfinite(largest) else np.inf
 
 
-def stages_of(preconditioner: Preconditioner, method: Collocation, time_grid: np.ndarray) -> Stages:
-    """Return all stages of the steps of a time grid (n + 1,), s."""
+def stages_of(
+    preconditioner: Preconditioner,
+    method: Collocation,
+    time_grid: np.ndarray,
+    size: np.ndarray | None = None,
+) -> Stages:
+    """Return all stages of the steps of a time grid (n + 1,), s; `size` as of `Stages`."""
     instants = preconditioner.system.at_stages(time_grid, method.c)
-    return Stages(preconditioner, method, np.diff(time_grid), instants)
+    return Stages(preconditioner, method, np.diff(time_grid), instants, size)
 
 
 def step_ends(stages: Stages, state: State, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -29,7 +29,7 @@ from dolfinopt.dynamics.drives import NOTHING, Drives
 from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.feed_forward import known_forces
 from dolfinopt.dynamics.machine_instants import MachineInstants
-from dolfinopt.dynamics.measured import EXACT
+from dolfinopt.dynamics.measured import DEFLECTION_LIMIT, EXACT
 from dolfinopt.dynamics.modes import Modes, modes_of
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.tables import motion_at_stages
@@ -213,7 +213,10 @@ class MachineSystem:
     @cached_property
     def _start(self) -> np.ndarray:
         """That of `initial_state`: every time grid asks for it."""
-        return self._rest(np.zeros((1, self.num_coordinates)))[0]
+        start = self._rest(np.zeros((1, self.num_coordinates)))[0]
+        if self.deflection(start) > DEFLECTION_LIMIT:  # Newton's method found arms folded
+            raise self._no_equilibrium()
+        return start
 
     @property
     def is_held(self) -> np.ndarray:

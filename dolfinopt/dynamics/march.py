@@ -131,8 +131,9 @@ class March:
                 if too_many or self._h < LEAST_STEP_SHARE * horizon:
                     raise GivenUp(
                         f"the simulation gets no further than t = {self.t:.4g} s with "
-                        f"{len(self._ends) - 1} time steps: the motion changes too fast for arms "
-                        f"that deflect by {100 * self._deflection:.0f} % of their length; {REMEDY}"
+                        f"{len(self._ends) - 1} time steps: the motion changes too fast there, or "
+                        f"the arms, deflected by {100 * self._deflection:.2g} % of their length so "
+                        f"far, have no equilibrium beyond; {REMEDY}"
                     )
                 self._progress.tell(f"step by step, {100 * self.t / horizon:.0f} %")
                 self._window(end, horizon)
@@ -141,14 +142,14 @@ class March:
     def _window(self, end: float, horizon: float) -> None:
         """Solve some steps, and keep those that are short enough."""
         grid = self._next_steps(end, horizon)
-        stages = stages_of(self._preconditioner, self._method, grid)
+        stages = stages_of(self._preconditioner, self._method, grid, self.size)
         first = self._first_guess(grid)
         found = newton(stages, self.state, first, self._error, WINDOW_LIMITS)
         self._iterations += found.iterations
         if not found.converged:
             self._shorten(grid)
             return
-        errors = estimate(stages, grid, self.state, found.a, found.matrix, self.size)
+        errors = estimate(stages, grid, self.state, found.a, found.matrix)
         self._accept(stages, grid, found.a, errors)
 
     def _next_steps(self, end: float, horizon: float) -> np.ndarray:

@@ -31,8 +31,8 @@ class Linearisation(Protocol):
     Of m rows or changes, a multiple of n, each instant stands for as many in turn.
     """
 
-    def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Linearisation:
-        """Return it by coordinates `keep` of the S, at m instants between every s by (m, s)."""
+    def step_mean(self, stages: int, keep: np.ndarray) -> Linearisation:
+        """Return its mean over every `stages` instants, by coordinates `keep` of the S."""
 
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""

@@ -166,6 +166,8 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 def _when(s: np.ndarray, motion: Motion) -> np.ndarray:
     """Return the instants at which the time law reaches s, in (0, 1)."""
+    if not len(s):
+        return s
     law, last = time_law(motion), motion.duration
     return inverse(lambda t: law(t, last)[0], s, 0.0, last)
 

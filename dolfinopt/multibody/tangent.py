@@ -47,17 +47,11 @@ class Tangent:
         count, rows, size, _ = self.matrix.shape
         return self.matrix.reshape(count, rows, 3 * size)
 
-    def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Tangent:
-        """Return it by some of the coordinates, at further instants between those of every step.
-
-        Args:
-            weights: (m, s) of s instants in turn, for m others.
-            keep: ascending places among the S coordinates.
-        """
+    def step_mean(self, stages: int, keep: np.ndarray) -> Tangent:
+        """Return its mean over every `stages` instants, by some of the coordinates, ascending."""
         kept = self.matrix[:, :, self.order[keep]]
-        between = weights @ kept.reshape(-1, weights.shape[1], kept[0].size)
-        between = between.reshape(-1, *kept.shape[1:])
-        return Tangent(between, self.own[keep], np.arange(len(keep)))
+        mean = kept.reshape(-1, stages, *kept.shape[1:]).mean(axis=1)
+        return Tangent(mean, self.own[keep], np.arange(len(keep)))
 
     def dense(self) -> np.ndarray:
         """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
