@@ -388,11 +388,16 @@ class BodyMotion:
     def rows_by_rates(self, kept: np.ndarray, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the derivatives of the rows by those e, e', e'' kept (n, q, k, 3), pushes held."""
         constants, q, count = self.constants, self.constants.num_modes, self.w.shape[1]
-        W = constants.W.reshape(-1, q * q)
-        by_z = [(x.T @ W).reshape(count, q, q) for x in (self.alpha, self.beta)]
-        by_z.append(np.broadcast_to(constants.M, (count, q, q)))
+        W, M = constants.W.reshape(-1, q, q), constants.M
         if constants.bent is None:
-            out = np.stack([x[:, :, kept] for x in by_z], axis=3)
+            W, M = W[:, :, kept], M[:, kept]
+        flat = W.reshape(len(W), -1)
+        by_z = [(x.T @ flat).reshape(count, *M.shape) for x in (self.alpha, self.beta)]
+        by_z.append(np.broadcast_to(M, (count, *M.shape)))
+        if constants.bent is None:
+            out = np.empty((count, *M.shape, 3))
+            for rate, x in enumerate(by_z):
+                out[..., rate] = x
         else:
             jets = self._by_rates(slice(len(constants.T), None), np.arange(q))
             out = _chain(by_z, [x[:, :, kept] for x in jets]).reshape(count, q, -1)
@@ -505,5 +510,8 @@ def _chain(by: Sequence[np.ndarray], rates: Sequence[np.ndarray]) -> np.ndarray:
         rates: V = dv/de, V', V'' (n, p, k).
     """
     (by_v, by_rate, by_second), (V, Vd, Vdd) = by, rates
-    by_e = by_v @ V + by_rate @ Vd + by_second @ Vdd
-    return np.stack([by_e, by_rate @ V + 2.0 * (by_second @ Vd), by_second @ V], axis=3)
+    out = np.empty((len(V), by_v.shape[1], V.shape[2], 3))
+    out[..., 0] = by_v @ V + by_rate @ Vd + by_second @ Vdd
+    out[..., 1] = by_rate @ V + 2.0 * (by_second @ Vd)
+    out[..., 2] = by_second @ V
+    return out

@@ -318,10 +318,11 @@ class Interface(CarriedFrame):
         return self.body.V[self.places]
 
     @cached_property
-    def rows_by_load(self) -> np.ndarray:
-        """Derivative of the body's rows by a load in the interface's components (d + r, q, n)."""
-        V, d = self.V, self.dim.d
-        return self.in_own(np.concatenate([V[:d], self.turning.jacobian_times(V[d:])]))
+    def of_coefficients(self) -> np.ndarray:
+        """Derivative of `coefficients` by a load in the interface's components (n, b, b)."""
+        out, d = np.zeros((self.dim.b, self.dim.b, self.place.shape[1])), self.dim.d
+        out[range(d), range(d)], out[d:, d:] = 1.0, self.turning.J
+        return by_instant(self.in_own(out)).swapaxes(1, 2)
 
 
 class MovingJoint(CarriedFrame):

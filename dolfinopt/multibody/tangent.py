@@ -272,19 +272,21 @@ class _Passes:
         rows = self.matrix[:, len(self.rows) + part.start : len(self.rows) + part.stop]
         by_motion = by_instant(body.rows_by_motion.swapaxes(0, 1))
         own = body.rows_by_rates(kept, interface_coefficients(link, loads))
+        own = own.reshape(*rows.shape[:2], -1)
         for s, interface in link.interfaces.items():
-            by_load, on = by_instant(interface.rows_by_load.swapaxes(0, 1)), outboard[s]
-            by_end = by_load @ on.by_motion
-            by_motion += by_end @ interface.transform
+            V, turning, on = by_instant(interface.V), carried_load(link, loads, s), outboard[s]
+            Vt, by_end = V.swapaxes(1, 2), interface.of_coefficients @ on.by_motion
+            by_load = Vt @ interface.of_coefficients
+            by_motion += Vt @ (by_end @ interface.transform)
             _add_product(by_load, on.by_columns, rows[:, :, on.first :], len(outboard) == 1)
-            rows[:, :, columns] += by_end @ self.ends[i, s][:, :, columns]
-            V, turning = by_instant(interface.V), carried_load(link, loads, s)
+            by_own = by_end @ self.ends[i, s][:, :, columns]
             by_displacement = interface.coefficients_by_coordinates(loads[s], turning)
-            own[..., 0] += V.swapaxes(1, 2) @ (by_instant(by_displacement) @ V[:, :, kept])
+            by_own[:, :, ::3] += by_instant(by_displacement) @ V[:, :, kept]
+            own += Vt @ by_own
             if s in link.applied:
                 given = by_instant(interface.coefficients(_given(link, s)))
-                self._add_turned(i, V.swapaxes(1, 2) @ given, rows)
-        rows[:, :, columns] += own.reshape(*rows.shape[:2], -1)
+                self._add_turned(i, Vt @ given, rows)
+        rows[:, :, columns] += own
         self._add_moved(i, by_motion, rows, alone=not self.tree.forces)
 
     def _on_carrier(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
