@@ -38,7 +38,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.dimension import DIMENSIONS, compose, product
+from dolfinopt.multibody.dimension import DIMENSIONS, product
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -127,11 +127,6 @@ class BodyMotion:
     def beta(self) -> np.ndarray:
         """Entries of 2 Omega (g, n)."""
         return self.dim.beta(self.w)
-
-    @cached_property
-    def alpha_by_spin(self) -> np.ndarray:
-        """Derivative of the entries of A by w (g, r, n)."""
-        return self.dim.alpha_by_spin(self.w)
 
     # -- conjugates of the pushes, displacement along the modes -------------------------------
 
@@ -315,25 +310,41 @@ class BodyMotion:
     @cached_property
     def load_by_motion(self) -> np.ndarray:
         """Derivative of (F, T) by (a, w, wd), (d + r, d + 2 r, n)."""
-        dim, (s, sd, _), (G, H, _) = self.dim, self.moments, self.second_moments
-        d, r = dim.d, dim.r
-        out = np.zeros((d + r, d + 2 * r, self.a.shape[1]))
+        dim, d = self.dim, self.dim.d
+        out = np.zeros((dim.b, dim.b + dim.r, self.a.shape[1]))
         out[range(d), range(d)] = self.constants.mass
-        spun = dim.by_spin(s)
-        out[:d, d : d + r] = product(dim.applied.matrix(s), self.alpha_by_spin)
-        out[:d, d : d + r] += 2.0 * dim.by_spin(sd)
-        out[:d, d + r :], out[d:, :d] = spun, spun.swapaxes(0, 1)
-        of_G, of_H = dim.torque_of.matrix(G), dim.torque_of.matrix(H)
-        out[d:, d : d + r] = product(of_G, self.alpha_by_spin) + 2.0 * compose(of_H, dim.spin)
-        out[d:, d + r :] = compose(of_G, dim.spin)
+        out[d:, :d] = dim.moment.matrix(self.moments[0])
+        by_alpha, by_beta = (x.swapaxes(0, 1) for x in self._load_by_entries)
+        out[:, d:] = dim.spin_gradient(self.w, by_alpha, by_beta).swapaxes(0, 1)
         return out
+
+    @property
+    def _load_by_entries(self) -> list[np.ndarray]:
+        """Derivatives of (F, T) by alpha and beta (d + r, g, n)."""
+        applied, torque = self.dim.applied.matrix, self.dim.torque_of.matrix
+        pairs = zip(self.moments[:2], self.second_moments[:2], strict=True)
+        return [np.concatenate([applied(s), torque(G)]) for s, G in pairs]
+
+    def motion_gradient(self, virtual: np.ndarray, zeta: np.ndarray) -> np.ndarray:
+        """Return derivatives (d + 2 r, n) of the virtual work of F, T and the rows by the motion.
+
+        Args:
+            virtual: (d + r, n) multiplies (F, T).
+            zeta: (q, n) multiplies the rows.
+        """
+        dim, (u, phi) = self.dim, np.split(virtual, [self.dim.d])
+        by_a = self.constants.mass * u + dim.velocity(phi, self.moments[0])
+        by_entries = [product(x.swapaxes(0, 1), virtual) for x in self._load_by_entries]
+        if self.is_flexible:
+            by_a += product(self.V[: dim.d], zeta)
+            by_entries = [x + product(Y, zeta) for x, Y in zip(by_entries, (self.Y, self.Yd))]
+        return np.concatenate([by_a, dim.spin_gradient(self.w, *by_entries)])
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:
         """Derivative of the rows by (a, w, wd), (d + 2 r, q, n)."""
-        dim = self.dim
-        by_w = product(self.alpha_by_spin.swapaxes(0, 1), self.Y) - 2.0 * dim.axial(self.Yd)
-        return np.concatenate([self.V[: dim.d], by_w, -dim.axial(self.Y)])
+        by_spin = self.dim.spin_gradient(self.w, self.Y, self.Yd)
+        return np.concatenate([self.V[: self.dim.d], by_spin])
 
     @cached_property
     def load_by_conjugates(self) -> np.ndarray:
@@ -341,19 +352,33 @@ class BodyMotion:
 
         z is `Constants.inertial`'s last.
         """
-        dim, d, ends = self.dim, self.dim.d, self.dim.d + self.dim.g
-        out = np.zeros((dim.b, 3, ends + len(self.rates), self.a.shape[1]))
-        on_s, on_v, on_z = out[:, :, :d], out[d:, :, d:ends], out[d:, :, ends:]
-        on_s[:d, 0], on_s[:d, 1] = dim.apply.matrix(self.alpha), dim.apply.matrix(self.beta)
-        on_s[range(d), 2, range(d)] = 1.0
-        on_s[d:, 0] = -dim.by_spin(self.a).swapaxes(0, 1)
+        dim, d = self.dim, self.dim.d
+        out = np.zeros((dim.b, 3, len(self.constants.inertial), self.a.shape[1]))
+        by_s = out[:, :, :d]
+        by_s[:d, 0], by_s[:d, 1] = dim.apply.matrix(self.alpha), dim.apply.matrix(self.beta)
+        by_s[range(d), 2, range(d)] = 1.0
+        by_s[d:, 0] = -dim.moment.matrix(self.a)
+        out[d:, :, d:] = self._by_second_rates(self._torques)
+        return out
+
+    @property
+    def _torques(self) -> list[np.ndarray]:
+        """Derivatives of T by G, H, I (r, g, n); the last (r, g, 1)."""
+        torque = self.dim.torque.matrix
+        return [torque(self.alpha), torque(self.beta), -self.dim.spin.T[:, :, None]]
+
+    def _by_second_rates(self, by: Sequence[np.ndarray]) -> np.ndarray:
+        """Return derivatives (m, 3, g + q, n) by v, z and their rates from those by G, H, I."""
         # G, H and I have v and its transpose, v' and v'' transposed; W_c z takes the place of v.
-        of_alpha, of_beta = dim.torque.matrix(self.alpha), dim.torque.matrix(self.beta)
-        for rate, matrix in enumerate((of_alpha, of_beta, -dim.spin.T[:, :, None])):
-            on_v[:, rate] = dim.transposed(matrix.swapaxes(0, 1)).swapaxes(0, 1)
-        on_v[:, 0] += of_alpha
-        on_z[:] = np.einsum("rtgn,gqn->rtqn", on_v, self._Wz[:, :, 0])
-        on_z[:, 0] += product(of_beta, self._Wz[:, :, 1]) + dim.axial(self._Wz[:, :, 2])
+        count, transposed = self.a.shape[1], self.dim.transposed
+        out = np.empty((len(by[0]), 3, self.dim.g + len(self.rates), count))
+        by_v, by_z = out[:, :, : self.dim.g], out[:, :, self.dim.g :]
+        for rate, x in enumerate(by):
+            by_v[:, rate] = transposed(x.swapaxes(0, 1)).swapaxes(0, 1)
+        by_v[:, 0] += by[0]
+        by_z[:] = np.einsum("mtgn,gqn->mtqn", by_v, self._Wz[:, :, 0])
+        for rate in (1, 2):
+            by_z[:, 0] += product(by[rate], self._Wz[:, :, rate])
         return out
 
     def load_by_rates(self, kept: np.ndarray) -> np.ndarray:
@@ -363,11 +388,16 @@ class BodyMotion:
     def rows_by_rates(self, kept: np.ndarray, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the derivatives of the rows by those e, e', e'' kept (n, q, k, 3), pushes held."""
         constants, q, count = self.constants, self.constants.num_modes, self.w.shape[1]
-        W = constants.W.reshape(-1, q * q)
-        by_z = [(x.T @ W).reshape(count, q, q) for x in (self.alpha, self.beta)]
-        by_z.append(np.broadcast_to(constants.M, (count, q, q)))
+        W, M = constants.W.reshape(-1, q, q), constants.M
         if constants.bent is None:
-            out = np.stack([x[:, :, kept] for x in by_z], axis=3)
+            W, M = W[:, :, kept], M[:, kept]
+        flat = W.reshape(len(W), -1)
+        by_z = [(x.T @ flat).reshape(count, *M.shape) for x in (self.alpha, self.beta)]
+        by_z.append(np.broadcast_to(M, (count, *M.shape)))
+        if constants.bent is None:
+            out = np.empty((count, *M.shape, 3))
+            for rate, x in enumerate(by_z):
+                out[..., rate] = x
         else:
             jets = self._by_rates(slice(len(constants.T), None), np.arange(q))
             out = _chain(by_z, [x[:, :, kept] for x in jets]).reshape(count, q, -1)
@@ -395,7 +425,7 @@ class BodyMotion:
         constants, body, zeta = self.constants, self.constants.body, multipliers
         d, ends, P = self.dim.d, self.dim.d + self.dim.g, len(constants.T)
         every = np.zeros((len(constants.by_e), 4, zeta.shape[1]))
-        every[constants.inertial, :3] = np.einsum("irpn,in->prn", self.load_by_conjugates, virtual)
+        every[constants.inertial, :3] = self._inertia_gradient(virtual)
         every[:d, 3], every[d:ends, 3] = self.a, self.alpha
         for s, one in outboard.items():
             every[constants.outboard(s)] = one
@@ -421,6 +451,15 @@ class BodyMotion:
             further_points=np.zeros_like(body.further_points),
             along_modes=bent[P:][: len(body.along_modes)].reshape(body.along_modes.shape),
         )
+
+    def _inertia_gradient(self, virtual: np.ndarray) -> np.ndarray:
+        """Return the virtual work of (F, T) by the inertial conjugates and rates (., 3, n)."""
+        dim, (u, phi) = self.dim, np.split(virtual, [self.dim.d])
+        by_first = dim.apply(dim.transposed(self.alpha), u) - dim.velocity(phi, self.a)
+        by_s = np.stack([by_first, -dim.apply(self.beta, u), u], axis=1)  # 2 Omega is skew
+        by_second = [np.einsum("rgn,rn->gn", x, phi)[None] for x in self._torques]
+        by_rest = self._by_second_rates(by_second)[0].swapaxes(0, 1)
+        return np.concatenate([by_s, by_rest])
 
     @property
     def accelerations(self) -> np.ndarray:
@@ -471,5 +510,8 @@ def _chain(by: Sequence[np.ndarray], rates: Sequence[np.ndarray]) -> np.ndarray:
         rates: V = dv/de, V', V'' (n, p, k).
     """
     (by_v, by_rate, by_second), (V, Vd, Vdd) = by, rates
-    by_e = by_v @ V + by_rate @ Vd + by_second @ Vdd
-    return np.stack([by_e, by_rate @ V + 2.0 * (by_second @ Vd), by_second @ V], axis=3)
+    out = np.empty((len(V), by_v.shape[1], V.shape[2], 3))
+    out[..., 0] = by_v @ V + by_rate @ Vd + by_second @ Vdd
+    out[..., 1] = by_rate @ V + 2.0 * (by_second @ Vd)
+    out[..., 2] = by_second @ V
+    return out

@@ -130,9 +130,11 @@ class Dimension:
         """Return the entries (g, n) of 2 Omega."""
         return product(self.spin, 2.0 * w)
 
-    def alpha_by_spin(self, w: np.ndarray) -> np.ndarray:
-        """Return the derivative of `alpha` by w (g, r, n)."""
-        return self._by_spin.matrix(w)
+    def spin_gradient(self, w: np.ndarray, by_alpha: np.ndarray, by_beta: np.ndarray) -> np.ndarray:
+        """Return derivatives (2 r, ..., n) by w and wd from those by alpha and beta (g, ..., n)."""
+        alpha_by_spin = self._by_spin.matrix(w)
+        by_w = product(alpha_by_spin.swapaxes(0, 1), by_alpha) - 2.0 * self.axial(by_beta)
+        return np.concatenate([by_w, -self.axial(by_alpha)])
 
     def axial(self, G: np.ndarray) -> np.ndarray:
         """Return `torque` (r, ..., n) of second moments with accelerations themselves."""

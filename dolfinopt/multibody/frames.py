@@ -123,13 +123,32 @@ class CarriedFrame:
         out = np.zeros((size, size, a.shape[1]))
         out[range(size), range(size)] = 1.0
         if self.is_offset:
-            out[:d, d:s] = product(dim.applied.matrix(self.place), dim.alpha_by_spin(w))
-            out[:d, s:] = dim.by_spin(self.place)
-        if self.shift_rates is not None:
-            out[:d, d:s] += 2.0 * dim.by_spin(self.shift_rates[0])
+            by_alpha, by_beta = (x.swapaxes(0, 1) for x in self._accelerated)
+            out[:d, d:] = dim.spin_gradient(w, by_alpha, by_beta).swapaxes(0, 1)
         if self.spin is not None and dim.r > 1:
             out[s:, d:s] = -dim.skew(self.spin[0])
         return by_instant(self.in_own(out))
+
+    @property
+    def _accelerated(self) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of its acceleration by alpha and beta (d, g, n), the carrier's components."""
+        by_alpha = self.dim.applied.matrix(self.place)
+        if self.shift_rates is None:
+            return by_alpha, np.zeros_like(by_alpha)
+        return by_alpha, self.dim.applied.matrix(self.shift_rates[0])
+
+    def motion_gradient(self, by: np.ndarray) -> np.ndarray:
+        """Return derivatives of a function by the carrier's motion, from those by its own.
+
+        Both are (d + 2 r, n).
+        """
+        dim, d, out = self.dim, self.dim.d, self.in_carrier(by).copy()
+        if self.spin is not None and dim.r > 1:
+            out[d : dim.b] += dim.commutator(self.spin[0], out[dim.b :])
+        if self.is_offset:
+            by_entries = (product(x.swapaxes(0, 1), out[:d]) for x in self._accelerated)
+            out[d:] += dim.spin_gradient(self.carrier[1], *by_entries)
+        return out
 
     @cached_property
     def of_loads(self) -> np.ndarray:
@@ -256,16 +275,54 @@ class Interface(CarriedFrame):
             out[d:, d:] += by_theta
         return out
 
+    # -- gradients of a function -------------------------------------------------------------
+
+    def displacement_gradient(self, by: np.ndarray) -> np.ndarray:
+        """Return derivatives (b, 3, n) by (u, theta) and its rates, from those by the motion."""
+        dim, d, turning, (a, w, wd) = self.dim, self.dim.d, self.turning, self._unturned
+        by_a, by_w, by_wd = np.split(self.in_carrier(by), [d, dim.b])
+        by_spins = np.stack([-dim.moment(a, by_a), by_w, by_wd], axis=1)
+        if dim.r > 1:
+            by_spins[:, 0] += dim.commutator(by_w, w) + dim.commutator(by_wd, wd)
+            by_spins[:, 1] += dim.commutator(by_wd, self.carrier[1])
+        by_rotation = turning.jacobian_transposed(by_spins)
+        if self.spin_by_rotation is not None:
+            of_v, of_change, of_rate = (x.swapaxes(0, 1) for x in self.spin_by_rotation)
+            by_rotation[:, 0] += product(of_v, by_w) + product(of_change, by_wd)
+            by_rotation[:, 1] += product(of_rate, by_wd)
+        # 2 Omega is skew.
+        by_place = dim.apply(dim.transposed(self.alpha), by_a), -dim.apply(self.beta, by_a), by_a
+        return np.concatenate([np.stack(by_place, axis=1), by_rotation])
+
+    def load_gradient(
+        self, load: np.ndarray, turning: np.ndarray, virtual: np.ndarray, x: np.ndarray
+    ) -> np.ndarray:
+        """Return derivatives (b, n) by (u, theta) of the virtual work of a load.
+
+        Args:
+            load, turning: as for `load_by_coordinates`.
+            virtual: displacement and rotation of the body (d + r, n).
+            x: (b, n) those of (u, theta).
+        """
+        dim, d, moved = self.dim, self.dim.d, self.virtual(virtual, x)
+        moment = dim.moment(turning[:d], moved[:d]) + dim.commutator(turning[d:], moved[d:])
+        by_rotation = self.turning.jacobian_transposed(moment)
+        by_theta = self.turning.by_theta(load[d:], -1.0)
+        if by_theta is not None:
+            by_rotation += product(by_theta.swapaxes(0, 1), x[d:])
+        return np.concatenate([-dim.velocity(virtual[d:], load[:d]), by_rotation])
+
     @cached_property
     def V(self) -> np.ndarray:
         """Derivative of (u, theta) by the body's coordinates (b, q, n)."""
         return self.body.V[self.places]
 
     @cached_property
-    def rows_by_load(self) -> np.ndarray:
-        """Derivative of the body's rows by a load in the interface's components (d + r, q, n)."""
-        V, d = self.V, self.dim.d
-        return self.in_own(np.concatenate([V[:d], self.turning.jacobian_times(V[d:])]))
+    def of_coefficients(self) -> np.ndarray:
+        """Derivative of `coefficients` by a load in the interface's components (n, b, b)."""
+        out, d = np.zeros((self.dim.b, self.dim.b, self.place.shape[1])), self.dim.d
+        out[range(d), range(d)], out[d:, d:] = 1.0, self.turning.J
+        return by_instant(self.in_own(out)).swapaxes(1, 2)
 
 
 class MovingJoint(CarriedFrame):

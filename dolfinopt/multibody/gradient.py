@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from dolfinopt.multibody.dimension import product
-from dolfinopt.multibody.frames import CarriedFrame, Interface
+from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -47,34 +47,30 @@ def body_gradient(
     moves, ends = _virtual_motion(tree, links, zeta, drives)
     by_motion: dict[int, np.ndarray] = {}
     by_rotation = _by_rotation(tree, links, moves, zeta)
+    none = np.zeros((0, len(q)))
     gradient: dict[int, ShapeIntegrals] = {}
     for i in reversed(tree.order):
         link, own, dim = links[i], zeta[tree.slices[i]], tree.dim
-        by = _motion_gradient(link.body.load_by_motion, moves[i])
-        if link.body.is_flexible:
-            by += np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
+        by = link.body.motion_gradient(moves[i], own)
         outboard: dict[int, np.ndarray] = {}
         for s, interface in link.interfaces.items():
             on_interface = np.zeros_like(by)
             for k in tree.hanging[i, s]:
-                on_interface += _carried(links[k].joint, by_motion[k])
+                on_interface += links[k].joint.motion_gradient(by_motion[k])
                 if (rotor := links[k].rotor) is not None:
-                    on_interface += _motion_gradient(rotor.load_by_motion, ends[i, s])
+                    on_interface += np.einsum("ijn,in->jn", rotor.load_by_motion, ends[i, s])
                     on_interface += rotor.force_by_motion[:, None] * drives[:, tree.rotors[k]]
             if s in link.carried:
-                on_interface += _motion_gradient(link.carried[s].load_by_motion, ends[i, s])
-            by += _carried(interface, on_interface)
+                on_interface += link.carried[s].motion_gradient(ends[i, s], none)
+            by += interface.motion_gradient(on_interface)
             if not link.body.is_flexible:
                 continue
             load, turning = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
             weights = np.empty((dim.b, 4, zeta.shape[1]))
-            weights[:, :3] = np.einsum("irbn,in->brn", interface.by_coordinates, on_interface)
+            weights[:, :3] = interface.displacement_gradient(on_interface)
             weights[:, 3] = interface.coefficients(load)
-            for by_x, work in (
-                (interface.load_by_coordinates(load, turning), moves[i]),
-                (interface.coefficients_by_coordinates(load, turning), product(interface.V, own)),
-            ):
-                weights[:, 0] += _motion_gradient(by_x, work)
+            displaced = product(interface.V, own)
+            weights[:, 0] += interface.load_gradient(load, turning, moves[i], displaced)
             if (i, s) in by_rotation:
                 weights[dim.d :, 0] += by_rotation[i, s]
             outboard[s] = weights
@@ -110,16 +106,6 @@ def _by_rotation(
                 total -= dim.commutator(given[dim.d :], moved[dim.d :])
         of_bodies[i] = total
     return found
-
-
-def _motion_gradient(by: np.ndarray, virtual: np.ndarray) -> np.ndarray:
-    """Return the derivatives (j, n) of sum_i virtual_i f_i from those of f (i, j, n)."""
-    return np.asarray(np.einsum("ijn,in->jn", by, virtual))
-
-
-def _carried(frame: CarriedFrame, by: np.ndarray) -> np.ndarray:
-    """Return derivatives (d + 2 r, n) by the carrier's motion from those by a frame's."""
-    return np.asarray(np.einsum("nij,in->jn", frame.transform, by))
 
 
 def _virtual_motion(

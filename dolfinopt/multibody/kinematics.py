@@ -175,10 +175,6 @@ class SiteMotion:
         found = product(self.R, v[:, None])
         return np.broadcast_to(found, (self.dim.d, len(self.posed.q)))
 
-    def generalised_force(self, load: np.ndarray) -> np.ndarray:
-        """Return what force and moment (d + r, n), the ground's components, do on all (n, C)."""
-        return np.asarray(np.einsum("bn,bcn->nc", load, self.by))
-
     def along(self, virtual: np.ndarray) -> np.ndarray:
         """Return displacement and rotation (d + r, n) by virtual coordinates (n, C)."""
         return np.asarray(np.einsum("bcn,nc->bn", self.by, virtual))
@@ -200,7 +196,7 @@ class SiteMotion:
         return a, wd
 
     def hessian(self, load: np.ndarray) -> np.ndarray:
-        """Return the derivative (n, C, C) of `generalised_force` by the coordinates, the load held.
+        """Return the derivative (n, C, C) of what a load does on the coordinates by these.
 
         Rows are the coordinates on which it works.
         """
@@ -335,15 +331,6 @@ def end_effector(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np
     return Posed(mechanism, motion.q, q).interface(*mechanism.way[-1])[0].T
 
 
-def deviation(mechanism: Mechanism, motion: RigidMotion, q: np.ndarray) -> np.ndarray:
-    """Return the flexible minus the equivalent rigid end-effector (n, d), m.
-
-    Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
-    """
-    rigid = end_effector(mechanism, motion, np.zeros_like(q))
-    return end_effector(mechanism, motion, q) - rigid
-
-
 def end_rotation(
     mechanism: Mechanism, motion: RigidMotion, q: np.ndarray, desired: RigidMotion
 ) -> np.ndarray:
@@ -391,7 +378,7 @@ def end_effector_gradient(
     site = SiteMotion(posed, mechanism.end, np.zeros(dim.d), np.eye(dim.d))
     load, still = np.zeros((dim.b, len(q))), np.zeros((dim.b, len(q)))
     load[: dim.d], load[dim.d :] = weights.T, 0.0 if moments is None else moments.T
-    by_all, by_bodies = site.generalised_force(load), no_gradient(mechanism)
+    by_all, by_bodies = np.einsum("bn,bcn->nc", load, site.by), no_gradient(mechanism)
     site.add_gradient(by_bodies, load, still, still, np.zeros_like(by_all))
     by_rigid, by_q = np.split(by_all, [mechanism.num_rigid], axis=1)
     return by_q, by_rigid, by_bodies

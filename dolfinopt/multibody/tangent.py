@@ -12,7 +12,6 @@ from itertools import pairwise
 import numpy as np
 
 from dolfinopt.multibody.body import by_instant
-from dolfinopt.multibody.frames import CarriedFrame
 from dolfinopt.multibody.newton_euler import (
     Link,
     carried_load,
@@ -162,11 +161,11 @@ class _Passes:
         self.kept = [keep[a:b] - part.start for (a, b), part in parts]
         self.count, rows = links[0].body.a.shape[1], len(asked) + tree.num_coordinates
         self.matrix = np.zeros((self.count, rows, 3 * len(self.order)))
-        # Of the motions of frames by all columns before their body's, of interfaces by these, too.
-        self.frames: dict[int, np.ndarray] = {}
+        # Of the motions of interfaces by all columns before their body's and by these.
         self.ends: dict[Site, np.ndarray] = {}
+        self.own: dict[int, slice] = {}  # columns of a body's coordinates
         self._outwards()
-        self.on_frames: dict[int, _LoadDerivative] = {}
+        self.on_carriers: dict[int, _LoadDerivative] = {}
         self._inwards()
 
     def _outwards(self) -> None:
@@ -179,22 +178,37 @@ class _Passes:
         for i in tree.order:
             link, joint, kept = self.links[i], tree.joints[i], self.kept[i]
             stop += 3 * sum(k in self.rows for k in {joint.coordinate, tree.rotors.get(i)})
-            frame = self._moved(link.joint, self.ends[joint.parent, joint.interface], stop)
-            if (place := self.places.get(joint.coordinate)) is not None:
-                frame[:, :, 3 * place : 3 * place + 3] = self._by_joint(i)
-            self.frames[i] = frame
-            stop += 3 * len(kept)
+            self.own[i] = slice(stop, stop + 3 * len(kept))
+            stop = self.own[i].stop
             for s, interface in link.interfaces.items():
-                end = self.ends[i, s] = self._moved(interface, frame, stop)
+                end = self.ends[i, s] = self._moved(i, interface.transform, stop)
                 if link.body.is_flexible:
                     by_own = link.body.by_rates(interface.by_coordinates, interface.places, kept)
-                    end[:, :, frame.shape[2] :] = by_own.reshape(*end.shape[:2], -1)
+                    end[:, :, self.own[i]] = by_own.reshape(*end.shape[:2], -1)
 
-    def _moved(self, frame: CarriedFrame, carrier: np.ndarray, width: int) -> np.ndarray:
-        """Return the derivatives of a frame's motion through that of its carrier."""
-        out = np.zeros((*carrier.shape[:2], width))
-        np.matmul(frame.transform, carrier, out=out[:, :, : carrier.shape[2]])
+    def _carrier(self, i: int) -> np.ndarray:
+        """Return the derivatives of the motion of what carries body i."""
+        joint = self.tree.joints[i]
+        return self.ends[joint.parent, joint.interface]
+
+    def _moved(self, i: int, left: np.ndarray, width: int) -> np.ndarray:
+        """Return matrices (n, m, .) times the derivatives of a frame's motion."""
+        out = np.zeros((self.count, left.shape[1], width))
+        self._add_moved(i, left, out, alone=True)
         return out
+
+    def _add_moved(self, i: int, left: np.ndarray, out: np.ndarray, alone: bool) -> None:
+        """Add matrices (n, m, .) times the derivatives of the motion of a body's frame."""
+        carrier = self._carrier(i)
+        by_carrier = left @ self.links[i].joint.transform
+        _add_product(by_carrier, carrier, out[:, :, : carrier.shape[2]], alone)
+        if (by_joint := self._joint_columns(i)) is not None:
+            out[:, :, by_joint] += left @ self._by_joint(i)
+
+    def _joint_columns(self, i: int) -> slice | None:
+        """Return the columns of the coordinate of a body's joint, if it is asked for."""
+        place = self.places.get(self.tree.joints[i].coordinate)
+        return None if place is None else slice(3 * place, 3 * place + 3)
 
     def _by_joint(self, i: int) -> np.ndarray:
         """Return the derivatives of a frame's motion by its joint's coordinate (n, d + 2 r, 3)."""
@@ -203,8 +217,13 @@ class _Passes:
     def _inwards(self) -> None:
         for i in reversed(self.tree.order):
             felt = len(self.rows) > 0 or self.tree.is_felt(i)
-            if felt or self.links[i].body.is_flexible:
-                self._add_body(i, felt)
+            if not (felt or self.links[i].body.is_flexible):
+                continue
+            outboard = {s: self._on_interface((i, s)) for s in self.links[i].interfaces}
+            if self.links[i].body.is_flexible:
+                self._add_rows(i, outboard)
+            if felt:
+                self.on_carriers[i] = self._on_carrier(i, outboard)
         if self.rows:
             on_ground = self._on_interface((GROUND, 0))
             if self.tree.cart is not None and 0 in self.rows:
@@ -217,99 +236,102 @@ class _Passes:
 
     def _on_interface(self, site: Site) -> _LoadDerivative:
         """Return the derivative of the load on an interface by all that is not inboard."""
-        tree, end = self.tree, self.ends[site]
+        (i, s), tree, end = site, self.tree, self.ends[site]
         first = self._first(end.shape[2])
+        hanging = [self.on_carriers[k] for k in tree.hanging[site]]
         by_motion = np.zeros((self.count, self.dim.b, end.shape[1]))
-        by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
+        by_motion += sum(one.by_motion for one in hanging)
+        if hanging:
+            by_columns = sum((one.by_columns for one in hanging[1:]), hanging[0].by_columns)
+        else:
+            by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
         for k in tree.hanging[site]:
-            joint, on_frame, rotor = self.links[k].joint, self.on_frames[k], self.links[k].rotor
-            by_motion += joint.of_loads @ (on_frame.by_motion @ joint.transform)
-            behind = by_columns[:, :, on_frame.first - first :]
-            _add_product(joint.of_loads, on_frame.by_columns, behind, len(tree.hanging[site]) == 1)
-            if (place := self.places.get(joint.joint.coordinate)) is not None:
-                load, start = joint.in_carrier(self.loads.joints[k]), 3 * place - first
-                by_joint = on_frame.by_motion @ self._by_joint(k)
-                by_columns[:, :, start : start + 3] += joint.of_loads @ by_joint
-                by_columns[:, :, start] += joint.load_by_coordinates(load, load)[:, 0].T
-            if rotor is not None:
-                by_motion += by_instant(rotor.load_by_motion)
-            if rotor is not None and (row := self.rows.get(tree.rotors[k])) is not None:
-                place = self.places[tree.rotors[k]]
-                start = 3 * place - first
-                by_columns[:, :, start : start + 3] += rotor.load_by_motor.transpose(2, 0, 1)
+            if (rotor := self.links[k].rotor) is None:
+                continue
+            by_motion += by_instant(rotor.load_by_motion)
+            if (row := self.rows.get(tree.rotors[k])) is not None:
+                place = 3 * self.places[tree.rotors[k]]
+                by_motor = rotor.load_by_motor.transpose(2, 0, 1)
+                by_columns[:, :, place - first : place - first + 3] += by_motor
                 self.matrix[:, row, : end.shape[2]] += rotor.force_by_motion @ end
-                self.matrix[:, row, 3 * place + 2] += rotor.force_by_motor
-        i, s = site
+                self.matrix[:, row, place + 2] += rotor.force_by_motor
         if i != GROUND and s in self.links[i].carried:
             by_motion += by_instant(self.links[i].carried[s].load_by_motion)
         return _LoadDerivative(by_motion, by_columns, first)
 
-    def _add_body(self, i: int, felt: bool) -> None:
-        """Add the rows of a body and of its joint's drive."""
-        link, frame = self.links[i], self.frames[i]
-        outboard = {s: self._on_interface((i, s)) for s in link.interfaces}
-        if link.body.is_flexible:
-            self._add_rows(i, outboard)
-        if felt:
-            self.on_frames[i] = self._on_frame(i, outboard)
-        if (row := self.rows.get(self.tree.joints[i].coordinate)) is not None:
-            on_frame, axis = self.on_frames[i], link.joint.drive_axis
-            by_inboard = (axis @ on_frame.by_motion)[:, None] @ frame
-            self.matrix[:, row, : frame.shape[2]] += by_inboard[:, 0]
-            self.matrix[:, row, on_frame.first :] += axis @ on_frame.by_columns
-
     def _add_rows(self, i: int, outboard: dict[int, _LoadDerivative]) -> None:
         """Add the derivative of a body's elastic rows."""
-        link, kept, part, frame = self.links[i], self.kept[i], self.tree.slices[i], self.frames[i]
-        body, loads, width = link.body, self.loads.outboard[i], frame.shape[2]
+        link, kept, part = self.links[i], self.kept[i], self.tree.slices[i]
+        body, loads, columns = link.body, self.loads.outboard[i], self.own[i]
         rows = self.matrix[:, len(self.rows) + part.start : len(self.rows) + part.stop]
-        by_rates = body.rows_by_rates(kept, interface_coefficients(link, loads))
         by_motion = by_instant(body.rows_by_motion.swapaxes(0, 1))
-        by_own = by_rates.reshape(*rows.shape[:2], -1)
+        own = body.rows_by_rates(kept, interface_coefficients(link, loads))
+        own = own.reshape(*rows.shape[:2], -1)
         for s, interface in link.interfaces.items():
-            by_load, on = by_instant(interface.rows_by_load.swapaxes(0, 1)), outboard[s]
-            by_end = by_load @ on.by_motion
-            by_motion += by_end @ interface.transform
-            by_own += by_end @ self.ends[i, s][:, :, width:]
+            V, turning, on = by_instant(interface.V), carried_load(link, loads, s), outboard[s]
+            Vt, by_end = V.swapaxes(1, 2), interface.of_coefficients @ on.by_motion
+            by_load = Vt @ interface.of_coefficients
+            by_motion += Vt @ (by_end @ interface.transform)
             _add_product(by_load, on.by_columns, rows[:, :, on.first :], len(outboard) == 1)
-            V, turning = by_instant(interface.V), carried_load(link, loads, s)
+            by_own = by_end @ self.ends[i, s][:, :, columns]
             by_displacement = interface.coefficients_by_coordinates(loads[s], turning)
-            by_own[:, :, ::3] += V.swapaxes(1, 2) @ (by_instant(by_displacement) @ V[:, :, kept])
+            by_own[:, :, ::3] += by_instant(by_displacement) @ V[:, :, kept]
+            own += Vt @ by_own
             if s in link.applied:
                 given = by_instant(interface.coefficients(_given(link, s)))
-                rows[:, :, 0:width:3] += V.swapaxes(1, 2) @ (given @ self._rotation(i))
-        _add_product(by_motion, frame, rows[:, :, :width], not self.tree.forces)
-        rows[:, :, width : width + 3 * len(kept)] += by_own
+                self._add_turned(i, Vt @ given, rows)
+        rows[:, :, columns] += own
+        self._add_moved(i, by_motion, rows, alone=not self.tree.forces)
 
-    def _on_frame(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
-        """Return the derivative of what a joint feels of the body and all behind it."""
-        link, kept, frame = self.links[i], self.kept[i], self.frames[i]
-        body, loads, width = link.body, self.loads.outboard[i], frame.shape[2]
-        first = self._first(width)
+    def _on_carrier(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
+        """Return the derivative of what a body and all behind it ask of what carries it.
+
+        The row of the joint's drive follows from the same products.
+        """
+        link, kept, own, b = self.links[i], self.kept[i], self.own[i], self.dim.b
+        body, joint, loads = link.body, link.joint, self.loads.outboard[i]
+        carrier, row = self._carrier(i), self.rows.get(joint.joint.coordinate)
+        left, first = joint.of_loads, self._first(carrier.shape[2])
+        if row is not None:
+            axis = np.broadcast_to(joint.drive_axis, (self.count, 1, b))
+            left = np.concatenate([np.broadcast_to(left, (self.count, b, b)), axis], axis=1)
         by_motion = by_instant(body.load_by_motion)
-        by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
-        by_own = np.zeros((self.count, self.dim.b, 3 * len(kept)))
+        by_own = np.zeros((self.count, b, 3 * len(kept)))
         if body.is_flexible:
             by_own = body.load_by_rates(kept).reshape(by_own.shape)
+        out = np.zeros((self.count, left.shape[1], self.matrix.shape[2] - first))
         for s, interface in link.interfaces.items():
             of_loads, on = interface.of_loads, outboard[s]
             by_motion += of_loads @ (on.by_motion @ interface.transform)
-            by_own += of_loads @ (on.by_motion @ self.ends[i, s][:, :, width:])
-            behind = by_columns[:, :, on.first - first :]
-            _add_product(of_loads, on.by_columns, behind, len(outboard) == 1)
+            by_own += of_loads @ (on.by_motion @ self.ends[i, s][:, :, own])
+            behind = out[:, :, on.first - first :]
+            _add_product(left @ of_loads, on.by_columns, behind, len(outboard) == 1)
             if body.is_flexible:
                 turning = carried_load(link, loads, s)
                 by_displacement = by_instant(interface.load_by_coordinates(loads[s], turning))
                 by_own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
             if s in link.applied:
                 given = by_instant(self.dim.shifted(interface.place, _given(link, s)))
-                by_columns[:, :, 0:width:3] += given @ self._rotation(i)
-        by_columns[:, :, width - first : width - first + 3 * len(kept)] += by_own
-        return _LoadDerivative(by_motion, by_columns, first)
+                self._add_turned(i, left @ given, out)
+        out[:, :, own.start - first : own.stop - first] += left @ by_own
+        by_motion = left @ by_motion
+        by_carrier = by_motion @ joint.transform
+        if (columns := self._joint_columns(i)) is not None:
+            by_joint = out[:, :, columns.start - first : columns.stop - first]
+            by_joint += by_motion @ self._by_joint(i)
+            load = joint.in_carrier(self.loads.joints[i])
+            if row is not None:
+                self.matrix[:, row, : carrier.shape[2]] += (by_carrier[:, b:] @ carrier)[:, 0]
+                self.matrix[:, row, first:] += out[:, b]
+            by_joint[:, :b, 0] += joint.load_by_coordinates(load, load)[:, 0].T
+        return _LoadDerivative(by_carrier[:, :b], out[:, :b], first)
 
-    def _rotation(self, i: int) -> np.ndarray:
-        """Return the derivative of a body's rotation by all coordinates inboard (n, r, .)."""
-        return self.frames[i][:, self.dim.d : self.dim.b, 1::3]  # as its spin's by their rates
+    def _add_turned(self, i: int, left: np.ndarray, out: np.ndarray) -> None:
+        """Add matrices (n, m, r) times the derivatives of a body's rotation by coordinates."""
+        # They are those of its spin by their rates.
+        spin = np.eye(self.dim.b + self.dim.r)[self.dim.d : self.dim.b]
+        turned = self._moved(i, left @ spin, self.own[i].start)
+        out[:, :, 0 : self.own[i].start : 3] += turned[:, :, 1::3]
 
 
 def _given(link: Link, s: int) -> np.ndarray:

@@ -32,7 +32,6 @@ from dolfinopt.multibody.dimension import SpaceTurning
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.kinematics import (
     Posed,
-    deviation,
     end_effector,
     end_effector_gradient,
     end_rotation,
@@ -226,16 +225,13 @@ def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
 
 @pytest.mark.serial
 def test_end_effector(machine: Machine) -> None:
-    """Its place, the deviation from the rigid machine, and derivatives by all they depend on."""
+    """Its place, its turn, and derivatives by all they depend on."""
     mechanism, rng = machine.mechanism, np.random.default_rng(9)
     motion, (q, _, _) = machine.split(machine.states)
     place = end_effector(mechanism, motion, q)
     if isinstance(machine.model, Chain):
         expected = [machine.model.frames(y)[0][-1] for y in machine.states[0]]
         assert_close(place, expected, 1e-14)
-    stiff = end_effector(mechanism, motion, 0.0 * q)
-    assert_close(deviation(mechanism, motion, q), place - stiff, 1e-14, np.abs(place).max())
-    assert not deviation(mechanism, motion, 0.0 * q).any()
     assert not end_rotation(mechanism, motion, 0.0 * q, motion).any()
     weights, turned = rng.normal(size=place.shape), end_rotation(mechanism, motion, q, motion)
     by_q, by_rigid, by_bodies = end_effector_gradient(mechanism, motion, q, weights, turned)
