@@ -545,14 +545,9 @@ WIDE = 110  # characters a line
 
 
 def _words(row: HistoryRow, iterations: int) -> str:
-    """Return a row of the history, or of the further iterations after it, in words."""
-    from dolfinopt.optimization.state import FurtherRow  # NumPy: help needs none
-
-    count, kind = iterations, ""
-    if isinstance(row, FurtherRow):
-        count, kind = row.of, "exact gradient, further "
+    """Return a row of the history in words."""
     return (
-        f"{kind}{row.iteration}/{count} objective {row.objective:.4g} "
+        f"{row.iteration}/{iterations} objective {row.objective:.4g} "
         f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
         f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
         + (f", {row.tightest}" if row.tightest else "")
@@ -599,8 +594,6 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
     from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
-    from dolfinopt.optimization.state import FurtherRow
-
     console = Console(stderr=True)
     # Eighty characters hold the figures; a bar wants more.
     columns: list[ProgressColumn] = [
@@ -613,8 +606,7 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
         task = progress.add_task("setting up", total=iterations)
 
         def show(row: HistoryRow) -> None:
-            total = row.of if isinstance(row, FurtherRow) else iterations
             words = _words(row, iterations)
-            progress.update(task, total=total, completed=row.iteration, description=words)
+            progress.update(task, completed=row.iteration, description=words)
 
         yield show

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,24 +11,14 @@ import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.optimization.certificate import (
-    Attempt,
-    Certificate,
-    FurtherRun,
-    assess,
-    certify,
-    initial_selection,
-)
+from dolfinopt.optimization.assessment import assess, initial_selection
+from dolfinopt.optimization.certificate import Certificate, certify
+from dolfinopt.optimization.conflicts import conflict_sentences
+from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.iterate import Iterate
-from dolfinopt.optimization.measured import (
-    CHECKPOINT_SECONDS,
-    LANDING_EXCESS,
-    LANDING_MOVE_FACTOR,
-    LANDING_STEPS,
-)
-from dolfinopt.optimization.problem import Evaluator, Problem, densities
-from dolfinopt.optimization.state import FurtherMemory, HistoryRow, Memory, fields_of
-from dolfinopt.optimization.stopping import Ending, conflict_sentences, stop_reason
+from dolfinopt.optimization.measured import CHECKPOINT_SECONDS, FROZEN_GAIN, FROZEN_WINDOW
+from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
+from dolfinopt.optimization.stopping import StopCode, stop_code, stop_reason
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import Limit, violated
@@ -36,6 +26,7 @@ from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.tables.objective import freezes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -58,10 +49,9 @@ class Result:
         history: one row a design, the initial one first; on the root only.
         iterations: design updates made.
         best_iteration: updates after which this design was found.
-        converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
-            within their tolerances and every constraint is met.
-        stop_reason: in words.
-        kkt: the residual of the final design by the gradient in use, see `stopping.kkt_residual`.
+        stop_code: why the iterations ended, and `stop_reason` in words.
+        kkt: the residual of the final design by the gradient in use, see `residual.kkt_residual`.
+        exact_from: iteration from which on the gradient was exact, None where it never was.
         certificate: what the exact gradient says of the final design.
         limits: every constraint and its value.
         conflicts: what holds those back that are not met, see `conflicts.conflict_sentences`.
@@ -82,9 +72,10 @@ class Result:
     history: list[HistoryRow]
     iterations: int
     best_iteration: int
-    converged: bool
+    stop_code: StopCode
     stop_reason: str
     kkt: float
+    exact_from: int | None
     certificate: Certificate
     limits: tuple[Limit, ...]
     conflicts: str
@@ -93,12 +84,14 @@ class Result:
     choice: OrderSelection | None = None
 
     @property
+    def converged(self) -> bool:
+        """Whether the iterations ended by themselves with a design that meets every limit."""
+        return self.stop_code is StopCode.SETTLED and not self.violated
+
+    @property
     def violated(self) -> str:
         """Which constraints the final design does not meet, and why; "" if it meets all."""
         return "; ".join(filter(None, [violated(self.limits), self.conflicts]))
-
-
-# -- the optimisation loop: evaluate, differentiate, update by MMA, until the design converges ---
 
 
 Report = Callable[[HistoryRow], None]
@@ -153,41 +146,45 @@ class _Run:
         self.evaluator, self.recorder, self.report = evaluator, recorder, report
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
-        one = evaluator.variables
-        x = np.clip(one.initial, one.xmin, one.xmax)
+        variables = evaluator.variables
+        x = np.clip(variables.initial, variables.xmin, variables.xmax)
         self.iterate = Iterate(evaluator, x)
         self.history: list[HistoryRow] = []  # rows so far (root only)
-        self.finished: Ending = ""  # why the iterations have ended, "" while they go on
+        self.finished: StopCode | None = None  # why the iterations have ended
+        self.exact_from: int | None = None  # iteration from which on the gradient is exact
         self.selection: OrderSelection | None = None  # of coordinates, where order is "auto"
         # (n_times, 2) of the initial design, evenly over the horizon, m (root only)
         self.initial_deviation = np.empty((0, 2))
-        self.memory: Memory | None = None  # what was saved last
-        self.further: FurtherMemory | None = None  # of iterations with the exact gradient
         self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
     def go(self, memory: Memory | None) -> Result:
-        """Iterate until the design converges or the iterations are spent."""
+        """Iterate until the design gains no more or the iterations are spent."""
         self._begin(memory)
         self._evaluate(anew=memory is None)
         if memory is None:
             self._record()
-        while not self._finished() or self._stiffens():
+        while not self._finished() or self._uses_exact_gradient() or self._stiffens():
             self.iterate.step()
             if not self.iterate.stuck:
                 self._record()
                 self._checkpoint()
         self._checkpoint(force=True)
-        self._land()
         return self._result()
 
     def _begin(self, memory: Memory | None) -> None:
         """Go on from `memory`, or choose the coordinates for the initial design (collective)."""
+        scene = self.scene
         if memory is not None:
             self._restore(memory)
-        elif needs(self.scene, "motion"):
-            initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
-            self.selection = initial_selection(self.evaluator, initial)
+        else:
+            if scene.objective.gradient == "exact" and scene.objective.has_esl_gradient:
+                self.evaluator.use_gradient("esl")
+            elif scene.objective.gradient == "exact":
+                self.exact_from = 0
+            if needs(scene, "motion"):
+                initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
+                self.selection = initial_selection(self.evaluator, initial)
         if self.recorder is not None:
             self.recorder.begin(self.history)
 
@@ -203,8 +200,36 @@ class _Run:
 
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
-        self.finished = self.iterate.ending()
-        return bool(self.finished)
+        one, options = self.iterate, self.scene.optimizer
+        last = options.max_iterations
+        if self.scene.objective.gradient == "esl" and self.exact_from is not None:
+            last = self.exact_from + options.exact_iterations
+        complete = one.projection.complete
+        self.finished = stop_code(
+            self.scene, one.iteration, last, one.progress, complete, one.stuck
+        )
+        late = self._begins_with_frozen_loads and one.progress.gain(FROZEN_WINDOW) <= FROZEN_GAIN
+        return late or self.finished is not None
+
+    @property
+    def _begins_with_frozen_loads(self) -> bool:
+        return self.scene.objective.gradient == "exact" and self.exact_from is None
+
+    def _uses_exact_gradient(self) -> bool:
+        """Go over to the exact gradient where frozen loads have done their work (collective)."""
+        # Frozen loads lead past resonances of the initial design, which the exact gradient, true
+        # as it is, does not see beyond.
+        one, options = self.iterate, self.scene.optimizer
+        more = options.exact_iterations > 0 and self.exact_from is None and freezes(self.scene)
+        if one.iteration >= options.max_iterations and not (
+            self.scene.objective.gradient == "esl" and more
+        ):
+            return False
+        if not (more or self._begins_with_frozen_loads):
+            return False
+        one.use_gradient("exact")
+        one.stuck, self.exact_from, self.finished = "", one.iteration, None
+        return True
 
     def _stiffens(self) -> bool:
         """Look again whether geometric stiffening counts, and say whether to go on (collective)."""
@@ -227,37 +252,22 @@ class _Run:
             return False
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
-    def _land(self) -> None:
-        """Take short steps where the iterations ended just beyond a limit (collective)."""
-        # The checkpoint does not know of them: a run that is resumed with more iterations goes on
-        # as if it had not ended.
-        one = self.iterate
-        if self.finished != "limit" or not one.curved:
-            return
-        one.search = replace(one.search, freedom=0, radius=LANDING_MOVE_FACTOR)
-        one.continuation.held = True
-        for _ in range(LANDING_STEPS):
-            if one.best.excess == 0.0 or one.problem.excess > LANDING_EXCESS or one.stuck:
-                return
-            one.step()
-            if not one.stuck:
-                self._record()
-
     def _result(self) -> Result:
         """Assess the best design (collective)."""
-        one, counts = self.iterate, replace(self.profile.counts)
-        made, idle, sought = one.iteration, one.idle, one.least_violated
+        one, counts, code = self.iterate, replace(self.profile.counts), self.finished
+        assert code is not None
+        iterations, stuck = one.iteration, one.stuck
         if one.return_to_best():
             one.measure()
-        certificate = certify(self.evaluator, one.x, one.nominal, one.problem, self._further)
-        if self.further is not None:
-            self._checkpoint(force=True)
+        certificate = certify(self.evaluator, one.x, one.nominal, one.problem)
         x_phys = one.nominal.x_phys
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        limits, conflicts = one.problem.limits, self._conflicts(sought)
+        limits, conflicts = one.problem.limits, self._conflicts(code)
         not_met = "; ".join(filter(None, [violated(limits), conflicts]))
+        last = one.iteration == iterations
+        returned = "" if last else f"returned: iteration {one.iteration}"
         return Result(
             partition=self.partition,
             arms=self.arms,
@@ -268,21 +278,12 @@ class _Run:
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
             history=self.history,
-            iterations=made,
+            iterations=iterations,
             best_iteration=one.iteration,
-            converged=self.finished == "converged",
-            stop_reason=stop_reason(
-                self.scene,
-                self.finished,
-                one.change,
-                one.residual.rms,
-                not_met,
-                one.grayness,
-                one.stuck,
-                idle,
-                None if one.iteration == made else one.iteration,
-            ),
+            stop_code=code,
+            stop_reason=stop_reason(self.scene, code, one.progress, not_met, stuck, returned),
             kkt=one.residual.rms,
+            exact_from=self.exact_from,
             certificate=certificate,
             limits=limits,
             conflicts=conflicts,
@@ -296,26 +297,12 @@ class _Run:
         if not self.scene.design.projection:
             return None
         x = self.evaluator.variables.split(self.iterate.x)
-        return self.evaluator.continuation.smoothed(x)
+        return self.evaluator.projection.smoothed(x)
 
-    def _further(self, problem: Problem, count: int) -> Iterator[Attempt]:
-        """Go on with the exact gradient, see `FurtherRun.iterations` (collective)."""
-        # Iterations of an interrupted run are not repeated.
-        one, memory = self.iterate, self.memory
-        done = None if memory is None else memory.further
-        run = FurtherRun(self.evaluator, one.x, one.iteration, done)
-        for attempt in run.iterations(problem, count):
-            self.further = run.memory
-            if run.row is not None:
-                self._show(run.row)
-                self._checkpoint()
-            yield attempt
-
-    def _conflicts(self, sought: bool) -> str:
+    def _conflicts(self, code: StopCode) -> str:
         """Return what holds back the limits that x does not meet (collective)."""
-        # `sought` says whether the violation was lessened as far as steps could.
         one, v = self.iterate, self.evaluator.variables
-        if not sought and one.problem.excess > 0.0:
+        if code is StopCode.ITERATIONS and one.problem.excess > 0.0:
             return "let the optimisation go on (optimizer.max_iterations)"
         return conflict_sentences(one.problem, one.x, v.xmin, v.xmax, v.slices, one.total)
 
@@ -333,12 +320,6 @@ class _Run:
                 if self.report is not None:
                     self.report(row)
 
-    def _show(self, row: HistoryRow) -> None:
-        """Report a row that is not the history's (collective)."""
-        with together(self.partition.world):
-            if self.partition.world.rank == 0 and self.report is not None:
-                self.report(replace(row, seconds=self._seconds()))
-
     def _seconds(self) -> float:
         return self.seconds_before + time.perf_counter() - self.begun
 
@@ -350,28 +331,22 @@ class _Run:
         if self.recorder is None or not self.partition.world.bcast(due, root=0):
             return
         with self.profile.phase("checkpoint"):
-            self.memory = self._memory()
-            self.recorder.save(self.memory)
+            self.recorder.save(self._memory())
         self.saved = time.perf_counter()
 
     def _memory(self) -> Memory:
-        """Return what to save; once the iterations have ended, that they have further ones."""
-        known = self.memory
-        if self.further is not None and known is not None:
-            return replace(known, further=self.further)
-        same = known is not None and known.iteration == self.iterate.iteration
+        """Return what to save."""
         return Memory(
             **fields_of(self.iterate.memory()),
             history=list(self.history),
             initial_deviation=self.initial_deviation,
-            finished=self.finished,
+            exact_from=self.exact_from,
             choice=self.selection,
             stiffening=stiffening_of(self.arms),
-            further=known.further if same and known is not None else None,
         )
 
     def _restore(self, memory: Memory) -> None:
-        self.selection, self.memory = memory.choice, memory
+        self.selection, self.exact_from = memory.choice, memory.exact_from
         for arm in self.arms.values():
             if memory.choice is not None:
                 arm.set_order(memory.choice.coordinates)

@@ -22,10 +22,10 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import LIMIT_PRICE
-from dolfinopt.optimization.mma import MMAState, Promise, initial_state, judge_step, mma_step
-from dolfinopt.optimization.problem import Stage
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
 from dolfinopt.part.folder import Forms, Saved
+from dolfinopt.part.merit import judge_step, merit
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without
@@ -790,19 +790,19 @@ class Search:
         slopes = self.problem.slopes(self.state)
         self.state = self.state.released  # for the matrices of those that are tried
         before = self.state
-        stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
+        price = LIMIT_PRICE * (abs(before.values[0]) or 1.0)
         room = {k: one.room() for k, one in before.outlines.items()}
         while self.radius >= LEAST_RADIUS:
-            x, after = self._proposed(slopes, stage, room)
+            x, after = self._proposed(slopes, price, room)
             tried = self._tried(x, room)
             if tried is None:
                 self.radius *= 0.5
                 continue
-            promised = Promise(before.values + slopes @ (x - self.x), 0.0)
-            after_it = tried.against(before.held)
-            verdict = judge_step(stage, before.values, after_it, promised, exact=True)
-            self.radius = min(1.0, verdict.factor * self.radius)
-            if verdict.accepted:
+            promised = before.values + slopes @ (x - self.x)
+            values = before.values, tried.against(before.held), promised
+            accepted, factor = judge_step(*(merit(one, price) for one in values))
+            self.radius = min(1.0, factor * self.radius)
+            if accepted:
                 self.x, self.mma, self.state = x, after, tried
                 self.passed.append(dict(tried.outlines))
                 self.morphed += 1
@@ -829,7 +829,7 @@ class Search:
     def _proposed(
         self,
         slopes: np.ndarray,
-        stage: Stage,
+        price: float,
         room: Mapping[int, tuple[np.ndarray, np.ndarray]],
     ) -> tuple[np.ndarray, MMAState]:
         low, high = [], []
@@ -848,7 +848,7 @@ class Search:
             self.mma,
             move=1.0,
             widest=WIDEST,
-            prices=np.full(len(values) - 1, stage.price),
+            prices=np.full(len(values) - 1, price),
         )
 
     def _tried(

@@ -15,7 +15,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.density.contacts import contacts_of
 from dolfinopt.optimization.certificate import _crisp
-from dolfinopt.optimization.problem import Evaluator
+from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.output.summary import _contact_warnings
 
 WORLD = MPI.COMM_WORLD

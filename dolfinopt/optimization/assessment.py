@@ -1,0 +1,119 @@
+"""What is still to be known of an optimised design when the iterations have ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.arms.arm import uniform_design
+from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.work import counted
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, CRISP_NEWTON_ITERATIONS
+from dolfinopt.parallel import together
+from dolfinopt.responses.evaluation import Evaluation
+from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
+from dolfinopt.responses.response import needs
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """The final design with its motion, as `Result` has it.
+
+    Attributes:
+        evaluation: of the design, with the motion.
+        crisp: of the design cut at x_phys = 1/2 without what hangs on it by contacts alone, see
+            `Contacts.kept`; None without a projection, or where the interfaces do not hang together
+            or the motion of what is left cannot be simulated.
+        initial: trajectory of the uniform initial design where the iterations had no motion.
+        selection: of the coordinates, with the error that they make of this design's motion.
+    """
+
+    evaluation: Evaluation
+    crisp: Evaluation | None
+    initial: Trajectory | None
+    selection: OrderSelection | None
+
+
+def initial_selection(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]
+) -> OrderSelection | None:
+    """Choose the coordinates by the initial design, where the scene says "auto" (collective)."""
+    return _choose(evaluator, x_phys, COORDINATE_RESERVE_FACTOR)
+
+
+def assess(
+    evaluator: Evaluator,
+    x_phys: Mapping[int, np.ndarray],
+    evaluation: Evaluation,
+    selection: OrderSelection | None,
+) -> Assessment:
+    """Evaluate what the iterations left out: motions not simulated, and the crisp design.
+
+    Collective; the arms, and `evaluator.trajectory`, are those of the design afterwards.
+
+    Args:
+        evaluator: of the iterations.
+        x_phys, evaluation: of the final design.
+        selection: of the coordinates so far.
+    """
+    scene, arms = evaluator.scene, evaluator.arms
+    moves = needs(scene, "motion")
+    if not moves:
+        selection = _choose(evaluator, x_phys, 1.0)
+    elif selection is not None:
+        selection = replace(selection, error=_selection_error(evaluator, x_phys, selection))
+    # A followed mode is known by those before it: the initial and the crisp design's are not.
+    vectors = {k: arm.initial_vectors for k, arm in arms.items()}
+    initial = crisp = None
+    if not moves:
+        uniform = uniform_design(scene, evaluator.partition, arms)
+        evaluator.evaluate_densities(uniform, simulated=True)
+        initial = evaluator.trajectory
+    if scene.design.projection:
+        crisp = _crisp(evaluator, x_phys)
+    if scene.design.projection or not moves:
+        for k, arm in arms.items():
+            arm.initial_vectors = vectors[k]
+        evaluation = evaluator.evaluate_densities(x_phys, simulated=True)
+    return Assessment(evaluation, crisp, initial, selection)
+
+
+def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+    """Return the evaluation of the design cut at 1/2, contacts opened; None if it falls apart."""
+    # The same on all ranks.
+    arms, trajectory = evaluator.arms, evaluator.trajectory
+    with together(evaluator.partition.world):
+        found = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
+    whole = all(one.joins for one in found.values())
+    if not evaluator.partition.world.allreduce(whole, MPI.MIN):
+        return None
+    cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
+    steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
+    with suppress(ConvergenceError), counted(CRISP_NEWTON_ITERATIONS * steps):
+        return evaluator.evaluate_densities(cut, simulated=True)
+    return None
+
+
+def _choose(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray], reserve: float
+) -> OrderSelection | None:
+    one = evaluator
+    return choose_coordinates(
+        one.scene, one.partition, one.arms, x_phys, one.profile, reserve=reserve
+    )
+
+
+def _selection_error(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray], selection: OrderSelection
+) -> float:
+    place = evaluator.scene, evaluator.partition, evaluator.arms
+    try:
+        return estimated_error(*place, x_phys, selection.coordinates, evaluator.profile)
+    except ConvergenceError:  # of the richer motion; the design is not lost for it
+        return np.inf
