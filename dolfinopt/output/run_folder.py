@@ -59,8 +59,8 @@ class Simulated:
         counts: this rank's, where not all of the profile's belong to the run.
         crisp: evaluation of the design cut at one half.
         x_filtered: what `x_phys` was projected from, see `Result`.
-        iterations, best_iteration, converged, stop_reason, kkt: of the optimisation: after which
-            the design was found; kkt is its residual.
+        iterations, best_iteration, converged, stop_code, stop_reason, exact_from, kkt: of the
+            optimisation, see `Result`.
         certificate: of the optimised design.
         limits: the constraints; by default those of `evaluation` and `x_phys`.
         initial_deviation: (n, 2) m, of the initial design, kept for the picture.
@@ -80,7 +80,9 @@ class Simulated:
     iterations: int = 0
     best_iteration: int = 0
     converged: bool = True
+    stop_code: str = "simulated"
     stop_reason: str = "simulated"
+    exact_from: int | None = None
     kkt: float | None = None
     certificate: Certificate | None = None
     limits: Sequence[Limit] | None = None
@@ -171,7 +173,9 @@ def write_result(
         iterations=result.iterations,
         best_iteration=result.best_iteration,
         converged=result.converged,
+        stop_code=result.stop_code.value,
         stop_reason=result.stop_reason,
+        exact_from=result.exact_from,
         kkt=result.kkt if np.isfinite(result.kkt) else None,
         certificate=result.certificate,
         limits=result.limits,

@@ -76,7 +76,6 @@ CERTIFICATE_UNITS = {
     "kkt": "-",
     "gradient_angle": "degree",
     "gradient_ratio": "-",
-    "excess": "-",
     "seconds": "s",
 }
 
@@ -142,7 +141,9 @@ def summarise(
             "iterations": run.iterations,
             "best_iteration": run.best_iteration,
             "converged": run.converged,
+            "stop_code": run.stop_code,
             "stop_reason": run.stop_reason,
+            "exact_from": run.exact_from,
             "kkt": run.kkt,
             "certificate": None if run.certificate is None else run.certificate.to_dict(),
             **cost,
