@@ -4,24 +4,36 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
-from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.optimization.assessment import assess, initial_selection
-from dolfinopt.optimization.certificate import Certificate, certify
+from dolfinopt.optimization.assessment import (
+    assess,
+    evaluated_beside,
+    initial_selection,
+    solid_limits,
+    solid_sentence,
+    straight_bars,
+)
+from dolfinopt.optimization.certificate import certify
 from dolfinopt.optimization.conflicts import conflict_sentences
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.iterate import Iterate
-from dolfinopt.optimization.measured import CHECKPOINT_SECONDS, FROZEN_GAIN, FROZEN_WINDOW
+from dolfinopt.optimization.measured import (
+    CHECKPOINT_SECONDS,
+    COMPARED_ITERATIONS,
+    FROZEN_GAIN,
+    FROZEN_WINDOW,
+)
+from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
-from dolfinopt.optimization.stopping import StopCode, stop_code, stop_reason
+from dolfinopt.optimization.stopping import StopCode, ending, stop_code
 from dolfinopt.parallel import Partition, together
-from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.constraints import Limit, violated
+from dolfinopt.profiling import Profile
+from dolfinopt.progress import log
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
@@ -30,68 +42,6 @@ from dolfinopt.scene.tables.objective import freezes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """An optimised design.
-
-    Attributes:
-        partition, arms: which ranks did what, and this rank's arms with the final design reduced.
-        x_phys: physical densities (n_cells,) of this rank's arms.
-        x_filtered: (n_cells,) what they were projected from, smooth from cell to cell; None without
-            a projection.
-        evaluation: of the final design.
-        trajectory: of the final design; on the root only.
-        crisp: evaluation of the final design cut at x_phys = 1/2; None without a projection.
-        initial_deviation: (n, 2) of the initial design, evenly over the horizon, m; on the root
-            only.
-        history: one row a design, the initial one first; on the root only.
-        iterations: design updates made.
-        best_iteration: updates after which this design was found.
-        stop_code: why the iterations ended, and `stop_reason` in words.
-        kkt: the residual of the final design by the gradient in use, see `residual.kkt_residual`.
-        exact_from: iteration from which on the gradient was exact, None where it never was.
-        certificate: what the exact gradient says of the final design.
-        limits: every constraint and its value.
-        conflicts: what holds those back that are not met, see `conflicts.conflict_sentences`.
-        profile: seconds and counts of this rank.
-        counts: those of the iterations alone, on this rank.
-        choice: of the coordinates, and the error that they make of the final design's motion;
-            None where the scene states a number.
-    """
-
-    partition: Partition
-    arms: Mapping[int, Arm]
-    x_phys: Mapping[int, np.ndarray]
-    x_filtered: Mapping[int, np.ndarray] | None
-    evaluation: Evaluation
-    crisp: Evaluation | None
-    trajectory: Trajectory | None
-    initial_deviation: np.ndarray
-    history: list[HistoryRow]
-    iterations: int
-    best_iteration: int
-    stop_code: StopCode
-    stop_reason: str
-    kkt: float
-    exact_from: int | None
-    certificate: Certificate
-    limits: tuple[Limit, ...]
-    conflicts: str
-    profile: Profile
-    counts: Counts
-    choice: OrderSelection | None = None
-
-    @property
-    def converged(self) -> bool:
-        """Whether the iterations ended by themselves with a design that meets every limit."""
-        return self.stop_code is StopCode.SETTLED and not self.violated
-
-    @property
-    def violated(self) -> str:
-        """Which constraints the final design does not meet, and why; "" if it meets all."""
-        return "; ".join(filter(None, [violated(self.limits), self.conflicts]))
 
 
 Report = Callable[[HistoryRow], None]
@@ -119,7 +69,8 @@ def run(
     memory: Memory | None = None,
     recorder: Recorder | None = None,
     report: Report | None = None,
-) -> Result:
+    compared: bool = False,
+) -> RankResult:
     """Optimise the scene's arms (collective).
 
     An iteration: filter -> reduce -> simulate -> load cases -> gradient -> MMA.
@@ -130,11 +81,15 @@ def run(
         memory: of a run that goes on.
         recorder: keeps history and memory.
         report: called on the root with every row of the history.
+        compared: look at solid arms before, and at bars of the same mass after the iterations,
+            where these are many enough for it to cost at most a twentieth.
 
     Raises:
         ConvergenceError: a simulation failed.
     """
-    return _Run(Evaluator(scene, partition, arms, profile), recorder, report).go(memory)
+    run_ = _Run(Evaluator(scene, partition, arms, profile), recorder, report)
+    run_.compared = compared and scene.optimizer.max_iterations >= COMPARED_ITERATIONS
+    return run_.go(memory)
 
 
 class _Run:
@@ -155,15 +110,17 @@ class _Run:
         self.selection: OrderSelection | None = None  # of coordinates, where order is "auto"
         # (n_times, 2) of the initial design, evenly over the horizon, m (root only)
         self.initial_deviation = np.empty((0, 2))
+        self.compared = False  # whether to look at solid arms and bars
         self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
-    def go(self, memory: Memory | None) -> Result:
+    def go(self, memory: Memory | None) -> RankResult:
         """Iterate until the design gains no more or the iterations are spent."""
         self._begin(memory)
         self._evaluate(anew=memory is None)
         if memory is None:
             self._record()
+            self._look_at_solid_arms()
         while not self._finished() or self._uses_exact_gradient() or self._stiffens():
             self.iterate.step()
             if not self.iterate.stuck:
@@ -197,6 +154,23 @@ class _Run:
         trajectory = self.evaluator.trajectory
         if trajectory is not None and len(self.initial_deviation) == 0:
             self.initial_deviation = trajectory.deviation
+
+    def _look_at_solid_arms(self) -> None:
+        """Tell what solid arms make of the limits (collective)."""
+        if not self.compared:
+            return
+        with self.profile.phase("comparison"):
+            limits = solid_limits(self.evaluator)
+        if limits and self.partition.world.rank == 0:
+            log.info(solid_sentence(limits))
+
+    def _bars(self, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+        """Evaluate straight solid bars of the same mass (collective)."""
+        if not self.compared or self.iterate.iteration < COMPARED_ITERATIONS:
+            return None
+        bars = straight_bars(self.evaluator, x_phys)
+        with self.profile.phase("comparison"):
+            return None if bars is None else evaluated_beside(self.evaluator, bars)
 
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
@@ -252,7 +226,7 @@ class _Run:
             return False
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
-    def _result(self) -> Result:
+    def _result(self) -> RankResult:
         """Assess the best design (collective)."""
         one, counts, code = self.iterate, replace(self.profile.counts), self.finished
         assert code is not None
@@ -264,11 +238,12 @@ class _Run:
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        limits, conflicts = one.problem.limits, self._conflicts(code)
-        not_met = "; ".join(filter(None, [violated(limits), conflicts]))
+        conflicts = self._conflicts(code)
         last = one.iteration == iterations
         returned = "" if last else f"returned: iteration {one.iteration}"
-        return Result(
+        kept = one.problem.excess == 0.0
+        return RankResult(
+            scene=self.scene,
             partition=self.partition,
             arms=self.arms,
             x_phys=x_phys,
@@ -277,19 +252,20 @@ class _Run:
             crisp=final.crisp,
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
-            history=self.history,
+            rows=self.history,
             iterations=iterations,
             best_iteration=one.iteration,
             stop_code=code,
-            stop_reason=stop_reason(self.scene, code, one.progress, not_met, stuck, returned),
+            ending=ending(self.scene, code, one.progress, kept, stuck, returned),
             kkt=one.residual.rms,
             exact_from=self.exact_from,
             certificate=certificate,
-            limits=limits,
+            limits=one.problem.limits,
             conflicts=conflicts,
             profile=self.profile,
             counts=counts,
             choice=final.selection,
+            bars=self._bars(x_phys),
         )
 
     def _filtered(self) -> dict[int, np.ndarray] | None:

@@ -67,6 +67,8 @@ COORDINATE_RESERVE_FACTOR = 3.0
 # to 44.
 CRISP_NEWTON_ITERATIONS = 400.0
 
+COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a twentieth
+
 # -- Taylor tests (gradient_check) --
 
 STEP_RATIO = 4.0  # of one step to the next: remainders of second order fall by 16

@@ -208,6 +208,6 @@ class Memory(IterateMemory):
     stiffening: Stiffening | None = None
 
 
-def fields_of(one: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as they are, by their names."""
-    return {field.name: getattr(one, field.name) for field in fields(one)}
+def fields_of(one: Any, kind: type | None = None) -> dict[str, Any]:
+    """Return the fields of a dataclass, or those of one that it derives from, by their names."""
+    return {field.name: getattr(one, field.name) for field in fields(kind or one)}

@@ -10,13 +10,13 @@ from dolfinopt.optimization.measured import (
     WINDOW,
 )
 from dolfinopt.optimization.state import Progress
-from dolfinopt.progress import NOT_MET
 from dolfinopt.scene.load import Scene
 
 
 class StopCode(Enum):
     """Why the iterations ended; the values stand in summary.json."""
 
+    SIMULATED = "simulated"  # there were none
     SETTLED = "settled"  # the best design gains no more
     INFEASIBLE = "infeasible"  # no design keeps the limits, and the violation falls no more
     STUCK = "stuck"  # no step from the last design has a motion
@@ -51,15 +51,15 @@ def stop_code(
     return StopCode.ITERATIONS if iteration >= last else None
 
 
-def stop_reason(
-    scene: Scene, code: StopCode, progress: Progress, not_met: str, stuck: str, returned: str
+def ending(
+    scene: Scene, code: StopCode, progress: Progress, kept: bool, stuck: str, returned: str
 ) -> str:
-    """Say in words why the iterations ended, and which limits are not met.
+    """Say in words why the iterations ended.
 
     Args:
         scene, progress, stuck: as for `stop_code`.
         code: what that returned.
-        not_met: the limits that the design does not meet, and what conflicts with them.
+        kept: whether the design meets all limits.
         returned: which design is returned, "" for the last one.
     """
     tolerance, options = 100.0 * scene.optimizer.tolerance, scene.optimizer
@@ -71,10 +71,6 @@ def stop_reason(
         StopCode.STUCK: f"stopped: no step leads on ({stuck})",
         StopCode.ITERATIONS: f"stopped after optimizer.max_iterations = {options.max_iterations}",
     }[code]
-    if code is StopCode.ITERATIONS and not not_met and gain < 100.0:
+    if code is StopCode.ITERATIONS and kept and gain < 100.0:
         reason += f", {gain:.2g} % gained in the last {WINDOW}"
-    if returned:
-        reason += f"; {returned}"
-    if not_met:
-        reason += f"{NOT_MET}{not_met}"
-    return reason
+    return f"{reason}; {returned}" if returned else reason

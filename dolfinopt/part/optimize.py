@@ -54,7 +54,6 @@ WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
 TRIALS = 30  # struts of an arm that are left out in trial, at most
 GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
-ENDED = " iterations"  # what the ending says of a search that was not allowed more
 PRUNINGS = 3  # times that struts are left out from one start
 ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
 
@@ -301,7 +300,7 @@ class Descent:
             ending = self._searched()
             found, limits = self._judged(start, ending)
             kept = all(one.met for one in limits)
-            if self.done >= self.iterations or (kept and not ending.endswith(ENDED)):
+            if self.done >= self.iterations or (kept and not self.search.spent):
                 break
             self._tighten(limits)
         self._keep(ending)
@@ -738,6 +737,7 @@ class Search:
         self.x = np.zeros(0)
         self.mma: MMAState = initial_state(self.x)
         self.falls: list[float] = []
+        self.spent = False  # whether no more iterations were allowed
         self._begin()
 
     def _begin(self) -> None:
@@ -749,6 +749,7 @@ class Search:
 
     def run(self, iterations: int, tell: Tell, first: int) -> str:
         """Take so many steps at most; return why the search ended."""
+        self.spent = False
         while self.steps < iterations:
             if not self._step():
                 return "no step betters the parts"
@@ -757,7 +758,8 @@ class Search:
             tell(self._line(first + self.steps))
             if self._settled():
                 return "settled"
-        return f"{first + iterations}{ENDED}"
+        self.spent = True
+        return f"{first + iterations} iterations"
 
     def _keep(self) -> None:
         if self.state.rank < self.best.rank:

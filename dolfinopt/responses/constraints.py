@@ -10,6 +10,7 @@ import numpy as np
 
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.motion.build import rests
+from dolfinopt.progress import shown, with_unit
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.response import constraints_of, find_limited, objective_of
@@ -68,6 +69,19 @@ class Limit:
     def words(self) -> str:
         """E.g. "first frequency of arm2"."""
         return self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
+
+    @property
+    def of_mass(self) -> bool:
+        """Whether it limits how much material there is."""
+        return find_limited(self.quantity).of_nominal
+
+    @property
+    def usage(self) -> str:
+        """E.g. "deviation 5.3 of 8 mm: 66 %"; of a lower limit the limit's share of the value."""
+        (value, limit), unit = shown((self.value, self.limit), self.unit)
+        of = "of at least" if self.least else "of"
+        share = 100.0 * (1.0 + self.excess) if not self.least else 100.0 * self.limit / self.value
+        return with_unit(f"{self.words} {value:.3g} {of} {limit:.4g}", unit) + f": {share:.0f} %"
 
     @property
     def bound(self) -> str:

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import filled, mesh_size, solid_mesh
-from dolfinopt.part.part import DEFAULTS, GRAY, Curves
+from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.surface import (
@@ -196,7 +197,7 @@ class SolidPart:
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
         one, found = self.domain, []
-        if one.grayness > GRAY:
+        if one.grayness > GREY:
             found.append(
                 f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
                 "the material is in cells that are neither solid nor void; the part is another "
