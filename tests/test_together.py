@@ -19,8 +19,9 @@ from dolfinopt.fem import elasticity, elements
 from dolfinopt.fem.elements import IncompatibleElement
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import checkpoint, design, run_folder, summary
-from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
+from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
@@ -184,13 +185,13 @@ def resuming(folder):
 def writing(folder):
     built = build(*COARSE)
     x = built.uniform()
-    simulated = Simulated(*built.place, x, *built.evaluate(x), built.profile)
-    return lambda: write_simulation(folder, simulated, 1.0)
+    simulated = simulation_result(*built.place, x, *built.evaluate(x), built.profile)
+    return lambda: write_result(folder, simulated, 1.0)
 
 
 def writing_designs(folder):
     result = do.optimize(coarse(), world=COMM)
-    return lambda: write_result(coarse(), folder, result, 1.0)
+    return lambda: write_result(folder, result, 1.0)
 
 
 def writing_gradients(folder):

@@ -194,7 +194,7 @@ def draw(
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.design import designed
-    from dolfinopt.plots.curves import deviation_of, drives_figure, history_of
+    from dolfinopt.plots.curves import deviation_of, drives_figure, history_of, limits_figure
     from dolfinopt.plots.design import design_figure, stress_figure
     from dolfinopt.plots.machine import machine_figure
     from dolfinopt.plots.style import save
@@ -208,6 +208,8 @@ def draw(
     save(machine_figure(views, trajectory, title), folder / "machine.png")
     if history:
         save(history_of(scene, history), folder / "history.png")
+        if (limits := limits_figure(scene, history)) is not None:
+            save(limits, folder / "limits.png")
     if not scene.is_pinned:
         save(deviation_of(trajectory, initial), folder / "deviation.png")
     if trajectory.is_machine:

@@ -289,7 +289,14 @@ class _Run:
         row = self.iterate.measure()
         with together(self.partition.world):
             if self.partition.world.rank == 0:
-                row = replace(row, seconds=self._seconds())
+                problem, residual = self.iterate.problem, self.iterate.residual
+                first = self.history[0].objective if self.history else row.objective
+                row = replace(
+                    row,
+                    seconds=self._seconds(),
+                    merit=problem.merit(abs(first) or 1.0),
+                    multipliers=problem.by_limit(residual.scale * residual.multipliers),
+                )
                 self.history.append(row)
                 if self.recorder is not None:
                     self.recorder.append(row)

@@ -73,6 +73,11 @@ class Problem:
         """Largest relative violation of a limit by its true value; 0 where all are met."""
         return max((0.0 if one.met else one.excess for one in self.limits), default=0.0)
 
+    def by_limit(self, of_rows: np.ndarray) -> dict[str, float]:
+        """Return sums of (m,) numbers of the rows by the names of the limits that they share."""
+        sums = np.bincount(self.rows, of_rows, minlength=len(self.limits))
+        return {one.name: float(x) for one, x in zip(self.limits, sums, strict=True)}
+
     def merit(self, size: float) -> float:
         """Return f0 / size + 10 sum of excesses, of the limits' true values."""
         over = sum(one.excess for one in self.limits if not one.met)

@@ -26,11 +26,13 @@ class Residual:
         rms: root mean square over the variables that can move.
         largest: of any of them, over the largest of the objective's gradient.
         multipliers: (m,) of the constraints, for the objective scaled to a root mean square of 1.
+        scale: that root mean square of its gradient, by which they are in the objective's unit.
     """
 
     rms: float
     largest: float
     multipliers: np.ndarray
+    scale: float = 0.0
 
     @classmethod
     def unknown(cls) -> Residual:
@@ -95,7 +97,7 @@ def kkt_residual(
         return Residual(0.0, 0.0, np.zeros(f.size))
     if not np.isfinite(square):
         return Residual(np.inf, np.inf, np.zeros(f.size))
-    scale = np.sqrt(square / count)
+    scale = float(np.sqrt(square / count))
     g0 = g0 / scale
     slack = np.maximum(-f, 0.0)
     best, inside = Residual(np.inf, np.inf, np.zeros(f.size)), roomy
@@ -111,11 +113,11 @@ def kkt_residual(
         sums = added(step**2, np.where(movable, g0, 0.0) ** 2, movable)
         own = float(sums[0] + ((found * slack) ** 2).sum() / max(1.0, sums[2]))
         if own == 0.0:
-            return Residual(0.0, 0.0, found)
+            return Residual(0.0, 0.0, found, scale)
         rms = np.sqrt(own / sums[1]) if sums[1] > 0.0 else np.inf
         if rms < best.rms:
             most = largest(np.where(movable, g0, 0.0)) or 1.0
-            best = Residual(float(rms), largest(step) / most, found)
+            best = Residual(float(rms), largest(step) / most, found, scale)
         changed = added(moving != inside)
         if changed[0] == 0 or f.size == 0:
             break

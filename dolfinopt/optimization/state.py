@@ -13,6 +13,8 @@ from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 
+MULTIPLIER = "multiplier_"  # begins the columns of multipliers
+
 
 @dataclass(frozen=True)
 class HistoryRow:
@@ -27,7 +29,10 @@ class HistoryRow:
         change: largest change of a design variable in the update that led here.
         seconds: wall-clock time since the run's beginning, earlier parts included.
         kkt: Karush-Kuhn-Tucker residual of this design, see `residual.kkt_residual`.
+        merit: objective over that of the initial design, and ten times the limits' excesses.
         constraints: value of every constraint, by its name, see `constraints.Limit`.
+        multipliers: of every constraint by its name: by how much the objective betters, to first
+            order, for each 100 % by which the limit is eased.
         tightest: how far limits are kept, in words; of the live line, not kept in history.csv.
     """
 
@@ -39,28 +44,37 @@ class HistoryRow:
     change: float
     seconds: float
     kkt: float = np.nan
+    merit: float = np.nan
     constraints: Mapping[str, float] = field(default_factory=dict)
+    multipliers: Mapping[str, float] = field(default_factory=dict)
     tightest: str = field(default="", compare=False, repr=False)
 
     @property
     def columns(self) -> list[str]:
         """Names of `values`, the header of history.csv."""
-        return [f.name for f in fields(self)][:-2] + list(self.constraints)
+        own = [f.name for f in fields(self)][:-3]
+        return own + list(self.constraints) + [f"{MULTIPLIER}{one}" for one in self.multipliers]
 
     @property
     def values(self) -> list[float]:
         """The row of history.csv."""
-        return [*astuple(self)[:-2], *self.constraints.values()]
+        own = astuple(self)[:-3]
+        return [*own, *self.constraints.values(), *self.multipliers.values()]
 
     @classmethod
     def from_values(cls, columns: Sequence[str], values: Sequence[float]) -> HistoryRow:
         """Return the row of which `columns` and `values` are."""
-        own = len(fields(cls)) - 2
-        pairs = zip(columns[own:], map(float, values[own:]), strict=True)
-        iteration, *figures = values[:own]
+        known = [f.name for f in fields(cls)][:-3]
+        figures = dict(zip(columns, map(float, values), strict=True))
+        own = {name: figures.pop(name) for name in known if name in figures}
+        size = len(MULTIPLIER)
         # Columns by name: one by one they would hide what mypy can check.
-        named = dict(zip(columns[1:own], map(float, figures), strict=True))
-        return cls(iteration=int(iteration), constraints=dict(pairs), **named)  # type: ignore[arg-type]
+        return cls(
+            iteration=int(own.pop("iteration")),
+            constraints={k: x for k, x in figures.items() if not k.startswith(MULTIPLIER)},
+            multipliers={k[size:]: x for k, x in figures.items() if k.startswith(MULTIPLIER)},
+            **own,  # type: ignore[arg-type]
+        )
 
 
 # -- what an optimisation must remember to go on as if it had never been interrupted -------------

@@ -87,6 +87,7 @@ HISTORY_UNITS = {
     "change": "-",
     "seconds": "s",
     "kkt": "-",
+    "merit": "-",
 }
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
@@ -464,7 +465,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
         parts = {one.name: one.parts(scene.dimension) for one in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
         units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
-    units["history.csv"] = {"objective": unit, **HISTORY_UNITS}
+    units["history.csv"] = {"objective": unit, **HISTORY_UNITS, "multipliers": unit}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)
     return units

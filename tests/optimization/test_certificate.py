@@ -304,6 +304,7 @@ def test_interrupted_iterations_with_the_exact_gradient_go_on(shared_tmp_path, m
 
 def test_summary_and_screen(shared_tmp_path):
     words = overrides(*QUICK, LIGHT, "optimizer.max_iterations=1", "optimizer.exact_iterations=2")
+    words = [*words, "--verbose"]
     if WORLD.size > 1:
         run("optimize", TWO_ARM, *words, "--no-plots", "--out", shared_tmp_path / "out")
         return
@@ -311,7 +312,7 @@ def test_summary_and_screen(shared_tmp_path):
     assert done.returncode == 0, done.stderr
     summary = summary_of(shared_tmp_path / "out")
     found = summary["certificate"]
-    assert f"certificate: {found['sentence']}\n" in done.stdout
+    assert f"  {found['sentence']}\n" in done.stdout
     assert found["feasible"] and found["missing"] == "" and summary["iterations"] == 3
     assert 0.0 < found["kkt"] < 10.0 and summary["exact_from"] == 1
     assert summary["units"]["certificate"]["gradient_angle"] == "degree"

@@ -260,7 +260,7 @@ def test_any_number_of_ranks():
 def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
     monkeypatch.setattr(certificate, "estimated_error", lambda *_: 0.02)
     scene = small(iterations=1)
-    written = write_result(scene, shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
+    written = write_result(shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
     if written is not None:
         assert written.summary["reduction"]["error_estimate"] == 0.02
         (warning,) = (w for w in written.summary["warnings"] if "filter" not in w)
