@@ -164,7 +164,7 @@ class _Run:
         self._evaluate(anew=memory is None)
         if memory is None:
             self._record()
-        while not self._finished() or self._uses_exact_gradient() or self._stiffens():
+        while not self._finished() or self._goes_on():
             self.iterate.step()
             if not self.iterate.stuck:
                 self._record()
@@ -204,9 +204,8 @@ class _Run:
         last = options.max_iterations
         if self.scene.objective.gradient == "esl" and self.exact_from is not None:
             last = self.exact_from + options.exact_iterations
-        complete = one.projection.complete
         self.finished = stop_code(
-            self.scene, one.iteration, last, one.progress, complete, one.stuck
+            self.scene, one.iteration, last, one.progress, one.best, one.stuck
         )
         late = self._begins_with_frozen_loads and one.progress.gain(FROZEN_WINDOW) <= FROZEN_GAIN
         return late or self.finished is not None
@@ -214,6 +213,12 @@ class _Run:
     @property
     def _begins_with_frozen_loads(self) -> bool:
         return self.scene.objective.gradient == "exact" and self.exact_from is None
+
+    def _goes_on(self) -> bool:
+        """Look for what is still to be done where nothing is gained any more (collective)."""
+        if self.finished in (StopCode.SETTLED, StopCode.STUCK) and self.iterate.begin_again():
+            return True
+        return self._uses_exact_gradient() or self._stiffens()
 
     def _uses_exact_gradient(self) -> bool:
         """Go over to the exact gradient where frozen loads have done their work (collective)."""
@@ -256,7 +261,6 @@ class _Run:
         """Assess the best design (collective)."""
         one, counts, code = self.iterate, replace(self.profile.counts), self.finished
         assert code is not None
-        iterations, stuck = one.iteration, one.stuck
         if one.return_to_best():
             one.measure()
         certificate = certify(self.evaluator, one.x, one.nominal, one.problem)
@@ -266,8 +270,8 @@ class _Run:
             self.initial_deviation = final.initial.deviation
         limits, conflicts = one.problem.limits, self._conflicts(code)
         not_met = "; ".join(filter(None, [violated(limits), conflicts]))
-        last = one.iteration == iterations
-        returned = "" if last else f"returned: iteration {one.iteration}"
+        best = one.best.iteration
+        returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"
         return Result(
             partition=self.partition,
             arms=self.arms,
@@ -278,10 +282,10 @@ class _Run:
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
             history=self.history,
-            iterations=iterations,
-            best_iteration=one.iteration,
+            iterations=one.iteration,
+            best_iteration=best if best >= 0 else one.iteration,
             stop_code=code,
-            stop_reason=stop_reason(self.scene, code, one.progress, not_met, stuck, returned),
+            stop_reason=stop_reason(self.scene, code, one.progress, not_met, one.stuck, returned),
             kkt=one.residual.rms,
             exact_from=self.exact_from,
             certificate=certificate,
