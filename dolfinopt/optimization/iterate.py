@@ -12,10 +12,8 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
-    CURVED_ASYMPTOTE_GROWTH,
     GREY_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
-    LARGEST_ASYMPTOTE_GROWTH,
     LEAP_FACTOR,
     LEAST_REACH,
     MERIT_RISE,
@@ -223,7 +221,6 @@ class Iterate:
                 self.state,
                 move=move,
                 widest=CURVED_ASYMPTOTE_DISTANCE if curved else LARGEST_ASYMPTOTE_DISTANCE,
-                widen=CURVED_ASYMPTOTE_GROWTH if curved else LARGEST_ASYMPTOTE_GROWTH,
                 comm=self.world,
                 pieces=self.variables.pieces,
             )
