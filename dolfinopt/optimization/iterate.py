@@ -12,14 +12,13 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
-    CURVED_ASYMPTOTE_GROWTH,
     GREY_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
-    LARGEST_ASYMPTOTE_GROWTH,
     LEAP_FACTOR,
     LEAST_REACH,
     MERIT_RISE,
     REACH_GROWTH,
+    RETURNED_REACH,
     SHORTER_REACH,
     SHORTER_STEP,
     STEP_ATTEMPTS,
@@ -43,6 +42,7 @@ class Iterate:
         best, progress: the best design so far, and the course of the iterations.
         iteration, change: updates made, and the largest change of a variable in the last one.
         reach: factor on the move limit, at most 1.
+        returned_to: iteration of the best design that was gone back to last, -1 of none.
         residual, grayness: of x; the latter is known on the root.
         curved: whether limits other than volume and mass are to be kept.
         stuck: why no step leads on from x, "" while one does.
@@ -59,7 +59,7 @@ class Iterate:
         self.total = partial(sum_over_arms, evaluator.partition)
         self.x, self.state = x, initial_state(x)
         self.best, self.progress = Best.none(x), Progress()
-        self.iteration, self.change, self.reach = 0, 0.0, 1.0
+        self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
         self.residual, self.grayness = Residual.unknown(), 0.0
         self.stuck = ""
         self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
@@ -89,12 +89,23 @@ class Iterate:
 
     def return_to_best(self) -> bool:
         """Go back to the best design so far; return whether it is another one (collective)."""
-        iteration, here = self.best.iteration, (self.iteration, self.projection.beta)
-        if iteration < 0 or (iteration, self.best.beta) == here:
+        if self.best.iteration in (-1, self.iteration):
             return False
         self._restore_best()
-        self.iteration = iteration
         self._set(self.evaluator.evaluate(self.x))
+        return True
+
+    def begin_again(self) -> bool:
+        """Go on from the best design by shorter steps; return whether it is a new one (collective).
+
+        Each best design is gone back to once.
+        """
+        if self.problem.excess == 0.0 or self.best.iteration in (-1, self.returned_to):
+            return False
+        self.return_to_best()
+        self.returned_to = self.best.iteration
+        self.state, self.reach = initial_state(self.x), RETURNED_REACH
+        self.progress, self.stuck = self.progress.anew(), ""
         return True
 
     def begin_anew(self) -> bool:
@@ -210,7 +221,6 @@ class Iterate:
                 self.state,
                 move=move,
                 widest=CURVED_ASYMPTOTE_DISTANCE if curved else LARGEST_ASYMPTOTE_DISTANCE,
-                widen=CURVED_ASYMPTOTE_GROWTH if curved else LARGEST_ASYMPTOTE_GROWTH,
                 comm=self.world,
                 pieces=self.variables.pieces,
             )
@@ -274,6 +284,7 @@ class Iterate:
             iteration=self.iteration,
             change=self.change,
             reach=self.reach,
+            returned_to=self.returned_to,
             mma_steps=state.iteration,
             gradient=self.evaluator.gradient,
             cells=self.variables.split(np.column_stack(columns)),
@@ -299,6 +310,7 @@ class Iterate:
             arm.initial_vectors = memory.modes[k]
             arm.guesses = memory.guesses.get(k)
         self.iteration, self.change, self.reach = memory.iteration, memory.change, memory.reach
+        self.returned_to = memory.returned_to
         self.projection.restore((memory.beta, memory.thresholds))
 
 

@@ -121,7 +121,7 @@ class _Run:
         if memory is None:
             self._record()
             self._look_at_solid_arms()
-        while not self._finished() or self._uses_exact_gradient() or self._stiffens():
+        while not self._finished() or self._goes_on():
             self.iterate.step()
             if not self.iterate.stuck:
                 self._record()
@@ -178,9 +178,8 @@ class _Run:
         last = options.max_iterations
         if self.scene.objective.gradient == "esl" and self.exact_from is not None:
             last = self.exact_from + options.exact_iterations
-        complete = one.projection.complete
         self.finished = stop_code(
-            self.scene, one.iteration, last, one.progress, complete, one.stuck
+            self.scene, one.iteration, last, one.progress, one.best, one.stuck
         )
         late = self._begins_with_frozen_loads and one.progress.gain(FROZEN_WINDOW) <= FROZEN_GAIN
         return late or self.finished is not None
@@ -188,6 +187,12 @@ class _Run:
     @property
     def _begins_with_frozen_loads(self) -> bool:
         return self.scene.objective.gradient == "exact" and self.exact_from is None
+
+    def _goes_on(self) -> bool:
+        """Look for what is still to be done where nothing is gained any more (collective)."""
+        if self.finished in (StopCode.SETTLED, StopCode.STUCK) and self.iterate.begin_again():
+            return True
+        return self._uses_exact_gradient() or self._stiffens()
 
     def _uses_exact_gradient(self) -> bool:
         """Go over to the exact gradient where frozen loads have done their work (collective)."""
@@ -230,7 +235,6 @@ class _Run:
         """Assess the best design (collective)."""
         one, counts, code = self.iterate, replace(self.profile.counts), self.finished
         assert code is not None
-        iterations, stuck = one.iteration, one.stuck
         if one.return_to_best():
             one.measure()
         certificate = certify(self.evaluator, one.x, one.nominal, one.problem)
@@ -238,10 +242,9 @@ class _Run:
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        conflicts = self._conflicts(code)
-        last = one.iteration == iterations
-        returned = "" if last else f"returned: iteration {one.iteration}"
-        kept = one.problem.excess == 0.0
+        conflicts, kept = self._conflicts(code), one.problem.excess == 0.0
+        best = one.best.iteration
+        returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"
         return RankResult(
             scene=self.scene,
             partition=self.partition,
@@ -253,10 +256,10 @@ class _Run:
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
             rows=self.history,
-            iterations=iterations,
-            best_iteration=one.iteration,
+            iterations=one.iteration,
+            best_iteration=best if best >= 0 else one.iteration,
             stop_code=code,
-            ending=ending(self.scene, code, one.progress, kept, stuck, returned),
+            ending=ending(self.scene, code, one.progress, kept, one.stuck, returned),
             kkt=one.residual.rms,
             exact_from=self.exact_from,
             certificate=certificate,

@@ -29,7 +29,6 @@ from dolfinopt.optimization.measured import (
     ACTIVE_MULTIPLIER,
     BLOCK_ENTRIES,
     COMPLEMENTARITY_REST,
-    CURVED_ASYMPTOTE_GROWTH,
     DUAL_EVALUATIONS,
     DUAL_REGULARISATION,
     DUAL_ROUNDING,
@@ -47,6 +46,7 @@ from dolfinopt.optimization.measured import (
 
 Array = npt.NDArray[np.float64]
 
+_WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: asyincr)
 _NARROW = 0.7  # where it turned back (asydecr)
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
 
@@ -96,7 +96,6 @@ def mma_step(
     *,
     move: float = 0.2,
     widest: float = LARGEST_ASYMPTOTE_DISTANCE,
-    widen: float = CURVED_ASYMPTOTE_GROWTH,
     prices: npt.ArrayLike | None = None,
     comm: MPI.Comm | None = None,
     pieces: Mapping[int, int] | None = None,
@@ -119,8 +118,6 @@ def mma_step(
         move: largest step of a variable, in units of its range.
         widest: largest distance of the asymptotes, in these units. Wide ones make the approximation
             nearly linear, which lets curved constraints be left again and again.
-        widen: factor on their distance where a variable goes on in the same direction (Svanberg's
-            asyincr).
         prices: (m,) of a unit of every f_i, in units of f0: with them the approximation is that of
             f0 + sum_i price_i max(0, f_i). By default c_i = 1000.
         comm: communicator over which the variables are distributed; None: all are here.
@@ -150,7 +147,6 @@ def mma_step(
         state,
         move,
         widest,
-        widen,
         None if prices is None else np.asarray(prices, dtype=np.float64),
         {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
     )
@@ -177,7 +173,6 @@ class _Given:
     state: MMAState
     move: float
     widest: float
-    widen: float
     prices: Array | None
     pieces: Mapping[int, int]
 
@@ -266,7 +261,7 @@ def _asymptote_distance(given: _Given, columns: slice, width: Array) -> Array:
     last = (given.x[columns] - state.x_old1[columns]) / width
     before = (state.x_old1[columns] - state.x_old2[columns]) / width
     moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE
-    factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), given.widen, _NARROW), 1.0)
+    factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
     distance = factor * (state.upp[columns] - state.low[columns]) / (2.0 * width)
     return np.minimum(np.maximum(distance, LEAST_ASYMPTOTE_DISTANCE), given.widest)
 

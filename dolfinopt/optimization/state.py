@@ -172,7 +172,7 @@ class IterateMemory:
     Attributes:
         iteration: design updates made.
         change: largest one in the last update.
-        reach: factor on the move limit.
+        reach, returned_to: factor on the move limit, and the design that was gone back to last.
         mma_steps: taken since the asymptotes began.
         gradient: in use, "exact" or "esl".
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
@@ -190,6 +190,7 @@ class IterateMemory:
     iteration: int
     change: float
     reach: float
+    returned_to: int
     mma_steps: int
     gradient: str
     cells: Mapping[int, np.ndarray]

@@ -9,7 +9,7 @@ from dolfinopt.optimization.measured import (
     LOOKED_AT,
     WINDOW,
 )
-from dolfinopt.optimization.state import Progress
+from dolfinopt.optimization.state import Best, Progress
 from dolfinopt.scene.load import Scene
 
 
@@ -24,30 +24,28 @@ class StopCode(Enum):
 
 
 def stop_code(
-    scene: Scene, iteration: int, last: int, progress: Progress, complete: bool, stuck: str
+    scene: Scene, iteration: int, last: int, progress: Progress, best: Best, stuck: str
 ) -> StopCode | None:
     """Return why the iterations end here, None where they go on.
 
     A run ends where its best design gained at most `optimizer.tolerance` in `WINDOW` iterations
-    and the last one keeps all limits; it is looked at every few iterations, so that rounding
-    does not change their number.
+    of one projection; it is looked at every few iterations, so that rounding does not change
+    their number.
 
     Args:
         scene: with the tolerance.
         iteration: design updates made.
         last: of them at most.
         progress: of the iterations.
-        complete: whether the projection is as steep as it is to be.
+        best: the best design so far.
         stuck: why no step leads on, "" where one does.
     """
     if stuck:
         return StopCode.STUCK
     if iteration and iteration % LOOKED_AT == 0:
-        tolerance, within = scene.optimizer.tolerance, progress.excesses[-1] == 0.0
-        if complete and within and progress.gain(WINDOW) <= tolerance:
-            return StopCode.SETTLED
-        if not progress.feasible and progress.gain(INFEASIBLE_WINDOW) <= tolerance:
-            return StopCode.INFEASIBLE
+        tolerance, feasible = scene.optimizer.tolerance, best.excess == 0.0
+        if progress.gain(WINDOW if feasible else INFEASIBLE_WINDOW) <= tolerance:
+            return StopCode.SETTLED if feasible else StopCode.INFEASIBLE
     return StopCode.ITERATIONS if iteration >= last else None
 
 

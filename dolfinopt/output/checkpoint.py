@@ -246,7 +246,7 @@ def arrays_of(
         return {}
     arrays: dict[str, Any] = {
         "iteration": memory.iteration,
-        "last": [memory.change, memory.reach, memory.mma_steps],
+        "last": [memory.change, memory.reach, memory.returned_to, memory.mma_steps],
         "gradient": memory.gradient,
         "multipliers": memory.multipliers,
         "course": [memory.progress.objectives, memory.progress.excesses],
@@ -312,7 +312,7 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         error, strategy = float(arrays[f"{of}/error"]), Strategy[str(arrays[f"{of}/strategy"])]
         solutions.append(Solution(**parts, error=error, iterations=0, strategy=strategy))
-    change, reach, mma_steps = arrays["last"].tolist()
+    change, reach, returned_to, mma_steps = arrays["last"].tolist()
     objectives, excesses = map(tuple, arrays["course"].tolist())
     best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
     iteration = best["iteration"] = int(best["iteration"])
@@ -324,6 +324,7 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         "iteration": int(arrays["iteration"]),
         "change": change,
         "reach": reach,
+        "returned_to": int(returned_to),
         "mma_steps": int(mma_steps),
         "gradient": str(arrays["gradient"]),
         "cells": cells,
