@@ -119,7 +119,7 @@ def claim(
     resume: str = "",
     scene: Scene | None = None,
 ) -> None:
-    """Raise InputError if the folder holds results that --overwrite does not give up.
+    """Raise InputError if the folder holds results, unless they are to be overwritten.
 
     Or files that `scene` reads: these are not replaced even so.
     """

@@ -527,7 +527,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
     return _Traits(
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
-        scene.arms[index].cell_size or arm.mesh.cell_size,
+        (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
         arm.contacts(arm.kind.share(x_phys) > SOLID),
@@ -552,14 +552,14 @@ def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[st
         pieces = "1 piece" if contacts.pieces == 1 else f"{contacts.pieces} pieces"
         place = ", ".join(f"{x:.4g}" for x in contacts.places[0])
         text = (
-            f"arm {arm.name!r}: cells of the design cut at a density of one half meet in "
-            f"{' and '.join(counts)} alone, the worst at ({place}) m; by faces it is {pieces}: "
-            "such contacts are stiff in the model, and no joints in a workshop"
+            f"cut at a density of 0.5, arm {arm.name!r} is {pieces} that touch in "
+            f"{' and '.join(counts)} of cells alone, the worst at ({place}) m: such contacts are "
+            "stiff in the model, and no joints in a workshop"
         )
         if rated and run.crisp is not None:
-            text += f"; crisp is without them and {100.0 * contacts.left_out:.2g} % of the solid"
+            text += f"; crisp leaves them out, and {100.0 * contacts.left_out:.2g} % of the solid"
             if contacts.remaining:
-                text += f", but for {contacts.remaining} that cannot be opened without a cut"
+                text += f", but for {contacts.remaining} without which the arm is cut in two"
         found.append(f"{text}; {_against_contacts(scene, k, one.cell_size)}")
     if rated and run.crisp is None:
         hanging = any(one.contacts.count and not one.contacts.joins for one in traits.values())

@@ -84,7 +84,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Arrays of tables of which --set knows single ones by their name, or their number.
+# Arrays of tables whose entries --set addresses by name or number.
 NAMED: dict[str, type[Table]] = {
     "arms": Arm,
     "joints": Joint,

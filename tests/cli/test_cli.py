@@ -29,7 +29,7 @@ import dolfinopt as do
 from dolfinopt.cli import shared
 from dolfinopt.cli.shared import plain_lines
 from dolfinopt.disk import RUN
-from dolfinopt.optimization.state import FurtherRow, HistoryRow
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.folders import RUN_FILES
 from dolfinopt.part.folder import toml_text
 
@@ -455,17 +455,6 @@ def test_lines_without_a_terminal(capsys):
     assert text.count("7/400 objective 2.5 dev 7.5 mm") >= 2
     time.sleep(0.1)
     assert capsys.readouterr().err.count("\n") <= 1  # it ends with the run
-
-
-@pytest.mark.serial
-def test_further_iterations_are_told_apart(capsys):
-    with plain_lines(400, every=0.02) as show:
-        show(FurtherRow(3, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0, of=20))
-        deadline, text = time.monotonic() + 10.0, ""
-        while "objective" not in text and time.monotonic() < deadline:
-            time.sleep(0.01)
-            text += capsys.readouterr().err
-    assert "exact gradient, further 3/20 objective 2.5" in text and "/400" not in text
 
 
 @pytest.mark.serial

@@ -14,7 +14,7 @@ from solids import grid, sixths, solid_arm
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.density.contacts import contacts_of
-from dolfinopt.optimization.certificate import _crisp
+from dolfinopt.optimization.assessment import _crisp
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.output.summary import _contact_warnings
 

@@ -119,7 +119,8 @@ class PlanePart:
             found.append(
                 f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
                 "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust"'
+                'design than the optimised one; optimise with design.projection = "robust" until '
+                "it is crisp"
             )
         if one.crisp:
             found.append(

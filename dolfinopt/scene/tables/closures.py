@@ -76,8 +76,8 @@ class Closures(Table):
     )
     rpy: tuple[Angle, Angle, Angle] = Field(
         default=(0.0, 0.0, 0.0),
-        description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; at zero the "
-        "first interface's frame lies like it [rad]",
+        description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; zero: "
+        "parallel to the first interface's frame [rad]",
     )
     axis: Line | tuple[Component, Component, Component] | None = Field(
         default=None,
