@@ -51,7 +51,7 @@ from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
-from dolfinopt.responses.response import needs, objective_of
+from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
@@ -95,7 +95,7 @@ class SimulationResult(Result):
     @property
     def unit(self) -> str:
         """Unit of the objective."""
-        return objective_of(self.scene).unit
+        return self.scene.objective.response.unit
 
     @property
     def compliance(self) -> float:

@@ -210,7 +210,7 @@ def gradient(
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes
     from dolfinopt.responses.order_selection import choose_coordinates
-    from dolfinopt.responses.response import needs, objective_of
+    from dolfinopt.responses.response import needs
 
     claim(world, out.parent, overwrite, [out.name])
     if check:
@@ -225,7 +225,7 @@ def gradient(
     by_cell = slopes(loaded, partition, arms, trajectory, profile)
     write_gradient(out, loaded, partition, arms, by_cell, evaluation.objective)
     if world.rank == 0:
-        unit = objective_of(loaded).unit
+        unit = loaded.objective.response.unit
         name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
         value = with_unit(f"{evaluation.objective:.6g}", unit)
         click.echo(f"objective {value}; {name} gradient in {out}")

@@ -88,7 +88,7 @@ def _counted(result: Result) -> str:
 
 def _objective(result: Result, summary: Summary) -> str:
     """Return name, value and unit of the objective, what it stands for, and what was gained."""
-    scene, response = result.scene, objective_of(result.scene)
+    scene, response = result.scene, result.scene.objective.response
     name, value = response.label, result.evaluation.objective
     if scene.scenarios:
         how = "weighted sum" if scene.objective.scenarios == "sum" else "worst"
@@ -105,7 +105,8 @@ def _objective(result: Result, summary: Summary) -> str:
     gained = [_against(value, result.rows[0].objective, "the starting design")]
     if result.bars is not None:
         gained.append(_against_bars(result, value))
-    return f"{'maximised' if response.turned else 'minimised'} {text}: {', '.join(gained)}"
+    sought = "maximised" if objective_of(scene).turned else "minimised"
+    return f"{sought} {text}: {', '.join(gained)}"
 
 
 def _against(value: float, other: float, what: str) -> str:

@@ -23,8 +23,8 @@ from dolfinopt.parallel import together
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import Evaluation, evaluate
 from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
-from dolfinopt.responses.response import constraints_of, find_limited, needs
-from dolfinopt.scene.tables.objective import STATICS
+from dolfinopt.responses.response import constraints_of, needs
+from dolfinopt.scene.tables.responses import STATICS, limited_by
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -159,7 +159,7 @@ def solid_limits(evaluator: Evaluator) -> tuple[Limit, ...]:
     None where there are no others, or where their motion cannot be simulated.
     """
     scene = evaluator.scene
-    if all(one.response.of_nominal for one in constraints_of(scene)):
+    if all(one.response.declared.of_nominal for one in constraints_of(scene)):
         return ()
     solid = uniform_design(scene, evaluator.partition, evaluator.arms, 1.0)
     found = evaluated_beside(evaluator, solid)
@@ -173,7 +173,7 @@ def solid_sentence(limits: Sequence[Limit]) -> str:
     """
     parts = []
     for one in limits:
-        never = not one.met and find_limited(one.quantity).needs == STATICS
+        never = not one.met and limited_by(one.quantity).needs == STATICS
         parts.append(one.usage + " (cannot be kept)" * never)
     return f"solid arms: {', '.join(parts)}"
 

@@ -25,7 +25,7 @@ from dolfinopt.reduction import METHODS
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import freezes
+from dolfinopt.scene.tables.responses import freezes
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class Evaluator:
             found.append(self.differentiated(design, self.evaluate_densities(densities(design))))
         evaluation = self.evaluate_densities(densities(nominal))
         of_nominal = [
-            one.response.of_nominal
+            one.response.declared.of_nominal
             for one, measured in zip(
                 constraints_of(self.scene), evaluation.responses[1:], strict=True
             )
@@ -167,7 +167,7 @@ class Evaluator:
                 evaluation,
                 self.variables.by_x(objective, design),
                 np.array(by_x).reshape(len(rows), self.variables.size),
-                np.array([row.response.of_nominal for row in rows], dtype=bool),
+                np.array([row.response.declared.of_nominal for row in rows], dtype=bool),
             )
 
 

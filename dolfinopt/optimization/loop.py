@@ -38,7 +38,7 @@ from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene, pose_scenarios
-from dolfinopt.scene.tables.objective import freezes
+from dolfinopt.scene.tables.responses import freezes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm

@@ -158,7 +158,7 @@ def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float,
     """Return the objective's value, and the gradient of what is minimised."""
     response, nominal = objective_of(scene), designs[-1]
     turned = -1.0 if response.turned else 1.0
-    if response.of_nominal and len(designs) > 1:
+    if response.declared.of_nominal and len(designs) > 1:
         value, by_x = nominal.evaluation.objective, nominal.objective
         if scene.design.controls_widths and nominal.differentiated:
             dilated = designs[1]

@@ -35,7 +35,6 @@ from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
-from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
@@ -454,7 +453,7 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
 
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
-    unit = objective_of(scene).unit
+    unit = scene.objective.response.unit
     units: dict[str, Any] = {"objective": unit, **SUMMARY_UNITS}
     units["certificate"] = {**CERTIFICATE_UNITS, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)

@@ -248,7 +248,7 @@ def _judged(scene: Scene, parts: dict[int, Part]) -> Judgement:
     hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     for place, one in stress.items():
         owner = scene.owners[place]
-        if scene.constraints.stress is not None and owner is not None and len(one.hot):
+        if scene.constraints.limit("stress") is not None and owner is not None and len(one.hot):
             hot[owner] += HALVED * [one.hot]
     return state.evaluation.objective, column.limits, hot
 
@@ -615,9 +615,9 @@ class Problem:
         for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
-        if self.scene.constraints.stress is not None:
+        if (limit := self.scene.constraints.limit(STRESS)) is not None:
             stress, analysis = self._outline_stress(simulated, every)
-            measured, limit = stress.measure(analysis), self.scene.constraints.stress
+            measured = stress.measure(analysis)
             true, smooth = measured.values[0], measured.smooth[0]
             one = Limit(STRESS, "", true, limit, "Pa")
             rows.append((one, smooth, limit * smooth / true / self._factor(one)))
@@ -670,7 +670,7 @@ class Problem:
         for limit, row in zip(every, found, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
-        if self.scene.constraints.stress is not None:
+        if self.scene.constraints.limit("stress") is not None:
             stress, analysis = self._outline_stress(one, self.every(state.outlines))
             (row,) = stress.gradients(analysis)
             rows.append({k: g / state.held[len(rows) - 1] for k, g in row.items()})

@@ -28,7 +28,7 @@ from dolfinopt.plots.style import (
     spread,
 )
 from dolfinopt.responses.constraints import constraint_label, deviation_limits, limits_by_column
-from dolfinopt.responses.response import constraints_of, objective_of
+from dolfinopt.responses.response import constraints_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +79,7 @@ def _head(axes: Axes, label: str, note: str) -> None:
 
 def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
     """Return the picture of `history_figure` of a scene's optimisation, with its limits."""
-    minimised = objective_of(scene)
+    minimised = scene.objective.response
     limits = limits_by_column(scene, rows[0].constraints)
     return history_figure(rows, f"{minimised.label} [{minimised.unit}]", limits)
 
@@ -119,13 +119,13 @@ def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     alone is limited.
     """
     limits = limits_by_column(scene, rows[0].constraints)
-    if all(one.response.of_nominal for one in constraints_of(scene)):
+    if all(one.response.declared.of_nominal for one in constraints_of(scene)):
         return None
     figure, grid = panel_grid(np.ones((2, 1), dtype=bool), "Limits of the design", "iteration")
     above, below = grid[:, 0]
     iteration = [row.iteration for row in rows]
     objective = np.array([abs(row.objective) or 1.0 for row in rows])
-    lower = {one.name for one in constraints_of(scene) if one.response.lower}
+    lower = {one.name for one in constraints_of(scene) if one.response.declared.lower}
     every = []
     for number, (name, limit) in enumerate(limits.items()):
         value = np.array([row.constraints[name] for row in rows])

@@ -37,13 +37,13 @@ from dolfinopt.responses.response import (
     CellGradient,
     Measured,
     Response,
-    asked_of,
     bodies_in,
     constraints_of,
     needs,
     objective_of,
 )
 from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.tables.responses import asked
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -90,14 +90,14 @@ class Evaluation(Motion):
     smooth_limits: tuple[float, ...] = ()
     responses: tuple[Measured, ...] = ()
 
-    def values_of(self, *names: str) -> tuple[float, ...]:
-        """Return the true values of the first of these responses that was asked for, or none."""
-        return next((one.values for one in self.responses if one.response in names), ())
+    def values_of(self, name: str) -> tuple[float, ...]:
+        """Return the true values of a response, by its name; none where it was not asked for."""
+        return next((one.values for one in self.responses if one.response == name), ())
 
     @property
     def loaded_frequencies(self) -> tuple[float, ...]:
         """Of every flexible arm with what it carries, Hz; empty unless asked for."""
-        return self.values_of("eigenfrequency", "first_frequency")
+        return self.values_of("eigenfrequency")
 
     @property
     def tip_deflections(self) -> tuple[float, ...]:
@@ -211,7 +211,7 @@ def _evaluate_alike(
             if isinstance(motion, ConvergenceError):
                 raise motion
             under = arms
-            if any(one.needs and "motion" not in one.needs for one in asked_of(scene)):
+            if any(one.needs and "motion" not in one.needs for one in asked(scene)):
                 with together(partition.world):
                     under = {k: arm.under(scene) for k, arm in arms.items()}
             analysis = analysis_of(scene, partition, under, trajectory, profile)

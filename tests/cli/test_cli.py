@@ -112,7 +112,8 @@ def test_trajectory_files(optimised):
 def test_history_ends_in_the_summary(optimised):
     lines = (optimised / "history.csv").read_text().splitlines()
     header = "iteration,objective,max_deviation,grayness,volume_fraction,change,seconds,kkt,"
-    header += "volume_fraction_arm1,volume_fraction_arm2"
+    header += "merit,volume_fraction_arm1,volume_fraction_arm2,"
+    header += "multiplier_volume_fraction_arm1,multiplier_volume_fraction_arm2"
     assert lines[0] == header
     assert [int(line.split(",")[0]) for line in lines[1:]] == [0, 1, 2, 3]
     summary = summary_of(optimised)

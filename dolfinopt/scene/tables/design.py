@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, model_validator
 
 from dolfinopt.scene.tables.base import MAX_ITERATIONS, Length, Loc, Position, Refusal, Table
-from dolfinopt.scene.tables.objective import need_of
+from dolfinopt.scene.tables.responses import need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
