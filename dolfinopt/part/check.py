@@ -242,7 +242,7 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         yield f"first_frequency_{scene.arms[k].name}", frequency
     if scene.objective.response.name not in (
         "esl",
-        "compliance",
+        "integral_compliance",
         "mass",
         "deviation",
         "settling",

@@ -542,7 +542,7 @@ def test_bodies_of_a_loop_are_exported(shared_tmp_path, write_scene):
 @pytest.mark.serial
 def test_gradient_of_machines_is_checked(shared_tmp_path, capsys, write_scene):
     """Control's gradient: tests/responses/test_gradients.py."""
-    tight = ["--set", "simulation.tolerance=1e-4", "--set", "objective.kind=compliance"]
+    tight = ["--set", "simulation.tolerance=1e-4", "--set", "objective.kind=integral_compliance"]
     out = shared_tmp_path / "gradient.npz"
     run("gradient", write_scene(loop()), *tight, "--kind", "exact", "--check", "--out", out)
     if WORLD.rank == 0:

@@ -129,7 +129,7 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("overrides", [[], [SHARED], ["arms.arm1.rigid=true"]], ids=str)
-@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
+@pytest.mark.parametrize("kind", ["esl", "integral_compliance", "deviation"])
 def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: list[str]) -> None:
     """Loads f_j = K q_j, modes and instants held: q_j(x) = (V' K(x) V)^-1 f_j, remainders of 2."""
     built = build(f"objective.kind={kind}", "payload.mass=1.0", *overrides)

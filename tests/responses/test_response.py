@@ -32,8 +32,6 @@ from dolfinopt.scene.tables.objective import Constraints, declare
 from dolfinopt.scene.tables.responses import DECLARED, objective_kinds
 
 
-@response("roughness", label="distance from even filling", unit="m2", needs=frozenset(),
-          limit="upper limit of the distance from even filling [m2]")  # fmt: skip
 class Roughness(Response):
     """Integral of (x - x0)^2 over every design's cells, m2: least where x is x0 everywhere."""
 
@@ -61,7 +59,6 @@ class Roughness(Response):
         ]
 
 
-@response("mean_square", unit="m2 s", limit="upper limit of the squared deviation [m2 s]")
 class MeanSquare(Deviation):
     """Integral of |e|^2 over the horizon, m2 s."""
 
@@ -76,8 +73,17 @@ class MeanSquare(Deviation):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _forgotten() -> Iterator[None]:
-    """Leave the scenes of other tests without these words."""
+def _declared() -> Iterator[None]:
+    """Declare both; leave the scenes of other tests without these words."""
+    response(
+        "roughness",
+        label="distance from even filling",
+        unit="m2",
+        needs=frozenset(),
+        limit="upper limit of the distance from even filling [m2]",
+    )(Roughness)
+    squared = "upper limit of the squared deviation [m2 s]"
+    response("mean_square", unit="m2 s", limit=squared)(MeanSquare)
     yield
     for name in ("roughness", "mean_square"):
         del DECLARED[name], registry._known[name], Constraints.model_fields[name]

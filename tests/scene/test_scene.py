@@ -169,7 +169,7 @@ def test_ends_are_solid_unless_the_scene_says_otherwise():
         ("payload.mass = 4e-1", lambda s: s.payload.mass, 0.4),
         ("name=crane = big", lambda s: s.name, "crane = big"),
         ('name="crane"', lambda s: s.name, "crane"),
-        ("objective.kind = compliance", lambda s: s.objective.kind, "compliance"),
+        ("objective.kind = stress", lambda s: s.objective.kind, "stress"),
         ("design.projection=false", lambda s: s.design.projection, False),
         ("motion.gravity=[0, -9.81]", lambda s: s.motion.gravity, (0.0, -9.81)),
         ("payload={mass=1, inertia=2}", lambda s: (s.payload.mass, s.payload.inertia), (1, 2)),
@@ -374,7 +374,7 @@ BAD_VALUES = [
     ("simulation.sample", [3.1], "motion.horizon = 3.0 [s]"),
     ("simulation.sample", [1e-9], "between 3e-07 and"),
     ("simulation.stiffening", ["on"], 'true or false | "auto"'),
-    ("objective.kind", ["strain"], '"esl" | "compliance"'),
+    ("objective.kind", ["strain"], '"esl" | "integral_compliance"'),
     ("objective.load_cases design.continuation", [0], "an integer >= 1"),
     ("objective.load_cases", [3001], "at most 3000"),
     ("objective.gradient", ["adjoint"], '"esl" | "exact"'),
@@ -756,12 +756,12 @@ def test_length_of_a_body_from_a_file(tmp_path):
 
 # Key, a value that is not its default, and settings with which something uses it.
 UNUSED = {
-    "objective.worst": ("deviation", ["objective.kind=static", "constraints.esl=9.0"]),
+    "objective.worst": ("deviation", ["objective.kind=esl"]),
     "objective.stress_exponent": ("8.0", ["constraints.stress=1e8"]),
     "objective.loads": ("[[0.0,1.0,0.0]]", ["constraints.tip_deflection=0.1"]),
     "objective.effort_weights": ("[1.0,2.0,3.0]", ["constraints.effort=50.0"]),
     "objective.attached": ("point-mass", ["constraints.first_frequency=1.0"]),
-    "objective.elbow_angle": ("1.0", ["objective.kind=first_frequency"]),
+    "objective.elbow_angle": ("1.0", ["objective.kind=eigenfrequency"]),
     "objective.modes": ("2", ["objective.kind=eigenfrequency"]),
     "objective.follow": ("true", ["objective.kind=eigenfrequency"]),
     "objective.scenarios": ("worst", ["scenarios=[{changes=['payload.mass=1']}]"]),
@@ -772,9 +772,9 @@ UNUSED = {
 }
 # What does not: the wrong response, or none.
 OTHERS = {
-    "objective.worst": ["objective.kind=compliance"],
+    "objective.worst": ["objective.kind=integral_compliance"],
     "objective.effort_weights": ["constraints.peak_force=[9.0,9.0,9.0]"],
-    "objective.follow": ["objective.kind=first_frequency"],
+    "objective.follow": ["constraints.first_frequency=1.0"],
     "design.erosion": ["design.projection=heaviside"],
     "design.limits_on": ["design.projection=heaviside"],
 }

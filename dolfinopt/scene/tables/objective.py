@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, field_validator
@@ -407,6 +408,24 @@ class ConstraintOptions(Table):
 
 class Constraints(ConstraintOptions):
     """Limits of a design besides its volume: true extremes, of the worst scenario."""
+
+    @field_validator("peak_force", mode="before", check_fields=False)
+    @classmethod
+    def _leave_free(cls, value: Any) -> Any:
+        """Take None for inf, which JSON does not know."""
+        if not isinstance(value, list | tuple):
+            return value
+        free = tuple(None if one == math.inf else one for one in value)
+        if free and all(one is None for one in free):
+            raise Refusal("expected a limit for one drive at least")
+        return free
+
+    @field_validator("stiffness", check_fields=False)
+    @classmethod
+    def _check_cases(cls, cases: tuple[StiffnessCase, ...] | None) -> Any:
+        if cases == ():
+            raise Refusal("expected at least one table [[constraints.stiffness]]")
+        return cases
 
 
 def _add_key(one: Declaration) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import Field
 
 from dolfinopt.scene.tables.base import Loc, Refusal, Table
 
@@ -91,25 +91,8 @@ class StiffnessCase(Table):
             raise Refusal(f"expected force and moment of {kind} in this scene", at)
 
 
-def _leave_free(value: Any) -> Any:
-    """Take None for inf, which JSON does not know."""
-    if not isinstance(value, list | tuple):
-        return value
-    free = tuple(None if one == math.inf else one for one in value)
-    if free and all(one is None for one in free):
-        raise Refusal("expected a limit for one drive at least")
-    return free
-
-
-def _check_cases(cases: tuple[StiffnessCase, ...]) -> tuple[StiffnessCase, ...]:
-    if not cases:
-        raise Refusal("expected at least one table [[constraints.stiffness]]")
-    return cases
-
-
+Cases = tuple[StiffnessCase, ...]
 Positive = Annotated[float, Field(ge=1e-15, le=1e15)]  # of a response without a range of its own
-PeakForces = Annotated[tuple[Force | None, ...], BeforeValidator(_leave_free)]
-StiffnessCases = Annotated[tuple[StiffnessCase, ...], AfterValidator(_check_cases)]
 
 
 # -- declarations ----------------------------------------------------------------------------
@@ -300,7 +283,7 @@ DECLARED: dict[str, Declaration] = {
             limit=Limited(
                 "upper limits of the largest force of every drive, the cart's first, then the "
                 "joints' from the base outwards; inf leaves one without limit [N, N m]",
-                PeakForces,
+                tuple[Force | None, ...],
                 options=(),
             ),
             options=("effort_weights",),
@@ -336,7 +319,7 @@ DECLARED: dict[str, Declaration] = {
             "static displacement",
             "m",
             STATICS,
-            Limited("static load cases, each with the largest displacement [-]", StiffnessCases),
+            Limited("static load cases, each with the largest displacement [-]", Cases),
             objective=False,
             of_arms=True,
             file="static",
