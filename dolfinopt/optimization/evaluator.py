@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from dolfinopt.fem.interior import Guesses
 
 
+# Solutions, and of every arm eigenvectors and what iterative solves set out from.
+Start = tuple[tuple[Solution, ...], dict[int, list[np.ndarray]], dict[int, "Guesses | None"]]
+
+
 class Evaluator:
     """Evaluates one x after the other, each with the last one's motion as its initial guess.
 
@@ -102,6 +106,16 @@ class Evaluator:
         for k, vectors in self.initial_vectors.items():
             self.arms[k].initial_vectors = vectors
             self.arms[k].guesses = self.initial_guesses[k]
+
+    @property
+    def start(self) -> Start:
+        """From where the evaluation of the last x set out, for `restart`."""
+        return self.initial_solutions, self.initial_vectors, self.initial_guesses
+
+    def restart(self, start: Start) -> None:
+        """Let the next evaluation set out from there (collective)."""
+        self.initial_solutions, self.initial_vectors, self.initial_guesses = start
+        self.undo()
 
     def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:
         """Evaluate the last x again, from the same initial guesses: in the same bits (collective).

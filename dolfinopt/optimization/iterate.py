@@ -159,7 +159,7 @@ class Iterate:
         says why. The next steps are half as long where the merit rose, else longer again.
         """
         size = abs(self.problem.f0) or 1.0
-        merit, before = self.problem.merit(size), self.projection.state
+        merit, before, start = self.problem.merit(size), self.projection.state, self.evaluator.start
         rises = self.projection.rises(self.problem.excess)
         for attempt in range(STEP_ATTEMPTS):
             shorter = SHORTER_STEP**attempt
@@ -167,17 +167,20 @@ class Iterate:
             if rises:
                 self.projection.advance(self.variables.split(new))
             designs = self._tried(new)
-            if designs is None:
-                self.projection.restore(before)
-                continue
-            self._go_on(new, after, designs, rises)
-            if not rises:
-                rose = self.problem.merit(size) > merit + MERIT_RISE
-                factor = shorter * (SHORTER_REACH if rose else REACH_GROWTH)
-                self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
-            return
+            if designs is not None:
+                self._go_on(new, after, designs, rises)
+                if not rises:
+                    self._adapt_reach(shorter, self.problem.merit(size) > merit + MERIT_RISE)
+                return
+            self.projection.restore(before)
+            rises = False  # the shorter step is one of the same projection
+        self.evaluator.restart(start)
         self.evaluate_again()
         self.stuck = self.stuck or "every step, however short, makes it twice as bad"
+
+    def _adapt_reach(self, shorter: float, rose: bool) -> None:
+        factor = shorter * (SHORTER_REACH if rose else REACH_GROWTH)
+        self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
 
     def _tried(self, new: np.ndarray) -> list[EvaluatedDesign] | None:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
