@@ -492,7 +492,7 @@ CONTRADICTIONS = [
     (1, {"motion.cart_follow": 0.0}, "motion.cart_follow = 0.0", "0.5, the default, with one arm"),
     (1, {"motion.base": "fixed"}, 'motion.base = "fixed"', '"cart" with one arm'),
     # Exact by default: the way out is told.
-    (2, BALANCED | {"objective": {"kind": "compliance"}}, "reduction.method",
+    (2, BALANCED | {"objective": {"kind": "integral_compliance"}}, "reduction.method",
      'state objective.gradient = "esl"'),
     (2, KRYLOV | {"reduction.shifts": [0.0, 9.0], "reduction.coordinates": 5},
      "reduction.coordinates = 5", "an integer >= 6"),
@@ -619,7 +619,7 @@ def test_motion_and_payload_are_stated(table, remedy):
         ({"constraints": {"deviation": None}}, "esl"),  # as a summary has it
         ({"constraints": {"deviation": 0.01}, "objective": {"gradient": "esl"}}, "esl"),
         ({"objective": {"gradient": "exact"}}, "exact"),
-        *(({"objective": {"kind": kind}}, "exact") for kind in ("compliance", "settling")),
+        *(({"objective": {"kind": kind}}, "exact") for kind in ("integral_compliance", "settling")),
         ({"objective": {"kind": "mass"}, "constraints": {"stress": 6e7}}, "exact"),
     ],
 )

@@ -476,7 +476,7 @@ class Optimizer(Table):
         ge=0,
         le=MAX_ITERATIONS,
         description="iterations with the exact gradient that follow where frozen loads (gradient = "
-        '"esl") gain no more [-]',
+        '"esl") bring no further gain [-]',
     )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
