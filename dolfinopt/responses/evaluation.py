@@ -348,7 +348,8 @@ def _simulated(
     kept: list[Trajectory] = []
 
     def run() -> Motion:
-        moved, known = [], list(starts)
+        moved: list[Trajectory] = []
+        known = list(starts)
         for number, one in enumerate((scene, *pose_scenarios(scene))):
             # Scenarios begin with the scene's motion unless theirs is known.
             start = known[number] if number < len(known) else None
