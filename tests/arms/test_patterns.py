@@ -108,7 +108,7 @@ def test_gradients_by_the_design_of_both_arms(changes):
     if counted == slice(None):
         names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
         both = ("arm1", "arm2")
-        limits = [("first_frequency", both), ("tip_deflection", both)]
+        limits = [("eigenfrequency", both), ("tip_deflection", both)]
         assert names == [("volume_fraction", ("arm1",)), *limits]
 
 
