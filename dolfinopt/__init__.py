@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
-    from dolfinopt.optimization.loop import Result
+    from dolfinopt.optimization.result import Result
     from dolfinopt.output.design import gather_views
     from dolfinopt.output.run_folder import optimize
     from dolfinopt.parallel import abort_together, gather_arms, partition_arms
@@ -59,7 +59,7 @@ _HOME = {
     "Model": "model",
     "OptimizationResult": "model",
     "SimulationResult": "model",
-    "Result": "optimization.loop",
+    "Result": "optimization.result",
     "optimize": "output.run_folder",
     "abort_together": "parallel",
     "partition_arms": "parallel",

@@ -32,11 +32,10 @@ from mpi4py import MPI
 from dolfinopt.arms.arm import Arm, build_arms, fixed_body, uniform_design
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.build import check_forces, check_motion
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.optimization.certificate import Certificate
-from dolfinopt.optimization.state import HistoryRow
+from dolfinopt.optimization.result import Result
+from dolfinopt.optimization.state import HistoryRow, fields_of
 from dolfinopt.output.design import (
     ArmView,
     canonical_order,
@@ -49,9 +48,10 @@ from dolfinopt.output.run_folder import optimize
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
-from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
+from dolfinopt.responses.constraints import limits_of
+from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
-from dolfinopt.responses.response import needs, objective_of
+from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
@@ -69,26 +69,20 @@ if TYPE_CHECKING:
 Densities = Mapping[str, np.ndarray]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SimulationResult:
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class SimulationResult(Result):
     """One design, simulated; draws itself where it is the last expression of a notebook's cell.
 
     Attributes:
-        scene: in which.
-        evaluation: all figures, on all ranks.
         design: physical densities (n_cells,) of every arm with a design of its own, by its name;
             cells in the order of `Model.centroids`. On rank 0, empty elsewhere.
-        trajectory: the motion over time; None but on rank 0.
         views: cells, densities and modes of all arms, for pictures; empty but on rank 0.
         filtered: what an optimised, projected design was projected from, as `design`; else empty.
         stress_at_points: largest von Mises stress at the elements' Gauss points along the motion,
             Pa, where `Model.simulate` was asked for it; else, and on other ranks than 0, nan.
     """
 
-    scene: Scene
-    evaluation: Evaluation
     design: dict[str, np.ndarray]
-    trajectory: Trajectory | None
     views: list[ArmView]
     filtered: dict[str, np.ndarray] = field(default_factory=dict)
     stress_at_points: float = nan
@@ -101,7 +95,7 @@ class SimulationResult:
     @property
     def unit(self) -> str:
         """Unit of the objective."""
-        return objective_of(self.scene).unit
+        return self.scene.objective.response.unit
 
     @property
     def compliance(self) -> float:
@@ -155,7 +149,11 @@ class SimulationResult:
         """Return the figure of the end-effector's distance from its rigid path over time."""
         from dolfinopt.plots.curves import deviation_of
 
-        return None if self.trajectory is None else deviation_of(self.trajectory, self._initial())
+        return (
+            None
+            if self.trajectory is None
+            else deviation_of(self.trajectory, self.initial_deviation)
+        )
 
     def plot_design(self) -> Figure | None:
         """Return the figure of the arms' densities; of solids, of what is denser than 0.5."""
@@ -195,10 +193,6 @@ class SimulationResult:
 
         return None if self.trajectory is None else state_space(self.trajectory, t)
 
-    def _initial(self) -> np.ndarray | None:
-        """Return the deviation (n, 2) of the design to compare with, m."""
-        return None
-
     def __repr__(self) -> str:
         objective = with_unit(f"{self.objective:.4g}", self.unit)
         return (
@@ -215,27 +209,8 @@ class SimulationResult:
         return stream.getvalue()
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class OptimizationResult(SimulationResult):
-    """An optimised design, and how it came about.
-
-    Attributes:
-        iterations: design updates made.
-        converged: whether a stopping criterion was met, see `stop_reason`.
-        stop_reason: in words.
-        violated: the constraints that are not met, "" if all are.
-        rows: one a design, the initial one first; rank 0.
-        initial_deviation: (n, 2) of the initial design, evenly over the horizon, m; rank 0.
-        certificate: what the exact gradient says of the design.
-    """
-
-    iterations: int = 0
-    converged: bool = False
-    stop_reason: str = ""
-    violated: str = ""
-    rows: list[HistoryRow] = field(default_factory=list)
-    initial_deviation: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
-    certificate: Certificate = field(default_factory=Certificate)
+    """An optimised design, and how it came about."""
 
     @property
     def history(self) -> DataFrame | None:
@@ -256,9 +231,6 @@ class OptimizationResult(SimulationResult):
         from dolfinopt.plots.curves import history_of
 
         return history_of(self.scene, self.rows) if self.rows else None
-
-    def _initial(self) -> np.ndarray | None:
-        return self.initial_deviation if len(self.initial_deviation) else None
 
 
 Design = Densities | SimulationResult | str | Path | None
@@ -329,17 +301,19 @@ class Model:
             ConvergenceError: the motion could not be simulated; the message says what to try.
         """
         partition, arms, x_phys = self._prepared(x)
-        choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
+        choice = choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
         evaluation, trajectory = evaluate(self.scene, partition, arms, x_phys, self._profile)
         found = stress_report(partition, arms, trajectory, self._profile) if stress else None
         views = gather_views(self.scene, partition, arms, x_phys, found)
         points = [one.peak_at_points.value for one in (found or {}).values()]
         return SimulationResult(
-            self.scene,
-            evaluation,
-            self._gathered(x_phys),
-            trajectory,
-            views,
+            scene=self.scene,
+            evaluation=evaluation,
+            trajectory=trajectory,
+            limits=limits_of(self.scene, evaluation),
+            choice=choice,
+            design=self._gathered(x_phys),
+            views=views,
             stress_at_points=max(points, default=nan),
         )
 
@@ -424,19 +398,10 @@ class Model:
         )
         stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
-            self.scene,
-            found.evaluation,
-            self._gathered(found.x_phys, found.partition),
-            found.trajectory,
-            gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
-            self._gathered(found.x_filtered or {}, found.partition),
-            iterations=found.iterations,
-            converged=found.converged,
-            stop_reason=found.stop_reason,
-            violated=found.violated,
-            rows=found.history,
-            initial_deviation=found.initial_deviation,
-            certificate=found.certificate,
+            **fields_of(found, Result),
+            design=self._gathered(found.x_phys, found.partition),
+            views=gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
+            filtered=self._gathered(found.x_filtered or {}, found.partition),
         )
 
     def check_parts(

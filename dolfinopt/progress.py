@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from collections.abc import Sequence
 
 SILENT = 3.0  # s that work takes without a line, and between two lines of it
 log = logging.getLogger(__name__)
@@ -47,9 +48,15 @@ def show_slow_work() -> None:
 # -- figures with their units ----------------------------------------------------------------
 
 
-NOT_MET = "; not met: "  # before the constraints in a stop reason
-
-
 def with_unit(value: str, unit: str) -> str:
     """Return a number with its unit, "-" of none left out."""
     return value if unit == "-" else f"{value} {unit}"
+
+
+SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "Pa": ("MPa", 1e-6)}  # units of screen, pictures
+
+
+def shown(values: Sequence[float], unit: str) -> tuple[tuple[float, ...], str]:
+    """Return values of a unit in that in which they are shown, and this unit."""
+    other, factor = SHOWN.get(unit, (unit, 1.0))
+    return tuple(factor * one for one in values), other

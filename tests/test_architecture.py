@@ -15,7 +15,6 @@ from dolfinopt.reduction import METHODS
 from dolfinopt.scene.tables.arms import ElementName
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.motion import ReductionMethod
-from dolfinopt.scene.tables.objective import NEEDS, NO_LIMITS, Constraints, ObjectiveKind
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
@@ -57,8 +56,6 @@ def test_words_of_the_scene_are_those_of_the_code():
     assert set(get_args(ReductionMethod)) == METHODS.keys()
     assert set(get_args(Law)) == LAWS.keys()
     assert set(get_args(ElementName)) == set(ELEMENTS)
-    limited = Constraints.model_fields.keys() - set(NO_LIMITS)
-    assert {*get_args(ObjectiveKind), *limited} == NEEDS.keys()
 
 
 # -- seconds by phase: each is counted once  ------------------------------------------------------

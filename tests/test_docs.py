@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from declared import withdrawn
 from mpi4py import MPI
 from runs import ROOT, tomllib
 
 import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.responses import response
 from dolfinopt.scene.load import describe_keys
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
@@ -70,8 +70,8 @@ def folder(tmp_path, monkeypatch):
     for scene in (tmp_path / "demos").glob("*.toml"):
         scene.write_text(made_small(scene.read_text()))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(response, "_known", dict(response._known))  # pages may register some
-    return tmp_path
+    with withdrawn():
+        yield tmp_path
 
 
 def with_key(scene: str, table: str, key: str, value: str) -> str:

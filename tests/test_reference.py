@@ -85,7 +85,7 @@ def test_simulation(case):
 def test_gradient_of_the_integrated_compliance(kind):
     """Integral of q'Kq over the horizon, trajectory frozen or not, summed over 10 x 3 boxes."""
     (values,) = TWO_ARM_VALUES["gradients"]
-    changes = (LINEAR, "objective.kind=compliance", f"objective.gradient={kind}",
+    changes = (LINEAR, "objective.kind=integral_compliance", f"objective.gradient={kind}",
                f"reduction.coordinates={values['coordinates']}",
                f"motion.duration={values['duration']}")  # fmt: skip
     built, _, evaluation, trajectory = simulate(values["design"], *changes)

@@ -18,8 +18,9 @@ from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity, tensors
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.gradient_check import taylor_test
+from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import checkpoint, design, run_folder, summary
-from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
+from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, static
 from dolfinopt.responses import order_selection as coordinates
@@ -183,13 +184,13 @@ def resuming(folder):
 def writing(folder):
     built = build(*COARSE)
     x = built.uniform()
-    simulated = Simulated(*built.place, x, *built.evaluate(x), built.profile)
-    return lambda: write_simulation(folder, simulated, 1.0)
+    simulated = simulation_result(*built.place, x, *built.evaluate(x), built.profile)
+    return lambda: write_result(folder, simulated, 1.0)
 
 
 def writing_designs(folder):
     result = do.optimize(coarse(), world=COMM)
-    return lambda: write_result(coarse(), folder, result, 1.0)
+    return lambda: write_result(folder, result, 1.0)
 
 
 def writing_gradients(folder):
@@ -231,13 +232,13 @@ PLACES = [
     (evaluating, 0, evaluation, "_motion"),
     (a_batch, LONE, arm.Arm, "under", STATIC),
     (gradients, LONE, motion, "esl_gradient"),
-    (gradients, 0, motion, "_load_case_moments"),
+    (gradients, 0, motion.MotionResponse, "_over_scenarios"),
     (gradients, LONE, motion, "exact_gradient", EXACT),
-    (gradients, 0, motion, "_cotangents", EXACT),
-    (gradients, LONE, static, "static_gradient", STATIC),
+    (gradients, 0, motion.MotionResponse, "cotangents", EXACT),
+    (gradients, LONE, static, "tip_gradient", STATIC),
     (gradients, LONE, frequency, "period_gradient", PERIOD),
     (gradients, LONE, frequency, "rigid_gradient", PERIOD),
-    (gradients, LONE, static, "deflection_gradient", TIP),
+    (gradients, LONE, static, "tip_gradient", TIP),
     (gradients, LONE, frequency, "period_gradient", FREQUENCY),
     (choosing, LONE, arm.Arm, "set_design"),
     (choosing, LONE, coordinates, "shape_integrals"),

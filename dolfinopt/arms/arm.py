@@ -40,7 +40,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import STATICS, needs_alone
+from dolfinopt.scene.tables.responses import STATICS, needs_alone
 
 THRESHOLD_BOUNDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 

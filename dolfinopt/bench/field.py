@@ -221,9 +221,9 @@ def chosen_cases(
 # -- what is compared ------------------------------------------------------------------------
 
 
-def _response(*names: str) -> Callable[[SimulationResult], float]:
-    """Return the function to the first of these responses that the scene has, its largest."""
-    return lambda result: max(result.evaluation.values_of(*names), default=np.nan)
+def _response(name: str) -> Callable[[SimulationResult], float]:
+    """Return the function to the largest value of a response."""
+    return lambda result: max(result.evaluation.values_of(name), default=np.nan)
 
 
 def _bodies(result: SimulationResult) -> Sequence[ShapeIntegrals]:
@@ -256,7 +256,7 @@ NUMBERS: dict[str, Callable[[SimulationResult], float]] = {
     "stress": lambda result: result.stress_at_points,
     "settling": _response("settling"),
     "orientation": _response("orientation"),
-    "loaded frequency": _response("first_frequency"),
+    "loaded frequency": _response("eigenfrequency"),
     "first frequency": lambda result: _bodies(result)[0].first_frequency,
     "mass of the first arm": lambda result: _bodies(result)[0].mass,
     **{f"frequency {number}": _frequency(number) for number in (1, 2, 3)},

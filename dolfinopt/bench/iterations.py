@@ -279,7 +279,7 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
     excess = max((one.excess for one in result.limits), default=0.0)
     asked = result.iterations, result.counts.simulations, result.counts.adjoints
     found = result.evaluation.objective, excess, result.best_iteration
-    yield name, start, *asked, *found, seconds, result.stop_reason.partition(":")[0]
+    yield name, start, *asked, *found, seconds, result.stop_code.value
 
 
 def straight_rod() -> Rows:

@@ -13,7 +13,6 @@ from dolfinopt.cli.shared import (
     PATH,
     animation_option,
     claim,
-    conclude,
     design_option,
     draw,
     elapsed,
@@ -28,6 +27,7 @@ from dolfinopt.cli.shared import (
     set_option,
     start,
     tell,
+    verbose_option,
 )
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import PASSING_RATE
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.optimization.loop import Result
+    from dolfinopt.optimization.result import RankResult
     from dolfinopt.output.design import ArmView
     from dolfinopt.parallel import Partition
     from dolfinopt.scene.load import Scene
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 @set_option
 @plots_option
 @animation_option
+@verbose_option
 def optimize(
     scene: Path,
     out: Path | None,
@@ -59,6 +60,7 @@ def optimize(
     overrides: tuple[str, ...],
     plots: bool,
     animation: bool,
+    verbose: bool,
 ) -> None:
     """Optimise the arms of SCENE for the loads of their motion."""
     if resume and overwrite:
@@ -79,42 +81,38 @@ def optimize(
         try:
             with progress(world, loaded) as report:
                 result = run(
-                    loaded, folder, resume=resume, overwrite=overwrite, world=world, report=report
+                    loaded,
+                    folder,
+                    resume=resume,
+                    overwrite=overwrite,
+                    world=world,
+                    report=report,
+                    compared=True,
                 )
         except KeyboardInterrupt:
             instead = " in place of --overwrite" if overwrite else ""
             raise KeyboardInterrupt(f"to go on, add --resume{instead}") from None
-        _write_result(loaded, folder, result, plots, animation)
-
-
-def _write_result(scene: Scene, folder: Path, result: Result, plots: bool, animation: bool) -> None:
-    """Write all that an optimisation leaves behind; raise if it misses a limit (collective)."""
-    from dolfinopt.output.run_folder import write_result
-
-    def pictures(views: list[ArmView]) -> None:
-        assert result.trajectory is not None
-        history, initial = result.history, result.initial_deviation
-        draw(folder, scene, views, result.trajectory, history, initial, animation=animation)
-
-    drawn = pictures if plots or animation else None
-    written = write_result(scene, folder, result, elapsed(), pictures=drawn)
-    if written is not None:
-        conclude(written.summary, folder)
-        click.echo(_next(scene, folder, written.summary["grayness"]))
+        _conclude(folder, result, plots, animation, verbose)
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
 
 
-def _next(scene: Scene, folder: Path, grayness: float) -> str:
-    """Return how to go on from a design."""
-    from dolfinopt.part.part import GRAY
+def _conclude(
+    folder: Path, result: RankResult, plots: bool, animation: bool, verbose: bool
+) -> None:
+    """Write all that a result leaves behind, and tell of it (collective)."""
+    from dolfinopt.cli.report import conclude
+    from dolfinopt.output.run_folder import write_result
 
-    if scene.design.projection or grayness <= GRAY:
-        return f"parts for the workshop: dolfinopt part {folder}"
-    return (
-        f"no design for the workshop: with a grayness of {grayness:.2g} parts would be another "
-        'design; optimise with design.projection = "robust", then dolfinopt part'
-    )
+    def pictures(views: list[ArmView]) -> None:
+        assert result.trajectory is not None
+        history, initial = result.rows, result.initial_deviation
+        draw(folder, result.scene, views, result.trajectory, history, initial, animation=animation)
+
+    drawn = pictures if plots or animation else None
+    written = write_result(folder, result, elapsed(), pictures=drawn)
+    if written is not None:
+        conclude(result, written.summary, folder, verbose)
 
 
 # -- `dolfinopt simulate` ------------------------------------------------------------------------
@@ -128,6 +126,7 @@ def _next(scene: Scene, folder: Path, grayness: float) -> str:
 @set_option
 @plots_option
 @animation_option
+@verbose_option
 def simulate(
     scene: Path,
     design: Path | None,
@@ -136,6 +135,7 @@ def simulate(
     overrides: tuple[str, ...],
     plots: bool,
     animation: bool,
+    verbose: bool,
 ) -> None:
     """Simulate SCENE with a given design.
 
@@ -143,9 +143,9 @@ def simulate(
     """
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-simulation"
+    from dolfinopt.optimization.result import simulation_result
     from dolfinopt.output.design import arms_with_design
     from dolfinopt.output.folders import check_unused, remove_stale, working_alone
-    from dolfinopt.output.run_folder import Simulated, write_simulation
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
@@ -157,19 +157,10 @@ def simulate(
     with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
         choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
         evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
-        simulated = Simulated(
-            loaded, partition, arms, x_phys, evaluation, trajectory, profile, choice
-        )
-
-        def pictures(views: list[ArmView]) -> None:
-            assert trajectory is not None
-            draw(folder, loaded, views, trajectory, [], None, animation=animation)
-
-        drawn = pictures if plots or animation else None
+        place = partition, arms, x_phys
+        result = simulation_result(loaded, *place, evaluation, trajectory, profile, choice)
         on_root(world, remove_stale, folder)
-        written = write_simulation(folder, simulated, elapsed(), pictures=drawn)
-    if written is not None:
-        conclude(written.summary, folder)
+        _conclude(folder, result, plots, animation, verbose)
 
 
 # -- `dolfinopt gradient` ------------------------------------------------------------------------
@@ -219,7 +210,7 @@ def gradient(
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes
     from dolfinopt.responses.order_selection import choose_coordinates
-    from dolfinopt.responses.response import needs, objective_of
+    from dolfinopt.responses.response import needs
 
     claim(world, out.parent, overwrite, [out.name])
     if check:
@@ -234,7 +225,7 @@ def gradient(
     by_cell = slopes(loaded, partition, arms, trajectory, profile)
     write_gradient(out, loaded, partition, arms, by_cell, evaluation.objective)
     if world.rank == 0:
-        unit = objective_of(loaded).unit
+        unit = loaded.objective.response.unit
         name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
         value = with_unit(f"{evaluation.objective:.6g}", unit)
         click.echo(f"objective {value}; {name} gradient in {out}")

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import (
     AbstractContextManager,
     ExitStack,
@@ -40,7 +40,6 @@ from dolfinopt.output.folders import (
     prepare_folder,
     stale_parts,
 )
-from dolfinopt.progress import NOT_MET, with_unit
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -120,7 +119,7 @@ def claim(
     resume: str = "",
     scene: Scene | None = None,
 ) -> None:
-    """Raise InputError if the folder holds results that --overwrite does not give up.
+    """Raise InputError if the folder holds results, unless they are to be overwritten.
 
     Or files that `scene` reads: these are not replaced even so.
     """
@@ -195,7 +194,7 @@ def draw(
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.design import designed
-    from dolfinopt.plots.curves import deviation_of, drives_figure, history_of
+    from dolfinopt.plots.curves import deviation_of, drives_figure, history_of, limits_figure
     from dolfinopt.plots.design import design_figure, stress_figure
     from dolfinopt.plots.machine import machine_figure
     from dolfinopt.plots.style import save
@@ -209,6 +208,8 @@ def draw(
     save(machine_figure(views, trajectory, title), folder / "machine.png")
     if history:
         save(history_of(scene, history), folder / "history.png")
+        if (limits := limits_figure(scene, history)) is not None:
+            save(limits, folder / "limits.png")
     if not scene.is_pinned:
         save(deviation_of(trajectory, initial), folder / "deviation.png")
     if trajectory.is_machine:
@@ -219,149 +220,12 @@ def draw(
         draw_motion(folder / "motion.gif", views, trajectory)
 
 
-def _deflection_sentence(budget: Mapping[str, Any]) -> str:
-    """Return the shares of all kinds of parts in a line, the links' first."""
-    links, *others = [f"{name} {100.0 * x:.3g} %" for name, x in budget["shares"].items()]
-    held = links.replace("links ", "links hold ", 1)
-    return f"{held} of the deflection{''.join(f', {one}' for one in others)}"
-
-
-def _deflection_table(budget: Mapping[str, Any]) -> list[str]:
-    """Return the parts as lines of a table."""
-    head = (
-        f"at {budget['instant']:.3f} s, {1e3 * budget['linear']:.4g} mm to first order "
-        f"({1e3 * budget['deviation']:.4g} mm simulated):"
-    )
-    width = max(len(one["name"]) for one in budget["parts"])
-    return [
-        head,
-        *(
-            f"  {one['kind']:<8} {one['name']:<{width}} {1e3 * one['deflection']:>10.4g} mm "
-            f"{100.0 * one['share']:>6.1f} %"
-            for one in budget["parts"]
-        ),
-    ]
-
-
-def conclude(summary: Mapping[str, Any], folder: Path) -> None:
-    """Print what the deviation comes from, the run's warnings, and its figures in one line."""
-    optimised, parts = summary["kkt"] is not None, summary["deflection_budget"]
-    if parts is not None:
-        for line in [_deflection_sentence(parts), *([] if optimised else _deflection_table(parts))]:
-            click.echo(line)
-    warn(summary["warnings"])
-    if start := summary["loop_start"]:
-        joints = ", ".join(f"{name} = {value:.4g}" for name, value in start.items())
-        click.echo(f"closures: loops start with {joints}; motion.initial_joints chooses the branch")
-    found = summary["reduction"]
-    if found["error_estimate"] is not None:
-        click.echo(_chosen(found["coordinates"], found["error_estimate"]))
-    loads, asked = summary["stiffening"], summary["scene"]["simulation"]["stiffening"]
-    if asked == "auto" and loads is not None and loads["on"]:
-        reason = (
-            "the loads of the motion change the stiffness of an arm by "
-            f"{100.0 * loads['estimate']:.2g} %"
-            if loads["neglected"] is None
-            else f"the deviation would be {100.0 * loads['neglected']:.2g} % off without it"
-        )
-        click.echo(f'simulation.stiffening = "auto": on, {reason}')
-    ending, *_ = summary["stop_reason"].partition(NOT_MET)  # which is told last
-    if optimised:
-        ending = f"{_counted(summary)} ({ending}), {_sought(summary)}"
-    click.echo(
-        f"{summary['name']}: {ending}{' ' if optimised else ', '}{_minimised(summary)}, "
-        f"{_largest(summary)}, {_stress(summary)}{_contacts(summary)}{_narrow(summary)}"
-        f"grayness {summary['grayness']:.3f}, {summary['seconds']['total']:.1f} s; results in "
-        f"{folder}"
-    )
-    if summary["certificate"] is not None:
-        click.echo(f"certificate: {summary['certificate']['sentence']}")
-
-
-def _counted(summary: Mapping[str, Any]) -> str:
-    """Return the number of iterations; those beyond the limit, back within constraints, apart."""
-    made, most = summary["iterations"], summary["scene"]["optimizer"]["max_iterations"]
-    return f"{made} iterations" if made <= most else f"{most} iterations and {made - most} further"
-
-
-def _sought(summary: Mapping[str, Any]) -> str:
-    """Return what was done with the objective: "minimised" or "maximised"."""
-    from dolfinopt.responses.response import find
-
-    # Of frequencies the squared period is shown, which becomes least.
-    options = summary["scene"]["objective"]
-    turned = options["direction"] not in (None, find(options["kind"]).natural)
-    return "maximised" if turned else "minimised"
-
-
-def _largest(summary: Mapping[str, Any]) -> str:
-    """Return the largest deviation and when; of a pinned end, which has none, the pin's force."""
-    kinds = [one["kind"] for one in summary["scene"]["closures"]]
-    if kinds == ["pin"] and "closure_force_peak" in summary:
-        return f"largest force of the pin {summary['closure_force_peak']:.4g} N"
-    return (
-        f"maximal deviation {1e3 * summary['max_deviation']:.4g} mm "
-        f"at {summary['max_deviation_time']:.3f} s"
-    )
-
-
-def _stress(summary: Mapping[str, Any]) -> str:
-    """Return the largest stress, where and when, and a comma; "" where there is none."""
-    found = summary["stress"]
-    if found is None:
-        return ""
-    place = ", ".join(f"{x:.3g}" for x in found["place"])
-    return (
-        f"largest stress {1e-6 * found['value']:.4g} MPa in {found['arm']} at ({place}) m "
-        f"and {found['instant']:.3f} s, "
-    )
-
-
-def _contacts(summary: Mapping[str, Any]) -> str:
-    """Return in how many corners and edges alone cells meet, and a comma; "" where in none."""
-    found = summary["contacts"].values()
-    count = sum(one["corners"] + one["edges"] for one in found)
-    if not count:
-        return ""
-    pieces, s = sum(one["pieces"] for one in found), "s" if count > 1 else ""
-    return f"{pieces} pieces by faces and {count} contact{s} without one, "
-
-
-def _narrow(summary: Mapping[str, Any]) -> str:
-    """Return the widths that the design misses, and a comma; "" where it misses none."""
-    return "".join(
-        f"{one['what']} of {1e3 * one['width']:.3g} mm in {one['arm']} "
-        f"({1e3 * one['asked']:.4g} asked for), "
-        for one in summary["too_narrow"]
-    )
-
-
-def _minimised(summary: Mapping[str, Any]) -> str:
-    """Return name, value and unit of the objective, and the frequencies that it stands for."""
-    from dolfinopt.responses.response import find
-
-    options, scenarios = summary["scene"]["objective"], summary["scenarios"]
-    response = find(options["kind"])
-    name = response.label
-    if scenarios:
-        how = "weighted sum" if options["scenarios"] == "sum" else "worst"
-        name += f" ({how} of {len(scenarios)} scenarios)"
-    text = with_unit(f"{name} {summary['objective']:.4g}", response.unit)
-    if options["kind"] == "mass" and "designed_mass" in summary:
-        text += f" ({summary['designed_mass']:.4g} kg of it designed)"
-    if response.stands_for:
-        frequencies = summary["loaded_frequency"].items()
-        found = ", ".join(f"{arm} {value:.4g} {response.limit_unit}" for arm, value in frequencies)
-        text += f" ({response.stands_for} of {found})"
-    return text
-
-
 def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
     if choice is not None and world.rank == 0:
-        click.echo(_chosen(choice.coordinates, choice.error))
+        click.echo(chosen(choice.coordinates, choice.error))
 
 
-def _chosen(coordinates: int, error: float) -> str:
+def chosen(coordinates: int, error: float) -> str:
     return (
         f'reduction.coordinates = "auto": {coordinates} coordinates an arm, estimated error '
         f"{error:.2g}"
@@ -433,6 +297,11 @@ plots_option = click.option("--plots/--no-plots", default=True, help="draw pictu
 
 animation_option = click.option(
     "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
+)
+
+
+verbose_option = click.option(
+    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
 )
 
 
@@ -545,14 +414,9 @@ WIDE = 110  # characters a line
 
 
 def _words(row: HistoryRow, iterations: int) -> str:
-    """Return a row of the history, or of the further iterations after it, in words."""
-    from dolfinopt.optimization.state import FurtherRow  # NumPy: help needs none
-
-    count, kind = iterations, ""
-    if isinstance(row, FurtherRow):
-        count, kind = row.of, "exact gradient, further "
+    """Return a row of the history in words."""
     return (
-        f"{kind}{row.iteration}/{count} objective {row.objective:.4g} "
+        f"{row.iteration}/{iterations} objective {row.objective:.4g} "
         f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
         f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
         + (f", {row.tightest}" if row.tightest else "")
@@ -599,8 +463,6 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
     from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
-    from dolfinopt.optimization.state import FurtherRow
-
     console = Console(stderr=True)
     # Eighty characters hold the figures; a bar wants more.
     columns: list[ProgressColumn] = [
@@ -613,8 +475,7 @@ def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
         task = progress.add_task("setting up", total=iterations)
 
         def show(row: HistoryRow) -> None:
-            total = row.of if isinstance(row, FurtherRow) else iterations
             words = _words(row, iterations)
-            progress.update(task, total=total, completed=row.iteration, description=words)
+            progress.update(task, completed=row.iteration, description=words)
 
         yield show

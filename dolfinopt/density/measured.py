@@ -41,3 +41,7 @@ SAMPLES_LIMIT = 1_000_000
 # A piece that hangs on the rest by one end is a corner up to this length, in widths, and a member
 # beyond. Two straight edges that meet at less than 23 degrees make the longest corners.
 CORNER_LENGTH_RATIO = 2.0
+
+# -- designs ---------------------------------------------------------------------------------
+
+GREY = 0.02  # grayness from which on a design is no longer close to any part

@@ -26,7 +26,6 @@ from dolfinopt.responses.evaluation import evaluate, gradient
 from dolfinopt.responses.motion import MotionResponse
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import FORCES
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -106,7 +105,8 @@ def taylor_test(
             frozen = _by_x(partition, designed, cells, x)
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    share = FORCE_ROUNDING if scene.objective.kind in FORCES else OBJECTIVE_ROUNDING
+    of_forces = "effort_weights" in scene.objective.response.options
+    share = FORCE_ROUNDING if of_forces else OBJECTIVE_ROUNDING
     value = _fixed_objective(exact, partition, arms, patterns, profile, base)
     here = value(x)
     rounding = share * abs(here)
@@ -201,9 +201,9 @@ def _fixed_objective(
 def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float:
     """Return one value of a motion at the instants that `base` chooses."""
     if not trajectory.scenarios:
-        return part.value(trajectory.at(base.t), part.load_cases(base))
+        return part.value_at(trajectory.at(base.t), part.load_cases(base))
     pairs = zip(trajectory.scenarios, base.scenarios, strict=True)
-    values = [part.value(one.at(own.t), part.load_cases(own)) for one, own in pairs]
+    values = [part.value_at(one.at(own.t), part.load_cases(own)) for one, own in pairs]
     return part.combine(trajectory.scene, values)[0]
 
 

@@ -3,102 +3,45 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
-from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.optimization.certificate import (
-    Attempt,
-    Certificate,
-    FurtherRun,
+from dolfinopt.optimization.assessment import (
     assess,
-    certify,
+    evaluated_beside,
     initial_selection,
+    solid_limits,
+    solid_sentence,
+    straight_bars,
 )
+from dolfinopt.optimization.certificate import certify
+from dolfinopt.optimization.conflicts import conflict_sentences
+from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.measured import (
     CHECKPOINT_SECONDS,
-    LANDING_EXCESS,
-    LANDING_MOVE_FACTOR,
-    LANDING_STEPS,
+    COMPARED_ITERATIONS,
+    FROZEN_GAIN,
+    FROZEN_WINDOW,
 )
-from dolfinopt.optimization.problem import Evaluator, Problem, densities
-from dolfinopt.optimization.state import FurtherMemory, HistoryRow, Memory, fields_of
-from dolfinopt.optimization.stopping import Ending, conflict_sentences, stop_reason
+from dolfinopt.optimization.result import RankResult
+from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
+from dolfinopt.optimization.stopping import StopCode, ending, stop_code
 from dolfinopt.parallel import Partition, together
-from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.constraints import Limit, violated
+from dolfinopt.profiling import Profile
+from dolfinopt.progress import log
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.tables.responses import freezes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """An optimised design.
-
-    Attributes:
-        partition, arms: which ranks did what, and this rank's arms with the final design reduced.
-        x_phys: physical densities (n_cells,) of this rank's arms.
-        x_filtered: (n_cells,) what they were projected from, smooth from cell to cell; None without
-            a projection.
-        evaluation: of the final design.
-        trajectory: of the final design; on the root only.
-        crisp: evaluation of the final design cut at x_phys = 1/2; None without a projection.
-        initial_deviation: (n, 2) of the initial design, evenly over the horizon, m; on the root
-            only.
-        history: one row a design, the initial one first; on the root only.
-        iterations: design updates made.
-        best_iteration: updates after which this design was found.
-        converged: True when the change of the design and the Karush-Kuhn-Tucker residual are
-            within their tolerances and every constraint is met.
-        stop_reason: in words.
-        kkt: the residual of the final design by the gradient in use, see `stopping.kkt_residual`.
-        certificate: what the exact gradient says of the final design.
-        limits: every constraint and its value.
-        conflicts: what holds those back that are not met, see `conflicts.conflict_sentences`.
-        profile: seconds and counts of this rank.
-        counts: those of the iterations alone, on this rank.
-        choice: of the coordinates, and the error that they make of the final design's motion;
-            None where the scene states a number.
-    """
-
-    partition: Partition
-    arms: Mapping[int, Arm]
-    x_phys: Mapping[int, np.ndarray]
-    x_filtered: Mapping[int, np.ndarray] | None
-    evaluation: Evaluation
-    crisp: Evaluation | None
-    trajectory: Trajectory | None
-    initial_deviation: np.ndarray
-    history: list[HistoryRow]
-    iterations: int
-    best_iteration: int
-    converged: bool
-    stop_reason: str
-    kkt: float
-    certificate: Certificate
-    limits: tuple[Limit, ...]
-    conflicts: str
-    profile: Profile
-    counts: Counts
-    choice: OrderSelection | None = None
-
-    @property
-    def violated(self) -> str:
-        """Which constraints the final design does not meet, and why; "" if it meets all."""
-        return "; ".join(filter(None, [violated(self.limits), self.conflicts]))
-
-
-# -- the optimisation loop: evaluate, differentiate, update by MMA, until the design converges ---
 
 
 Report = Callable[[HistoryRow], None]
@@ -126,7 +69,8 @@ def run(
     memory: Memory | None = None,
     recorder: Recorder | None = None,
     report: Report | None = None,
-) -> Result:
+    compared: bool = False,
+) -> RankResult:
     """Optimise the scene's arms (collective).
 
     An iteration: filter -> reduce -> simulate -> load cases -> gradient -> MMA.
@@ -137,11 +81,15 @@ def run(
         memory: of a run that goes on.
         recorder: keeps history and memory.
         report: called on the root with every row of the history.
+        compared: look at solid arms before, and at bars of the same mass after the iterations,
+            where these are many enough for it to cost at most a twentieth.
 
     Raises:
         ConvergenceError: a simulation failed.
     """
-    return _Run(Evaluator(scene, partition, arms, profile), recorder, report).go(memory)
+    run_ = _Run(Evaluator(scene, partition, arms, profile), recorder, report)
+    run_.compared = compared and scene.optimizer.max_iterations >= COMPARED_ITERATIONS
+    return run_.go(memory)
 
 
 class _Run:
@@ -153,41 +101,47 @@ class _Run:
         self.evaluator, self.recorder, self.report = evaluator, recorder, report
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
-        one = evaluator.variables
-        x = np.clip(one.initial, one.xmin, one.xmax)
+        variables = evaluator.variables
+        x = np.clip(variables.initial, variables.xmin, variables.xmax)
         self.iterate = Iterate(evaluator, x)
         self.history: list[HistoryRow] = []  # rows so far (root only)
-        self.finished: Ending = ""  # why the iterations have ended, "" while they go on
+        self.finished: StopCode | None = None  # why the iterations have ended
+        self.exact_from: int | None = None  # iteration from which on the gradient is exact
         self.selection: OrderSelection | None = None  # of coordinates, where order is "auto"
         # (n_times, 2) of the initial design, evenly over the horizon, m (root only)
         self.initial_deviation = np.empty((0, 2))
-        self.memory: Memory | None = None  # what was saved last
-        self.further: FurtherMemory | None = None  # of iterations with the exact gradient
+        self.compared = False  # whether to look at solid arms and bars
         self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
-    def go(self, memory: Memory | None) -> Result:
-        """Iterate until the design converges or the iterations are spent."""
+    def go(self, memory: Memory | None) -> RankResult:
+        """Iterate until the design gains no more or the iterations are spent."""
         self._begin(memory)
         self._evaluate(anew=memory is None)
         if memory is None:
             self._record()
-        while not self._finished() or self._stiffens():
+            self._look_at_solid_arms()
+        while not self._finished() or self._goes_on():
             self.iterate.step()
             if not self.iterate.stuck:
                 self._record()
                 self._checkpoint()
         self._checkpoint(force=True)
-        self._land()
         return self._result()
 
     def _begin(self, memory: Memory | None) -> None:
         """Go on from `memory`, or choose the coordinates for the initial design (collective)."""
+        scene = self.scene
         if memory is not None:
             self._restore(memory)
-        elif needs(self.scene, "motion"):
-            initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
-            self.selection = initial_selection(self.evaluator, initial)
+        else:
+            if scene.objective.gradient == "exact" and scene.objective.has_esl_gradient:
+                self.evaluator.use_gradient("esl")
+            elif scene.objective.gradient == "exact":
+                self.exact_from = 0
+            if needs(scene, "motion"):
+                initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
+                self.selection = initial_selection(self.evaluator, initial)
         if self.recorder is not None:
             self.recorder.begin(self.history)
 
@@ -201,10 +155,60 @@ class _Run:
         if trajectory is not None and len(self.initial_deviation) == 0:
             self.initial_deviation = trajectory.deviation
 
+    def _look_at_solid_arms(self) -> None:
+        """Tell what solid arms make of the limits (collective)."""
+        if not self.compared:
+            return
+        with self.profile.phase("comparison"):
+            limits = solid_limits(self.evaluator)
+        if limits and self.partition.world.rank == 0:
+            log.info(solid_sentence(limits))
+
+    def _bars(self, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+        """Evaluate straight solid bars of the same mass (collective)."""
+        if not self.compared or self.iterate.iteration < COMPARED_ITERATIONS:
+            return None
+        bars = straight_bars(self.evaluator, x_phys)
+        with self.profile.phase("comparison"):
+            return None if bars is None else evaluated_beside(self.evaluator, bars)
+
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
-        self.finished = self.iterate.ending()
-        return bool(self.finished)
+        one, options = self.iterate, self.scene.optimizer
+        last = options.max_iterations
+        if self.scene.objective.gradient == "esl" and self.exact_from is not None:
+            last = self.exact_from + options.exact_iterations
+        self.finished = stop_code(
+            self.scene, one.iteration, last, one.progress, one.best, one.stuck
+        )
+        late = self._begins_with_frozen_loads and one.progress.gain(FROZEN_WINDOW) <= FROZEN_GAIN
+        return late or self.finished is not None
+
+    @property
+    def _begins_with_frozen_loads(self) -> bool:
+        return self.scene.objective.gradient == "exact" and self.exact_from is None
+
+    def _goes_on(self) -> bool:
+        """Look for what is still to be done where nothing is gained any more (collective)."""
+        if self.finished in (StopCode.SETTLED, StopCode.STUCK) and self.iterate.begin_again():
+            return True
+        return self._uses_exact_gradient() or self._stiffens()
+
+    def _uses_exact_gradient(self) -> bool:
+        """Go over to the exact gradient where frozen loads have done their work (collective)."""
+        # Frozen loads lead past resonances of the initial design, which the exact gradient, true
+        # as it is, does not see beyond.
+        one, options = self.iterate, self.scene.optimizer
+        more = options.exact_iterations > 0 and self.exact_from is None and freezes(self.scene)
+        if one.iteration >= options.max_iterations and not (
+            self.scene.objective.gradient == "esl" and more
+        ):
+            return False
+        if not (more or self._begins_with_frozen_loads):
+            return False
+        one.use_gradient("exact")
+        one.stuck, self.exact_from, self.finished = "", one.iteration, None
+        return True
 
     def _stiffens(self) -> bool:
         """Look again whether geometric stiffening counts, and say whether to go on (collective)."""
@@ -227,38 +231,22 @@ class _Run:
             return False
         return self.iterate.iteration < self.scene.optimizer.max_iterations
 
-    def _land(self) -> None:
-        """Take short steps where the iterations ended just beyond a limit (collective)."""
-        # The checkpoint does not know of them: a run that is resumed with more iterations goes on
-        # as if it had not ended.
-        one = self.iterate
-        if self.finished != "limit" or not one.curved:
-            return
-        one.search = replace(one.search, freedom=0, radius=LANDING_MOVE_FACTOR)
-        one.continuation.held = True
-        for _ in range(LANDING_STEPS):
-            if one.best.excess == 0.0 or one.problem.excess > LANDING_EXCESS or one.stuck:
-                return
-            one.step()
-            if not one.stuck:
-                self._record()
-
-    def _result(self) -> Result:
+    def _result(self) -> RankResult:
         """Assess the best design (collective)."""
-        one, counts = self.iterate, replace(self.profile.counts)
-        made, idle, sought = one.iteration, one.idle, one.least_violated
+        one, counts, code = self.iterate, replace(self.profile.counts), self.finished
+        assert code is not None
         if one.return_to_best():
             one.measure()
-        certificate = certify(self.evaluator, one.x, one.nominal, one.problem, self._further)
-        if self.further is not None:
-            self._checkpoint(force=True)
+        certificate = certify(self.evaluator, one.x, one.nominal, one.problem)
         x_phys = one.nominal.x_phys
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        limits, conflicts = one.problem.limits, self._conflicts(sought)
-        not_met = "; ".join(filter(None, [violated(limits), conflicts]))
-        return Result(
+        conflicts, kept = self._conflicts(code), one.problem.excess == 0.0
+        best = one.best.iteration
+        returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"
+        return RankResult(
+            scene=self.scene,
             partition=self.partition,
             arms=self.arms,
             x_phys=x_phys,
@@ -267,28 +255,20 @@ class _Run:
             crisp=final.crisp,
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
-            history=self.history,
-            iterations=made,
-            best_iteration=one.iteration,
-            converged=self.finished == "converged",
-            stop_reason=stop_reason(
-                self.scene,
-                self.finished,
-                one.change,
-                one.residual.rms,
-                not_met,
-                one.grayness,
-                one.stuck,
-                idle,
-                None if one.iteration == made else one.iteration,
-            ),
+            rows=self.history,
+            iterations=one.iteration,
+            best_iteration=best if best >= 0 else one.iteration,
+            stop_code=code,
+            ending=ending(self.scene, code, one.progress, kept, one.stuck, returned),
             kkt=one.residual.rms,
+            exact_from=self.exact_from,
             certificate=certificate,
-            limits=limits,
+            limits=one.problem.limits,
             conflicts=conflicts,
             profile=self.profile,
             counts=counts,
             choice=final.selection,
+            bars=self._bars(x_phys),
         )
 
     def _filtered(self) -> dict[int, np.ndarray] | None:
@@ -296,26 +276,12 @@ class _Run:
         if not self.scene.design.projection:
             return None
         x = self.evaluator.variables.split(self.iterate.x)
-        return self.evaluator.continuation.smoothed(x)
+        return self.evaluator.projection.smoothed(x)
 
-    def _further(self, problem: Problem, count: int) -> Iterator[Attempt]:
-        """Go on with the exact gradient, see `FurtherRun.iterations` (collective)."""
-        # Iterations of an interrupted run are not repeated.
-        one, memory = self.iterate, self.memory
-        done = None if memory is None else memory.further
-        run = FurtherRun(self.evaluator, one.x, one.iteration, done)
-        for attempt in run.iterations(problem, count):
-            self.further = run.memory
-            if run.row is not None:
-                self._show(run.row)
-                self._checkpoint()
-            yield attempt
-
-    def _conflicts(self, sought: bool) -> str:
+    def _conflicts(self, code: StopCode) -> str:
         """Return what holds back the limits that x does not meet (collective)."""
-        # `sought` says whether the violation was lessened as far as steps could.
         one, v = self.iterate, self.evaluator.variables
-        if not sought and one.problem.excess > 0.0:
+        if code is StopCode.ITERATIONS and one.problem.excess > 0.0:
             return "let the optimisation go on (optimizer.max_iterations)"
         return conflict_sentences(one.problem, one.x, v.xmin, v.xmax, v.slices, one.total)
 
@@ -326,18 +292,19 @@ class _Run:
         row = self.iterate.measure()
         with together(self.partition.world):
             if self.partition.world.rank == 0:
-                row = replace(row, seconds=self._seconds())
+                problem, residual = self.iterate.problem, self.iterate.residual
+                first = self.history[0].objective if self.history else row.objective
+                row = replace(
+                    row,
+                    seconds=self._seconds(),
+                    merit=problem.merit(abs(first) or 1.0),
+                    multipliers=problem.by_limit(residual.scale * residual.multipliers),
+                )
                 self.history.append(row)
                 if self.recorder is not None:
                     self.recorder.append(row)
                 if self.report is not None:
                     self.report(row)
-
-    def _show(self, row: HistoryRow) -> None:
-        """Report a row that is not the history's (collective)."""
-        with together(self.partition.world):
-            if self.partition.world.rank == 0 and self.report is not None:
-                self.report(replace(row, seconds=self._seconds()))
 
     def _seconds(self) -> float:
         return self.seconds_before + time.perf_counter() - self.begun
@@ -350,28 +317,22 @@ class _Run:
         if self.recorder is None or not self.partition.world.bcast(due, root=0):
             return
         with self.profile.phase("checkpoint"):
-            self.memory = self._memory()
-            self.recorder.save(self.memory)
+            self.recorder.save(self._memory())
         self.saved = time.perf_counter()
 
     def _memory(self) -> Memory:
-        """Return what to save; once the iterations have ended, that they have further ones."""
-        known = self.memory
-        if self.further is not None and known is not None:
-            return replace(known, further=self.further)
-        same = known is not None and known.iteration == self.iterate.iteration
+        """Return what to save."""
         return Memory(
             **fields_of(self.iterate.memory()),
             history=list(self.history),
             initial_deviation=self.initial_deviation,
-            finished=self.finished,
+            exact_from=self.exact_from,
             choice=self.selection,
             stiffening=stiffening_of(self.arms),
-            further=known.further if same and known is not None else None,
         )
 
     def _restore(self, memory: Memory) -> None:
-        self.selection, self.memory = memory.choice, memory
+        self.selection, self.exact_from = memory.choice, memory.exact_from
         for arm in self.arms.values():
             if memory.choice is not None:
                 arm.set_order(memory.choice.coordinates)

@@ -4,42 +4,19 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 """
 
 
-# -- Which steps are taken (mma, iterate) --
+# -- The step (iterate); figures of the sixteen problems in docs: theory/optimiser --
 
-# Of the promised fall of the merit: what a step must bring; with frozen loads any fall does.
-ACCEPTED_FALL_SHARE = 0.05
-LONGER_FALL_SHARE = 0.6  # of it: the next step may be longer
-SHORTER_FALL_SHARE = 0.25  # of it, at less: the next step is shorter
-SHORTER_MOVE_FACTOR = 0.5  # on the move limit
-# On the move limit, where the merit rose by twice what was promised, and of free steps.
-SHORTEST_MOVE_FACTOR = 0.25
-LONGER_MOVE_FACTOR = 2.0  # on the move limit
-STRICT_ATTEMPTS = 8  # of a strict step: the last is 1 % as long as the first
-MERIT_ROUNDING = 1e-10  # relative
-# Without a lower merit until the search goes back; of 13 problems the longest way over a hill that
-# ended lower took ten.
-FREE_STEPS = 8
-STRICT_STEPS = 3  # after that, before free ones again
-FREE_ATTEMPTS = 4  # of a free step that leaps
-# On a limit's value, or on the objective of a design that keeps all limits: leads nowhere.
-LEAP_FACTOR = 2.0
+SHORTER_REACH = 0.5  # on the move limit where the merit rose
+REACH_GROWTH = 1.2  # on it where it did not
+LEAST_REACH = 0.05  # of the scene's move limit
+RETURNED_REACH = 0.25  # of it, after the search has gone back to the best design
+MERIT_RISE = 1e-3  # of the merit, from which on it counts as risen
+SHORTER_STEP = 0.25  # on a step without a motion, or that leaps
+STEP_ATTEMPTS = 4  # the last one 1/64 as long
+LEAP_FACTOR = 2.0  # on a limit, or on the objective of a design that keeps all: leads nowhere
 # For each time step of the last motion before a step is given up; most designs take 3 to 10,
 # machines 16 to 44, what falls apart thousands.
 STEP_NEWTON_ITERATIONS = 100.0
-RELEASE_MERIT_SHARE = 0.98  # of the merit since free steps were tried last: they are tried again
-# Without a smaller violation until limits get dearer; Byrd, Nocedal & Waltz (2008),
-# doi:10.1080/10556780701394169.
-DEARER_ITERATIONS = 20
-DEARER_PRICE_FACTOR = 30.0  # on the price of limits then
-DEAREST_PRICE_FACTOR = 900.0  # on it at most: what is left is the least violation
-# Of a held smooth limit, relative and for a change of x by 1: a new stage begins.
-STAGE_LIMIT_DRIFT = 0.05
-STAGE_PRICE_FACTOR = 2.0  # change of the objective from which a new stage begins
-STAGE_LIMIT_LEVEL = -0.2  # relative value from which on a limit counts for that
-CONVEXITY_MARGIN_FACTOR = 1.1  # Svanberg's: a little more convexity than what was seen asks for
-CONVEXITY_GROWTH_FACTOR = 10.0  # at most, in one step
-CONVEXITY_KEPT_SHARE = 0.5  # after a step that did not need it
-CONVEXITY_NOISE = 1e-6  # relative difference from the promise below which nothing is learnt
 
 # -- The projection, and the price of limits (problem) --
 
@@ -48,7 +25,6 @@ CONVEXITY_NOISE = 1e-6  # relative difference from the promise below which nothi
 GENTLE_SHARPNESS = 4.0
 # Relative violation of a limit from which on beta waits for the design to come back.
 WAITING_EXCESS = 0.02
-STRICT_SHARPENINGS = 4  # parts of design.continuation in which strict steps have one function
 # Of a relative excess, in objectives: 1 % costs a tenth; mass and compliance change by 1 to 3 %
 # with a percent of a limit.
 LIMIT_PRICE = 10.0
@@ -67,22 +43,18 @@ DEPENDENT_EIGENVALUE_SHARE = 1e-12
 ROOM_SHARE = 1e-3  # of their range that variables are away from both bounds that can move
 # Of the range, step of the variable that moves most: what bounds nearer than that hold.
 TRIAL_STEP_SHARE = 0.1
-LARGEST_RESIDUAL_FACTOR = 10.0  # times the tolerance of the root mean square
 # Of the norm that stands for the largest: 20 % above it at most, of 1e5 cells.
 LARGEST_EXPONENT = 64
-CUT_OFF_MOVE_SHARE = 0.5  # of the move limit: a larger change was cut off and tells nothing
 # Grayness above which a projection has not done its work: 2 % of the cells at 1/2.
 GREY_SHARE = 0.02
-LANDING_EXCESS = 0.05  # of a limit with which spent iterations go on with short steps
-LANDING_MOVE_FACTOR = 0.1  # on their move limit
-LANDING_STEPS = 8  # at most
-SETTLED_ITERATIONS = 60  # without a better design, the projection complete: the run has settled
-IMPROVING_ITERATIONS = 20  # within which a run counts as still improving
+WINDOW = 20  # iterations in which a run that goes on gains `optimizer.tolerance`; 10 end rods early
+INFEASIBLE_WINDOW = 60  # as long as no design keeps all limits
+LOOKED_AT = 5  # every so many iterations: counts do not depend on rounding then
+FROZEN_WINDOW = 10  # iterations in which frozen loads gain FROZEN_GAIN, else the exact gradient
+FROZEN_GAIN = 0.01
 OPPOSING_SHARE = 0.05  # of a violated limit's gradient that another one balances: they conflict
 # Of a limit: nearer than that it counts as reached, the iterations may end any time.
 REACHED_LIMIT_SHARE = 0.02
-# Of the objective or the violation by which a better design counts as improved.
-IMPROVED_SHARE = 1e-3
 # After which a checkpoint is written: a kill costs no more, writing stays below a percent.
 CHECKPOINT_SECONDS = 2.0
 
@@ -96,6 +68,8 @@ COORDINATE_RESERVE_FACTOR = 3.0
 # to 44.
 CRISP_NEWTON_ITERATIONS = 400.0
 
+COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a twentieth
+
 # -- Taylor tests (gradient_check) --
 
 STEP_RATIO = 4.0  # of one step to the next: remainders of second order fall by 16
@@ -106,14 +80,16 @@ PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 
 # -- Approximation and its dual (mma); what is Svanberg's stands there --
 
-FIRST_ASYMPTOTE_DISTANCE = 0.5  # of the range of a variable
+# Of the range of a variable. With Svanberg's 0.5 rounding grows to 7e-5 of the objective of
+# two_arm.toml in 90 iterations, with 0.2 to 1e-10, and to 5e-6 where distances grow by 1.4.
+FIRST_ASYMPTOTE_DISTANCE = 0.2
 LEAST_ASYMPTOTE_DISTANCE = 0.01  # of it
 LARGEST_ASYMPTOTE_DISTANCE = 10.0  # of it
 # Of it, largest with curved constraints: with 10 limits of the motion are left every 25 steps.
 CURVED_ASYMPTOTE_DISTANCE = 1.0
-# Of the range: a smaller move is rounding, and asymptotes would depend on the order of summation
-# over ranks.
-REST_MOVE_SHARE = 1e-9
+# Of the range: a smaller move counts neither as back nor as forth. With 1e-9 rounding decides, and
+# the kernels of OpenBLAS end in 2 % of the runs with other counts; with 1e-6 in none of 200.
+REST_MOVE_SHARE = 1e-6
 PENALTY_LIMIT = 1e9  # of the elastic price
 # The dual is stepped in units of (multiplier + this), as they span decades; below raa0 they hardly
 # change the design.

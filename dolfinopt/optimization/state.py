@@ -11,10 +11,9 @@ import numpy as np
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.optimization.measured import IMPROVED_SHARE
-from dolfinopt.optimization.mma import Search
-from dolfinopt.optimization.problem import Stage
 from dolfinopt.responses.order_selection import OrderSelection
+
+MULTIPLIER = "multiplier_"  # begins the columns of multipliers
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,11 @@ class HistoryRow:
         volume_fraction: over all arms.
         change: largest change of a design variable in the update that led here.
         seconds: wall-clock time since the run's beginning, earlier parts included.
-        kkt: Karush-Kuhn-Tucker residual of this design, see `stopping.kkt_residual`.
+        kkt: Karush-Kuhn-Tucker residual of this design, see `residual.kkt_residual`.
+        merit: objective over that of the initial design, and ten times the limits' excesses.
         constraints: value of every constraint, by its name, see `constraints.Limit`.
+        multipliers: of every constraint by its name: by how much the objective betters, to first
+            order, for each 100 % by which the limit is eased.
         tightest: how far limits are kept, in words; of the live line, not kept in history.csv.
     """
 
@@ -42,39 +44,37 @@ class HistoryRow:
     change: float
     seconds: float
     kkt: float = np.nan
+    merit: float = np.nan
     constraints: Mapping[str, float] = field(default_factory=dict)
+    multipliers: Mapping[str, float] = field(default_factory=dict)
     tightest: str = field(default="", compare=False, repr=False)
 
     @property
     def columns(self) -> list[str]:
         """Names of `values`, the header of history.csv."""
-        return [f.name for f in fields(self)][:-2] + list(self.constraints)
+        own = [f.name for f in fields(self)][:-3]
+        return own + list(self.constraints) + [f"{MULTIPLIER}{one}" for one in self.multipliers]
 
     @property
     def values(self) -> list[float]:
         """The row of history.csv."""
-        return [*astuple(self)[:-2], *self.constraints.values()]
+        own = astuple(self)[:-3]
+        return [*own, *self.constraints.values(), *self.multipliers.values()]
 
     @classmethod
     def from_values(cls, columns: Sequence[str], values: Sequence[float]) -> HistoryRow:
         """Return the row of which `columns` and `values` are."""
-        own = len(fields(cls)) - 2
-        pairs = zip(columns[own:], map(float, values[own:]), strict=True)
-        iteration, *figures = values[:own]
+        known = [f.name for f in fields(cls)][:-3]
+        figures = dict(zip(columns, map(float, values), strict=True))
+        own = {name: figures.pop(name) for name in known if name in figures}
+        size = len(MULTIPLIER)
         # Columns by name: one by one they would hide what mypy can check.
-        named = dict(zip(columns[1:own], map(float, figures), strict=True))
-        return cls(iteration=int(iteration), constraints=dict(pairs), **named)  # type: ignore[arg-type]
-
-
-@dataclass(frozen=True)
-class FurtherRow(HistoryRow):
-    """The same of a further iteration with the exact gradient; shown, and not kept.
-
-    Attributes:
-        of: how many of them there are at most.
-    """
-
-    of: int = 0
+        return cls(
+            iteration=int(own.pop("iteration")),
+            constraints={k: x for k, x in figures.items() if not k.startswith(MULTIPLIER)},
+            multipliers={k[size:]: x for k, x in figures.items() if k.startswith(MULTIPLIER)},
+            **own,  # type: ignore[arg-type]
+        )
 
 
 # -- what an optimisation must remember to go on as if it had never been interrupted -------------
@@ -95,8 +95,6 @@ class Best:
         objective: what is minimised.
         excess: largest relative violation of a limit.
         crisp: whether nearly all of it is solid or void.
-        improved: iteration of the last design that was better than the one before by a tenth of a
-            percent, and `reference` its objective, of an infeasible one its excess.
     """
 
     x: np.ndarray
@@ -106,8 +104,6 @@ class Best:
     objective: float
     excess: float
     crisp: bool = False
-    improved: int = 0
-    reference: float = np.inf
 
     @classmethod
     def none(cls, x: np.ndarray) -> Best:
@@ -115,25 +111,58 @@ class Best:
         return cls(x, -1, 0.0, {}, np.inf, np.inf)
 
     @property
-    def sharpness(self) -> float:
-        """Steepness of the projection, infinite of a crisp design."""
-        return np.inf if self.crisp else self.beta
-
-    @property
     def rank(self) -> tuple[bool, float, float]:
         """What is smaller for a better design; of infeasible ones the least violation counts."""
         if self.excess > 0.0:
             return True, self.excess, self.objective
-        return False, -self.sharpness, self.objective
+        return False, -np.inf if self.crisp else -self.beta, self.objective
 
-    def after(self, before: Best) -> Best:
-        """Return it with what it has improved since `before`, which it follows."""
-        value = self.excess or self.objective
-        same = (self.excess > 0.0) == (before.excess > 0.0)
-        same = same and self.sharpness <= before.sharpness
-        if same and value > before.reference - IMPROVED_SHARE * abs(before.reference):
-            return replace(self, improved=before.improved, reference=before.reference)
-        return replace(self, improved=self.iteration, reference=value)
+    def with_variables(self, x: np.ndarray) -> Best:
+        """Return it with these variables (n,)."""
+        return replace(self, x=x)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The course of the iterations, by which it is judged whether they still gain anything.
+
+    Attributes:
+        objectives, excesses: of every design so far: what is minimised, and the largest relative
+            violation of a limit.
+        since: number of the first one that can be compared with the last: of the same projection.
+    """
+
+    objectives: tuple[float, ...] = ()
+    excesses: tuple[float, ...] = ()
+    since: int = 0
+
+    def after(self, objective: float, excess: float) -> Progress:
+        """Return it with one design more."""
+        objectives = (*self.objectives, float(objective))
+        return Progress(objectives, (*self.excesses, float(excess)), self.since)
+
+    def anew(self) -> Progress:
+        """Return it where the next design is the first that counts."""
+        return replace(self, since=len(self.objectives))
+
+    @property
+    def feasible(self) -> bool:
+        """Whether a design that counts keeps all limits."""
+        return 0.0 in self.excesses[self.since :]
+
+    def gain(self, window: int) -> float:
+        """Return by how much the best design got better in so many iterations, relative.
+
+        Best is the least objective within all limits; where no design keeps them the least
+        violation. Infinite as long as there are fewer iterations that count.
+        """
+        excesses = np.array(self.excesses[self.since :])
+        if len(excesses) <= window:
+            return np.inf
+        values = np.array(self.objectives[self.since :])
+        values = np.where(excesses > 0.0, np.inf, values) if self.feasible else excesses
+        before, now = values[:-window].min(), values.min()
+        return float((before - now) / (abs(now) or 1.0)) if np.isfinite(before) else np.inf
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,13 +172,15 @@ class IterateMemory:
     Attributes:
         iteration: design updates made.
         change: largest one in the last update.
+        reach, returned_to: factor on the move limit, and the design that was gone back to last.
+        mma_steps: taken since the asymptotes began.
+        gradient: in use, "exact" or "esl".
         cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
-        multipliers, convexity: MMA's, on all ranks.
-        stage, search: that the design belongs to, and how the next step is sought.
-        age, held: updates since beta rose, and whether it stays as it is.
+        multipliers: MMA's, on all ranks.
         best: the best design so far; its variables are the last column of `cells`.
+        progress: the course of the iterations.
         guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
@@ -158,34 +189,19 @@ class IterateMemory:
 
     iteration: int
     change: float
+    reach: float
+    returned_to: int
+    mma_steps: int
+    gradient: str
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
     guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
-    convexity: np.ndarray
-    stage: Stage
-    search: Search
-    age: int
-    held: bool
     best: Best
+    progress: Progress
     solutions: tuple[Solution, ...]
     beta: float
     thresholds: Mapping[int, float]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FurtherMemory(IterateMemory):
-    """The further iterations with the exact gradient.
-
-    Attributes:
-        begun: updates of the design from which they set out.
-        objectives: of every design, in the order of the iterations.
-        feasible: whether it keeps all constraints.
-    """
-
-    begun: int
-    objectives: tuple[float, ...]
-    feasible: tuple[bool, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -195,20 +211,18 @@ class Memory(IterateMemory):
     Attributes:
         history: rows so far.
         initial_deviation: (n, 2) m of the initial design, evenly over the horizon.
-        finished: reason, or "" while running.
+        exact_from: iteration from which on the gradient is exact, None as long as it is not.
         choice: of the coordinates, where the scene leaves it to "auto".
         stiffening: decided for the initial design; None where nothing was simulated.
-        further: what has been done of the further iterations with the exact gradient.
     """
 
     history: list[HistoryRow]
     initial_deviation: np.ndarray
-    finished: str
+    exact_from: int | None
     choice: OrderSelection | None = None
     stiffening: Stiffening | None = None
-    further: FurtherMemory | None = None
 
 
-def fields_of(one: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as they are, by their names."""
-    return {field.name: getattr(one, field.name) for field in fields(one)}
+def fields_of(one: Any, kind: type | None = None) -> dict[str, Any]:
+    """Return the fields of a dataclass, or those of one that it derives from, by their names."""
+    return {field.name: getattr(one, field.name) for field in fields(kind or one)}

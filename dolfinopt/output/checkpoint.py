@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +15,7 @@ from dolfinopt.dynamics.collocation import Solution, Strategy
 from dolfinopt.errors import InputError
 from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.optimization.mma import Search
-from dolfinopt.optimization.problem import Stage
-from dolfinopt.optimization.state import Best, FurtherMemory, HistoryRow, IterateMemory, Memory
+from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Memory, Progress
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
@@ -30,10 +27,9 @@ if TYPE_CHECKING:
 
 NAME = CHECKPOINT
 SEAL = "digest"  # of all other arrays
-FURTHER = "further/"  # before the names of what further iterations left
 # Keys a resumed run may change: they say when to stop, not what design is computed.
 # Numbers of the best design.
-BEST = "iteration", "beta", "objective", "excess", "crisp", "improved", "reference"
+BEST = "iteration", "beta", "objective", "excess", "crisp"
 MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
 
 
@@ -66,9 +62,6 @@ def save(
     """Replace the checkpoint atomically (collective)."""
     number = len(scene.arms) + 1
     arrays = arrays_of(partition, arms, memory, number)
-    if memory.further is not None:
-        more = arrays_of(partition, arms, memory.further, number)
-        arrays |= {FURTHER + key: value for key, value in more.items()}
     with together(partition.world):
         if partition.world.rank == 0:
             _write(folder, scene, memory, arrays)
@@ -82,7 +75,7 @@ def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -
         "history": np.array([row.values for row in memory.history]),
         "history_columns": np.array(memory.history[0].columns),
         "initial_deviation": memory.initial_deviation,
-        "finished": np.array(memory.finished),
+        "exact_from": -1 if memory.exact_from is None else memory.exact_from,
     }
     if memory.choice is not None:
         arrays["coordinates"] = memory.choice.coordinates
@@ -92,9 +85,6 @@ def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -
         arrays["stiffening"] = [
             np.nan if x is None else float(x) for x in (known.estimate, known.on, known.neglected)
         ]
-    if (further := memory.further) is not None:
-        arrays[f"{FURTHER}begun"] = further.begun
-        arrays[f"{FURTHER}designs"] = np.column_stack([further.objectives, further.feasible])
     _sealed(folder, {key: np.asarray(value) for key, value in arrays.items()})
 
 
@@ -149,24 +139,14 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
             None if np.isnan(x) else x for x in arrays["stiffening"].tolist()
         )
         stiffening = Stiffening(estimate, bool(on), neglected)
-    further = None
-    if f"{FURTHER}begun" in arrays:
-        own = {k.removeprefix(FURTHER): v for k, v in arrays.items() if k.startswith(FURTHER)}
-        objectives, feasible = own["designs"].T.tolist()
-        further = FurtherMemory(
-            **fields_from(own, arms),
-            begun=int(own["begun"]),
-            objectives=tuple(objectives),
-            feasible=tuple(map(bool, feasible)),
-        )
+    exact_from = int(arrays["exact_from"])
     return Memory(
         **fields_from(arrays, arms),
         history=history,
         initial_deviation=arrays["initial_deviation"],
-        finished=str(arrays["finished"]),
+        exact_from=None if exact_from < 0 else exact_from,
         choice=choice,
         stiffening=stiffening,
-        further=further,
     )
 
 
@@ -266,12 +246,11 @@ def arrays_of(
         return {}
     arrays: dict[str, Any] = {
         "iteration": memory.iteration,
-        "last": [memory.change, memory.age, memory.held],
+        "last": [memory.change, memory.reach, memory.returned_to, memory.mma_steps],
+        "gradient": memory.gradient,
         "multipliers": memory.multipliers,
-        "convexity": memory.convexity,
-        "held": memory.stage.limits,
-        "price": memory.stage.price,
-        "search": astuple(memory.search),
+        "course": [memory.progress.objectives, memory.progress.excesses],
+        "since": memory.progress.since,
         "best": [getattr(memory.best, name) for name in BEST],
         "sharpness": memory.beta,
     }
@@ -333,7 +312,8 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
         error, strategy = float(arrays[f"{of}/error"]), Strategy[str(arrays[f"{of}/strategy"])]
         solutions.append(Solution(**parts, error=error, iterations=0, strategy=strategy))
-    change, age, held = arrays["last"].tolist()
+    change, reach, returned_to, mma_steps = arrays["last"].tolist()
+    objectives, excesses = map(tuple, arrays["course"].tolist())
     best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
     iteration = best["iteration"] = int(best["iteration"])
     best["crisp"] = bool(best["crisp"])
@@ -343,16 +323,16 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
     return {
         "iteration": int(arrays["iteration"]),
         "change": change,
+        "reach": reach,
+        "returned_to": int(returned_to),
+        "mma_steps": int(mma_steps),
+        "gradient": str(arrays["gradient"]),
         "cells": cells,
         "modes": modes,
         "guesses": guesses,
         "multipliers": arrays["multipliers"],
-        "convexity": arrays["convexity"],
-        "stage": Stage(tuple(arrays["held"]), float(arrays["price"])),
-        "search": Search.from_numbers(arrays["search"].tolist()),
-        "age": int(age),
-        "held": bool(held),
         "best": Best(x=np.empty(0), thresholds=thresholds, **best),
+        "progress": Progress(objectives, excesses, int(arrays["since"])),
         "solutions": tuple(solutions),
         "beta": float(arrays["sharpness"]),
         "thresholds": {k: float(arrays[f"arm{k}/threshold"]) for k in cells},

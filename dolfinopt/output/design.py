@@ -24,7 +24,6 @@ from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
-from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Arm as SceneArm
 from dolfinopt.scene.load import Scene
@@ -287,7 +286,7 @@ def write_gradient(
             order, name = canonical_order(centroid), scene.arms[index].name
             arrays[f"{name}/centroid"] = centroid[order]
             arrays[f"{name}/gradient"] = gathered[index][order]
-        unit = objective_of(scene).unit  # per physical density, which has none
+        unit = scene.objective.response.unit  # per physical density, which has none
         arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
         write_arrays(path, arrays)
 

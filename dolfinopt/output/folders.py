@@ -33,6 +33,7 @@ RUN_FILES = (
     "design.vtu",
     "design.png",
     "history.png",
+    "limits.png",
     "deviation.png",
     "drives.png",
     "motion.gif",

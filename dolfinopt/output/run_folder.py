@@ -12,14 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization import loop
-from dolfinopt.optimization.certificate import Certificate
-from dolfinopt.optimization.loop import Report, Result
+from dolfinopt.optimization.loop import Report
+from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import ArmView, HistoryWriter, gather_views, write_design, write_fields
@@ -33,10 +31,7 @@ from dolfinopt.output.folders import (
 from dolfinopt.output.summary import summarise, write_budget, write_summary
 from dolfinopt.output.trajectory import write_trajectory
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
-from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.constraints import Limit
-from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.order_selection import OrderSelection
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import named_files, with_relative_paths
@@ -47,46 +42,6 @@ if TYPE_CHECKING:
 Draw = Callable[[list[ArmView]], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Simulated:
-    """One design in one scene, simulated, and how it was found.
-
-    Attributes:
-        scene, partition, arms, x_phys: the design.
-        evaluation, trajectory: what came of it; the trajectory is the root's, None elsewhere.
-        profile: this rank's.
-        choice: what `reduction.coordinates = "auto"` came to.
-        counts: this rank's, where not all of the profile's belong to the run.
-        crisp: evaluation of the design cut at one half.
-        x_filtered: what `x_phys` was projected from, see `Result`.
-        iterations, best_iteration, converged, stop_reason, kkt: of the optimisation: after which
-            the design was found; kkt is its residual.
-        certificate: of the optimised design.
-        limits: the constraints; by default those of `evaluation` and `x_phys`.
-        initial_deviation: (n, 2) m, of the initial design, kept for the picture.
-    """
-
-    scene: Scene
-    partition: Partition
-    arms: Mapping[int, Arm]
-    x_phys: Mapping[int, np.ndarray]
-    evaluation: Evaluation
-    trajectory: Trajectory | None
-    profile: Profile
-    choice: OrderSelection | None = None
-    counts: Counts | None = None
-    crisp: Evaluation | None = None
-    x_filtered: Mapping[int, np.ndarray] | None = None
-    iterations: int = 0
-    best_iteration: int = 0
-    converged: bool = True
-    stop_reason: str = "simulated"
-    kkt: float | None = None
-    certificate: Certificate | None = None
-    limits: Sequence[Limit] | None = None
-    initial_deviation: np.ndarray | None = None
-
-
 @dataclass(frozen=True)
 class Written:
     """What the root wrote: every arm as pictures need it, and the content of summary.json."""
@@ -95,25 +50,25 @@ class Written:
     summary: Mapping[str, Any]
 
 
-def write_simulation(
+def write_result(
     folder: Path,
-    simulated: Simulated,
+    result: RankResult,
     wall: float,
     *,
     paraview: bool = True,
     pictures: Draw | None = None,
 ) -> Written | None:
-    """Write design, trajectory and summary of a simulation (collective); None but on the root.
+    """Write design, trajectory and summary of a result (collective); None but on the root.
 
     Args:
-        folder: exists.
-        simulated: what.
+        folder: exists; of an optimisation history and checkpoint are there already.
+        result: what came of a simulation or an optimisation.
         wall: seconds that it took up to now; the summary's total also counts what follows.
         paraview: write design.vtu and design.xdmf, too.
         pictures: called with the arms' views before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
-    one = simulated
+    one = result
     stress = stress_report(one.partition, one.arms, one.trajectory, one.profile)
     views = gather_views(one.scene, one.partition, one.arms, one.x_phys, stress, one.x_filtered)
     summary = summarise(one, wall, stress)
@@ -137,47 +92,6 @@ def write_simulation(
         summary["scene"] = with_relative_paths(summary["scene"], folder)
         write_summary(folder, summary)
         return Written(views, summary)
-
-
-def write_result(
-    scene: Scene,
-    folder: Path,
-    result: Result,
-    wall: float,
-    *,
-    paraview: bool = True,
-    pictures: Draw | None = None,
-) -> Written | None:
-    """Write design, trajectory and summary of an optimisation (collective); None but on the root.
-
-    Args:
-        scene: that was optimised.
-        folder: exists; history and checkpoint are there already.
-        result: what `optimize` returned.
-        wall, paraview, pictures: as for `write_simulation`.
-    """
-    simulated = Simulated(
-        scene,
-        result.partition,
-        result.arms,
-        result.x_phys,
-        result.evaluation,
-        result.trajectory,
-        result.profile,
-        choice=result.choice,
-        counts=result.counts,
-        crisp=result.crisp,
-        x_filtered=result.x_filtered,
-        iterations=result.iterations,
-        best_iteration=result.best_iteration,
-        converged=result.converged,
-        stop_reason=result.stop_reason,
-        kkt=result.kkt if np.isfinite(result.kkt) else None,
-        certificate=result.certificate,
-        limits=result.limits,
-        initial_deviation=result.initial_deviation,
-    )
-    return write_simulation(folder, simulated, wall, paraview=paraview, pictures=pictures)
 
 
 # -- an optimisation in a folder -------------------------------------------------------------
@@ -216,7 +130,8 @@ def optimize(
     world: MPI.Comm | None = None,
     report: Report | None = None,
     built: tuple[Partition, dict[int, Arm]] | None = None,
-) -> Result:
+    compared: bool = False,
+) -> RankResult:
     """Optimise the scene's arms (collective on `world`).
 
     An iteration: filter -> reduce -> simulate -> load cases -> gradient -> MMA.
@@ -230,6 +145,7 @@ def optimize(
         report: called on the root with every row of the history.
         built: which ranks do which arm, and this rank's, without a design yet; None: they are
             meshed.
+        compared: see `loop.run`.
 
     Raises:
         InputError: `resume` without a matching checkpoint; the folder holds results, and neither
@@ -241,11 +157,11 @@ def optimize(
         raise InputError("resume, overwrite: expected only one of them")
     scene.check_designed()
     if folder is None:
-        return _optimize(scene, None, False, False, world, report, built)
+        return _optimize(scene, None, False, False, world, report, built, compared)
     on_root(world, check_sources, folder, RUN_FILES, scene)
     check = None if resume or overwrite else partial(check_unused, folder, resume=checkpoint.NAME)
     with working_alone(world, folder, check):
-        return _optimize(scene, folder, resume, overwrite, world, report, built)
+        return _optimize(scene, folder, resume, overwrite, world, report, built, compared)
 
 
 def _optimize(
@@ -256,7 +172,8 @@ def _optimize(
     world: MPI.Comm,
     report: Report | None,
     built: tuple[Partition, dict[int, Arm]] | None,
-) -> Result:
+    compared: bool,
+) -> RankResult:
     """Optimise in a folder that no other run works in."""
     if folder is not None and not (resume or overwrite):
         on_root(world, checkpoint.begin, folder, scene)
@@ -278,5 +195,12 @@ def _optimize(
     if folder is not None:
         recorder = FolderRecorder(folder, scene, partition, arms)
     return loop.run(
-        scene, partition, arms, profile, memory=memory, recorder=recorder, report=report
+        scene,
+        partition,
+        arms,
+        profile,
+        memory=memory,
+        recorder=recorder,
+        report=report,
+        compared=compared,
     )

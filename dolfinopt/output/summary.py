@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.contacts import Contacts
+from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
@@ -34,7 +35,6 @@ from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
-from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
@@ -42,7 +42,7 @@ from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.trajectory import Trajectory
-    from dolfinopt.output.run_folder import Simulated
+    from dolfinopt.optimization.result import RankResult
 
 # Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
 SUMMARY_UNITS = {
@@ -76,7 +76,6 @@ CERTIFICATE_UNITS = {
     "kkt": "-",
     "gradient_angle": "degree",
     "gradient_ratio": "-",
-    "excess": "-",
     "seconds": "s",
 }
 
@@ -87,6 +86,7 @@ HISTORY_UNITS = {
     "change": "-",
     "seconds": "s",
     "kkt": "-",
+    "merit": "-",
 }
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
@@ -109,7 +109,7 @@ FALLS_APART = (
 
 
 def summarise(
-    run: Simulated, wall: float, stress: Mapping[int, ArmStress] | None = None
+    run: RankResult, wall: float, stress: Mapping[int, ArmStress] | None = None
 ) -> dict[str, Any]:
     """Return the content of summary.json on the root, an empty dict elsewhere (collective).
 
@@ -142,9 +142,12 @@ def summarise(
             "iterations": run.iterations,
             "best_iteration": run.best_iteration,
             "converged": run.converged,
+            "stop_code": run.stop_code.value,
             "stop_reason": run.stop_reason,
-            "kkt": run.kkt,
+            "exact_from": run.exact_from,
+            "kkt": _finite(run.kkt),
             "certificate": None if run.certificate is None else run.certificate.to_dict(),
+            **({} if run.bars is None else {"bars": _bars(run)}),
             **cost,
             "units": _units(scene, run.trajectory),
             "versions": versions(),
@@ -170,13 +173,14 @@ class _Traits:
     error: float | None = None  # by how much that of the reduced model exceeds it, relative
 
 
-def _gather_traits(run: Simulated) -> dict[int, _Traits]:
+def _gather_traits(run: RankResult) -> dict[int, _Traits]:
     """Return the traits of every design, on the root (collective)."""
     partition, arms, x_phys = run.partition, run.arms, run.x_phys
     with together(partition.world):
         mine = {k: _traits(run.scene, k, arm, x_phys[k]) for k, arm in arms.items()}
     every = gather_arms(partition, mine)
-    widths = _widths(partition, arms, x_phys)
+    grey = partition.world.bcast(is_grey(run.scene, _grayness(every)), root=0)
+    widths = {} if grey else _widths(partition, arms, x_phys)
     frequencies = _frequencies(partition, arms, x_phys, run.profile)
     with together(partition.world):
         return {
@@ -190,11 +194,9 @@ def _gather_traits(run: Simulated) -> dict[int, _Traits]:
         }
 
 
-def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]:
+def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any]:
     """Return what the designs are like, and the frequencies of the arms, by the arm's name."""
     scene = run.scene
-    volumes = [one.volume for one in traits.values()]
-    grays = [one.grayness for one in traits.values()]
     by_arm = {
         arm.name: traits[owner]
         for arm, owner in zip(scene.arms, scene.owners, strict=True)
@@ -203,7 +205,7 @@ def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]
     flexible = [arm.name for arm in scene.arms if arm.flexible]
     loaded = zip(flexible, run.evaluation.loaded_frequencies, strict=False)
     return {
-        "grayness": float(np.average(grays, weights=volumes)) if traits else 0.0,
+        "grayness": _grayness(traits),
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
         "connected": max((one.contacts.pieces for one in traits.values()), default=0),
         "contacts": {name: _contacts(one.contacts) for name, one in by_arm.items()},
@@ -216,6 +218,14 @@ def _of_designs(run: Simulated, traits: Mapping[int, _Traits]) -> dict[str, Any]
         },
         "loaded_frequency": dict(loaded),
     }
+
+
+def _grayness(traits: Mapping[int, _Traits]) -> float:
+    """Return the grayness of all designs together."""
+    if not traits:
+        return 0.0
+    every = traits.values()
+    return float(np.average([t.grayness for t in every], weights=[t.volume for t in every]))
 
 
 def _size(width: Width | None) -> float | None:
@@ -251,7 +261,7 @@ class _Narrow:
         )
 
 
-def _too_narrow(run: Simulated, traits: Mapping[int, _Traits]) -> list[_Narrow]:
+def _too_narrow(run: RankResult, traits: Mapping[int, _Traits]) -> list[_Narrow]:
     """Return every least width that the design cut at one half misses."""
     design = run.scene.design
     if not (run.iterations and design.controls_widths):
@@ -278,7 +288,7 @@ def _contacts(found: Contacts) -> dict[str, Any]:
     }
 
 
-def _first_frequencies(run: Simulated, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
+def _first_frequencies(run: RankResult, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
     """Return those of flexible arms by name, Hz; of a body from a file, what its modes tell."""
     found = {}
     bodies = () if run.trajectory is None else run.trajectory.mechanism.arms
@@ -290,13 +300,11 @@ def _first_frequencies(run: Simulated, by_arm: Mapping[str, _Traits]) -> dict[st
     return found
 
 
-def _of_responses(run: Simulated) -> dict[str, Any]:
+def _of_responses(run: RankResult) -> dict[str, Any]:
     """Return the constraints by name, and the figures of scenarios and of the crisp design."""
-    scene, limits = run.scene, run.limits
-    if limits is None:
-        limits = limits_of(scene, run.evaluation)
+    scene = run.scene
     return {
-        "constraints": summary_of(limits),
+        "constraints": summary_of(run.limits),
         "scenarios": [
             {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
             for one, motion in zip(scene.scenarios, run.evaluation.scenarios, strict=True)
@@ -305,7 +313,13 @@ def _of_responses(run: Simulated) -> dict[str, Any]:
     }
 
 
-def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
+def _bars(run: RankResult) -> dict[str, Any]:
+    """Return the figures of straight solid bars of the same mass, and what they make of limits."""
+    assert run.bars is not None
+    return {**_figures(run.bars), "constraints": summary_of(limits_of(run.scene, run.bars))}
+
+
+def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
     return [
         *implausible(run.scene),
         *(note for one in traits.values() for note in one.notes),
@@ -316,12 +330,12 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_limits_exceeded(run.trajectory),
         *_on_closures(run.scene, run.trajectory),
         *([] if (rest := forced_rest(run.scene)) is None else [rest]),
-        *_contact_warnings(run, traits),
+        *([] if is_grey(run.scene, _grayness(traits)) else _contact_warnings(run, traits)),
         *(one.sentence for one in _too_narrow(run, traits)),
     ]
 
 
-def _cost(run: Simulated, wall: float) -> dict[str, Any]:
+def _cost(run: RankResult, wall: float) -> dict[str, Any]:
     """Return seconds by phase, counts, memory and ranks, on the root (collective)."""
     world = run.partition.world
     seconds = _slowest(world, run.profile.seconds)
@@ -440,7 +454,7 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
 
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
-    unit = objective_of(scene).unit
+    unit = scene.objective.response.unit
     units: dict[str, Any] = {"objective": unit, **SUMMARY_UNITS}
     units["certificate"] = {**CERTIFICATE_UNITS, "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
@@ -451,7 +465,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
         parts = {one.name: one.parts(scene.dimension) for one in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
         units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
-    units["history.csv"] = {"objective": unit, **HISTORY_UNITS}
+    units["history.csv"] = {"objective": unit, **HISTORY_UNITS, "multipliers": unit}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)
     return units
@@ -513,14 +527,19 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
     return _Traits(
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
-        scene.arms[index].cell_size or arm.mesh.cell_size,
+        (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
         _volume(scene, index, arm),
         tuple(arm.mesh.notes),
         arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
 
 
-def _contact_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
+def is_grey(scene: Scene, grayness: float) -> bool:
+    """Return whether a design is no structure of solid and void, nor meant to be one."""
+    return not scene.design.projection and grayness > GREY
+
+
+def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
     """Return a sentence on every arm with contacts, and one where its crisp design falls apart."""
     scene, found = run.scene, []
     rated = run.iterations > 0 and bool(scene.design.projection)
@@ -533,14 +552,14 @@ def _contact_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str
         pieces = "1 piece" if contacts.pieces == 1 else f"{contacts.pieces} pieces"
         place = ", ".join(f"{x:.4g}" for x in contacts.places[0])
         text = (
-            f"arm {arm.name!r}: cells of the design cut at a density of one half meet in "
-            f"{' and '.join(counts)} alone, the worst at ({place}) m; by faces it is {pieces}: "
-            "such contacts are stiff in the model, and no joints in a workshop"
+            f"cut at a density of 0.5, arm {arm.name!r} is {pieces} that touch in "
+            f"{' and '.join(counts)} of cells alone, the worst at ({place}) m: such contacts are "
+            "stiff in the model, and no joints in a workshop"
         )
         if rated and run.crisp is not None:
-            text += f"; crisp is without them and {100.0 * contacts.left_out:.2g} % of the solid"
+            text += f"; crisp leaves them out, and {100.0 * contacts.left_out:.2g} % of the solid"
             if contacts.remaining:
-                text += f", but for {contacts.remaining} that cannot be opened without a cut"
+                text += f", but for {contacts.remaining} without which the arm is cut in two"
         found.append(f"{text}; {_against_contacts(scene, k, one.cell_size)}")
     if rated and run.crisp is None:
         hanging = any(one.contacts.count and not one.contacts.joins for one in traits.values())

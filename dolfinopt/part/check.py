@@ -29,7 +29,6 @@ from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.responses.constraints import Limit, limits_of
-from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report
 from dolfinopt.scene.load import Scene, scene_from_dict
 
@@ -241,9 +240,9 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         assert owner is not None
         frequency = one.arms[owner].state(one.x_phys[owner]).first_frequency
         yield f"first_frequency_{scene.arms[k].name}", frequency
-    if objective_of(scene).name not in (
+    if scene.objective.response.name not in (
         "esl",
-        "compliance",
+        "integral_compliance",
         "mass",
         "deviation",
         "settling",
@@ -272,7 +271,7 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
 def units_of(scene: Scene, column: Column) -> dict[str, str]:
     """Return the unit of every row."""
     known = {
-        "mass": "kg", "first_frequency": "Hz", "objective": objective_of(scene).unit,
+        "mass": "kg", "first_frequency": "Hz", "objective": scene.objective.response.unit,
         "compliance": "N m", "deviation": "m", "settling": "m", "orientation": "rad",
         "closure_force": "N",
         STRESS: "Pa", BUCKLING: "-",
@@ -561,7 +560,7 @@ def refined(
     places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     most = max((one.REFINEMENTS for one in parts.values()), default=0)
     settled = SETTLED_STRESS
-    if most and scene.constraints.stress is not None:
+    if most and scene.constraints.limit("stress") is not None:
         most, settled = ROUNDS_LIMITED, SETTLED_LIMITED
     for round_ in range(most + 1):
         fine = simulate_parts(scene, parts, meshes)

@@ -22,10 +22,10 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import LIMIT_PRICE
-from dolfinopt.optimization.mma import MMAState, Promise, initial_state, judge_step, mma_step
-from dolfinopt.optimization.problem import Stage
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.part.check import STRESS, Simulated, part_column, refined, simulate_parts
 from dolfinopt.part.folder import Forms, Saved
+from dolfinopt.part.merit import judge_step, merit
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without
@@ -54,7 +54,6 @@ WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
 TRIALS = 30  # struts of an arm that are left out in trial, at most
 GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
-ENDED = " iterations"  # what the ending says of a search that was not allowed more
 PRUNINGS = 3  # times that struts are left out from one start
 ACTIVE = 0.02  # relative distance up to which a limit counts where struts are judged
 
@@ -249,7 +248,7 @@ def _judged(scene: Scene, parts: dict[int, Part]) -> Judgement:
     hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     for place, one in stress.items():
         owner = scene.owners[place]
-        if scene.constraints.stress is not None and owner is not None and len(one.hot):
+        if scene.constraints.limit("stress") is not None and owner is not None and len(one.hot):
             hot[owner] += HALVED * [one.hot]
     return state.evaluation.objective, column.limits, hot
 
@@ -301,7 +300,7 @@ class Descent:
             ending = self._searched()
             found, limits = self._judged(start, ending)
             kept = all(one.met for one in limits)
-            if self.done >= self.iterations or (kept and not ending.endswith(ENDED)):
+            if self.done >= self.iterations or (kept and not self.search.spent):
                 break
             self._tighten(limits)
         self._keep(ending)
@@ -616,9 +615,9 @@ class Problem:
         for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
-        if self.scene.constraints.stress is not None:
+        if (limit := self.scene.constraints.limit(STRESS)) is not None:
             stress, analysis = self._outline_stress(simulated, every)
-            measured, limit = stress.measure(analysis), self.scene.constraints.stress
+            measured = stress.measure(analysis)
             true, smooth = measured.values[0], measured.smooth[0]
             one = Limit(STRESS, "", true, limit, "Pa")
             rows.append((one, smooth, limit * smooth / true / self._factor(one)))
@@ -671,7 +670,7 @@ class Problem:
         for limit, row in zip(every, found, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
-        if self.scene.constraints.stress is not None:
+        if self.scene.constraints.limit("stress") is not None:
             stress, analysis = self._outline_stress(one, self.every(state.outlines))
             (row,) = stress.gradients(analysis)
             rows.append({k: g / state.held[len(rows) - 1] for k, g in row.items()})
@@ -738,6 +737,7 @@ class Search:
         self.x = np.zeros(0)
         self.mma: MMAState = initial_state(self.x)
         self.falls: list[float] = []
+        self.spent = False  # whether no more iterations were allowed
         self._begin()
 
     def _begin(self) -> None:
@@ -749,6 +749,7 @@ class Search:
 
     def run(self, iterations: int, tell: Tell, first: int) -> str:
         """Take so many steps at most; return why the search ended."""
+        self.spent = False
         while self.steps < iterations:
             if not self._step():
                 return "no step betters the parts"
@@ -757,7 +758,8 @@ class Search:
             tell(self._line(first + self.steps))
             if self._settled():
                 return "settled"
-        return f"{first + iterations}{ENDED}"
+        self.spent = True
+        return f"{first + iterations} iterations"
 
     def _keep(self) -> None:
         if self.state.rank < self.best.rank:
@@ -790,19 +792,19 @@ class Search:
         slopes = self.problem.slopes(self.state)
         self.state = self.state.released  # for the matrices of those that are tried
         before = self.state
-        stage = Stage((), LIMIT_PRICE * (abs(before.values[0]) or 1.0))
+        price = LIMIT_PRICE * (abs(before.values[0]) or 1.0)
         room = {k: one.room() for k, one in before.outlines.items()}
         while self.radius >= LEAST_RADIUS:
-            x, after = self._proposed(slopes, stage, room)
+            x, after = self._proposed(slopes, price, room)
             tried = self._tried(x, room)
             if tried is None:
                 self.radius *= 0.5
                 continue
-            promised = Promise(before.values + slopes @ (x - self.x), 0.0)
-            after_it = tried.against(before.held)
-            verdict = judge_step(stage, before.values, after_it, promised, exact=True)
-            self.radius = min(1.0, verdict.factor * self.radius)
-            if verdict.accepted:
+            promised = before.values + slopes @ (x - self.x)
+            values = before.values, tried.against(before.held), promised
+            accepted, factor = judge_step(*(merit(one, price) for one in values))
+            self.radius = min(1.0, factor * self.radius)
+            if accepted:
                 self.x, self.mma, self.state = x, after, tried
                 self.passed.append(dict(tried.outlines))
                 self.morphed += 1
@@ -829,7 +831,7 @@ class Search:
     def _proposed(
         self,
         slopes: np.ndarray,
-        stage: Stage,
+        price: float,
         room: Mapping[int, tuple[np.ndarray, np.ndarray]],
     ) -> tuple[np.ndarray, MMAState]:
         low, high = [], []
@@ -848,7 +850,7 @@ class Search:
             self.mma,
             move=1.0,
             widest=WIDEST,
-            prices=np.full(len(values) - 1, stage.price),
+            prices=np.full(len(values) - 1, price),
         )
 
     def _tried(

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 
 FINEST = 1e-7  # m, the finest tolerance of curves: that of CAD programs
-GRAY = 0.02  # grayness from which on a design is no longer close to any part
 
 
 @dataclass(frozen=True)

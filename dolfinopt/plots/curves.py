@@ -24,10 +24,11 @@ from dolfinopt.plots.style import (
     look_numbers,
     looks,
     new_figure,
+    shortened,
     spread,
 )
 from dolfinopt.responses.constraints import constraint_label, deviation_limits, limits_by_column
-from dolfinopt.responses.response import objective_of
+from dolfinopt.responses.response import constraints_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,7 +79,7 @@ def _head(axes: Axes, label: str, note: str) -> None:
 
 def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
     """Return the picture of `history_figure` of a scene's optimisation, with its limits."""
-    minimised = objective_of(scene)
+    minimised = scene.objective.response
     limits = limits_by_column(scene, rows[0].constraints)
     return history_figure(rows, f"{minimised.label} [{minimised.unit}]", limits)
 
@@ -109,6 +110,43 @@ def history_figure(
     return figure
 
 
+def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
+    """Return the picture of how far limits are used, and what they cost.
+
+    Above, the share of every limit that is used over the iterations: of a lower limit it is the
+    limit over the value. Below, by how many per cent the objective would be better for each per
+    cent by which the limit is eased: the multiplier over the objective. None where the material
+    alone is limited.
+    """
+    limits = limits_by_column(scene, rows[0].constraints)
+    if all(one.response.declared.of_nominal for one in constraints_of(scene)):
+        return None
+    figure, grid = panel_grid(np.ones((2, 1), dtype=bool), "Limits of the design", "iteration")
+    above, below = grid[:, 0]
+    iteration = [row.iteration for row in rows]
+    objective = np.array([abs(row.objective) or 1.0 for row in rows])
+    lower = {one.name for one in constraints_of(scene) if one.response.declared.lower}
+    every = []
+    for number, (name, limit) in enumerate(limits.items()):
+        value = np.array([row.constraints[name] for row in rows])
+        least = any(name == key or name.startswith(f"{key}_") for key in lower)
+        used = 100.0 * (limit / value if least else value / limit)
+        eased = np.array([row.multipliers.get(name, np.nan) for row in rows]) / objective
+        label = shortened(constraint_label(name).partition(" [")[0])
+        every_tenth = max(1, len(rows) // 10)
+        above.plot(iteration, used, label=label, **look(number), markevery=every_tenth)
+        below.plot(iteration, eased, **look(number), markevery=every_tenth)
+        every.append(used)
+    log_scale(above, np.append(np.concatenate(every), 100.0))
+    above.axhline(100.0, color=LIMIT, ls="--", lw=1.0)
+    above.legend(fontsize=8, ncols=3, loc="upper right")
+    _head(above, "share of the limit that is used [%]", "limit: 100 %")
+    _head(below, "objective gained for 1 % of the limit [%]", "")
+    below.set_ylim(bottom=0.0)
+    above.set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
+    return figure
+
+
 # Columns of the history in the order of their panels: label, factor.
 HISTORY = {
     "max_deviation": ("maximal deviation [mm]", MILLI),
@@ -116,6 +154,7 @@ HISTORY = {
     "volume_fraction": ("volume fraction [-]", 1.0),
     "change": ("largest change of the design [-]", 1.0),
     "kkt": ("Karush-Kuhn-Tucker residual [-]", 1.0),
+    "merit": ("merit: objective and excesses of limits [-]", 1.0),
 }
 SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
 # Units of constraints in pictures: ending of the label, its replacement, factor.
@@ -147,6 +186,8 @@ def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str
         if hasattr(rows[0], name) and not limited:  # its limit has a panel of the same values
             panels[label] = factor * _numbers([getattr(row, name) for row in rows])
     for name, value in vars(rows[0]).items():
+        if name == "multipliers":  # in a picture of their own
+            continue
         if isinstance(value, Mapping):
             for key in value:
                 label, factor = _drawn(str(key))

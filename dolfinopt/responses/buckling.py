@@ -45,12 +45,11 @@ from dolfinopt.responses.response import (
     Measured,
     Response,
     p_norm,
-    register,
+    response,
 )
 from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
 from dolfinopt.responses.stress import ArmLoads, ByLoads, arm_loads, bodies_by_loads, motions_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import NEEDS
 
 # -- the instants of one arm along one motion at which it comes closest to buckling ---------------
 
@@ -205,7 +204,7 @@ def _loads(scene: Scene, trajectory: Trajectory) -> dict[int, Loads]:
 
 def _known(state: DesignState | None, trajectory: Trajectory | None) -> list[Pressed] | None:
     """Return what is known of a design in this motion."""
-    kept = None if state is None else state.kept.get(Buckling.name)
+    kept = None if state is None else state.kept.get(Buckling.declared.name)
     return kept[1] if kept is not None and kept[0] is trajectory else None
 
 
@@ -215,26 +214,20 @@ def _of_design(state: DesignState, loads: Loads, trajectory: Trajectory | None) 
     if known is None:
         with state.elastic.profile.phase("buckling"):
             known = [each for one in loads for each in pressed(state, *one)]
-        state.kept[Buckling.name] = trajectory, known
+        state.kept[Buckling.declared.name] = trajectory, known
     return known
 
 
 # -- as objective and as limit -------------------------------------------------------------------
 
 
-@register
+@response("buckling")
 class Buckling(Response):
     """p-norm of 1 / factor over arms, scenarios, their worst instants and modes; true: the factor.
 
     Instants are peaks over time, up to three of every arm, of each the four lowest modes. That
     nothing buckles is a factor of 1000, and of no influence.
     """
-
-    name, label, unit = "buckling", "reciprocal of the buckling factor", "-"
-    lower = True
-    natural = "maximize"
-    needs = NEEDS[name]
-    stands_for = "buckling factor"
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the least factor and the p-norm (collective)."""

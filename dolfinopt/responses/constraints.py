@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.motion.build import rests
+from dolfinopt.progress import shown, with_unit
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.motion import LoadCases, MotionResponse
-from dolfinopt.responses.response import constraints_of, find_limited, objective_of
+from dolfinopt.responses.response import constraints_of, find_limited
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import Constraints
+from dolfinopt.scene.tables.responses import DECLARED, VOLUME, limited_by
 
 # Relative violation of the true value up to which a constraint counts as met: MMA meets an active
 # one to a fraction of its last change, which optimizer.tolerance leaves at 1e-3.
@@ -70,6 +69,19 @@ class Limit:
         return self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
 
     @property
+    def of_mass(self) -> bool:
+        """Whether it limits how much material there is."""
+        return limited_by(self.quantity).of_nominal
+
+    @property
+    def usage(self) -> str:
+        """E.g. "deviation 5.3 of 8 mm: 66 %"; of a lower limit the limit's share of the value."""
+        (value, limit), unit = shown((self.value, self.limit), self.unit)
+        of = "of at least" if self.least else "of"
+        share = 100.0 * (1.0 + self.excess) if not self.least else 100.0 * self.limit / self.value
+        return with_unit(f"{self.words} {value:.3g} {of} {limit:.4g}", unit) + f": {share:.0f} %"
+
+    @property
     def bound(self) -> str:
         """E.g. "first frequency of arm2 >= 80 Hz"."""
         unit = "" if self.unit == "-" else f" {self.unit}"
@@ -105,7 +117,7 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
     limits = []
     # The objective's values come first: it may be the response of a limit, too.
     for bound, found in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
-        unit_of, lower = bound.response.unit_of, bound.response.lower
+        unit_of, lower = bound.response.unit_of, bound.response.declared.lower
         limits += [
             Limit(bound.name, arm, float(value), float(limit), unit_of(arm), lower)
             for arm, value, limit in zip(found.arms, found.values, bound.limits(found), strict=True)
@@ -115,7 +127,7 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
 
 def constraint_label(name: str) -> str:
     """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
-    for quantity in ("volume_fraction", *Constraints.model_fields):
+    for quantity in (VOLUME.name, *(one.key for one in DECLARED.values() if one.key)):
         if name == quantity or name.startswith(f"{quantity}_"):
             arm = name[len(quantity) + 1 :]
             unit = find_limited(quantity).unit_of(arm)
@@ -135,11 +147,11 @@ def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
 
 def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
     """Return the limits of the deviation, m, with first and last instant of each, s."""
-    limits, found = scene.constraints, []
-    if limits.deviation is not None:
-        found.append((limits.deviation, 0.0, scene.motion.horizon))
-    if limits.settling is not None:
-        found += [(limits.settling, begin, end) for begin, end in rests(scene)]
+    found = []
+    if (deviation := scene.constraints.limit("deviation")) is not None:
+        found.append((deviation, 0.0, scene.motion.horizon))
+    if (settling := scene.constraints.limit("settling")) is not None:
+        found += [(settling, begin, end) for begin, end in rests(scene)]
     return found
 
 
@@ -152,7 +164,7 @@ def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
     for limit, *others in zip(*reversed(variants), strict=True):
         values = [limit.value, *(one.value for one in others)]
         extreme = min(values) if limit.least else max(values)
-        kept = limit.value if find_limited(limit.quantity).of_nominal else extreme
+        kept = limit.value if limited_by(limit.quantity).of_nominal else extreme
         worst.append(replace(limit, value=kept))
     return tuple(worst)
 
@@ -181,23 +193,3 @@ def tightest(limits: Sequence[Limit]) -> str:
 def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:
     """Return the constraints by name, for summary.json."""
     return {one.name: one.to_dict() for one in limits}
-
-
-# -- the objective of a scene, where it is one of the motion -------------------------------------
-
-
-def load_cases(trajectory: Trajectory, scene: Scene) -> LoadCases:
-    """Return the instants that make up the scene's objective."""
-    return _of_motion(scene).load_cases(trajectory)
-
-
-def objective(trajectory: Trajectory, scene: Scene, cases: LoadCases | None = None) -> float:
-    """Return the scene's objective, at the instants that it chooses or at given ones."""
-    response = _of_motion(scene)
-    return response.value(trajectory, response.load_cases(trajectory) if cases is None else cases)
-
-
-def _of_motion(scene: Scene) -> MotionResponse:
-    response = objective_of(scene)
-    assert isinstance(response, MotionResponse), "an objective without a motion"
-    return response

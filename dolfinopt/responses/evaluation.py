@@ -37,13 +37,13 @@ from dolfinopt.responses.response import (
     CellGradient,
     Measured,
     Response,
-    asked_of,
     bodies_in,
     constraints_of,
     needs,
     objective_of,
 )
 from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.tables.responses import asked
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -90,14 +90,14 @@ class Evaluation(Motion):
     smooth_limits: tuple[float, ...] = ()
     responses: tuple[Measured, ...] = ()
 
-    def values_of(self, *names: str) -> tuple[float, ...]:
-        """Return the true values of the first of these responses that was asked for, or none."""
-        return next((one.values for one in self.responses if one.response in names), ())
+    def values_of(self, name: str) -> tuple[float, ...]:
+        """Return the true values of a response, by its name; none where it was not asked for."""
+        return next((one.values for one in self.responses if one.response == name), ())
 
     @property
     def loaded_frequencies(self) -> tuple[float, ...]:
         """Of every flexible arm with what it carries, Hz; empty unless asked for."""
-        return self.values_of("eigenfrequency", "first_frequency")
+        return self.values_of("eigenfrequency")
 
     @property
     def tip_deflections(self) -> tuple[float, ...]:
@@ -141,10 +141,7 @@ def evaluate(
     if simulated or needs(scene, "motion"):
         decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
         owned = _reduced(partition, arms, x_phys)
-        [(found, trajectory)] = _simulated([scene], partition, owned, profile, [start])
-        if isinstance(found, ConvergenceError):
-            raise found
-        motion = found
+        motion, trajectory = _simulated(scene, scene, partition, owned, profile, start)
     analysis = analysis_of(scene, partition, arms, trajectory, profile)
     return _measured(analysis, motion), trajectory
 
@@ -183,42 +180,24 @@ def evaluate_batch(
     except ConvergenceError as error:
         return [error] * len(scenes)
     found: dict[int, tuple[Evaluation, Trajectory | None] | ConvergenceError] = {}
-    for on in (False, True):  # bodies differ
-        if chosen := [i for i, one in enumerate(decided) if one.on == on]:
-            for arm in arms.values():
-                arm.set_stiffening(decided[chosen[0]])
-            some = _evaluate_alike([scenes[i] for i in chosen], partition, arms, x_phys, profile)
-            found.update(zip(chosen, some, strict=True))
-    return [found[i] for i in range(len(scenes))]
-
-
-def _evaluate_alike(
-    scenes: Sequence[Scene],
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Cells,
-    profile: Profile,
-) -> list[tuple[Evaluation, Trajectory | None] | ConvergenceError]:
-    """Return `evaluate_batch` of scenes whose bodies all have geometric stiffness, or none."""
-    try:
-        owned = _reduced(partition, arms, x_phys)
-    except ConvergenceError as error:
-        return [error] * len(scenes)
-    found: list[tuple[Evaluation, Trajectory | None] | ConvergenceError] = []
-    moved = _simulated(scenes, partition, owned, profile, [()] * len(scenes))
-    for scene, (motion, trajectory) in zip(scenes, moved, strict=True):
+    bodies: dict[bool, Mapping[int, ShapeIntegrals]] = {}
+    for i in sorted(range(len(scenes)), key=lambda i: decided[i].on):  # bodies differ
+        scene, on = scenes[i], decided[i].on
         try:
-            if isinstance(motion, ConvergenceError):
-                raise motion
+            if on not in bodies:
+                for arm in arms.values():
+                    arm.set_stiffening(decided[i])
+                bodies[on] = _reduced(partition, arms, x_phys)
+            motion, trajectory = _simulated(scenes[0], scene, partition, bodies[on], profile)
             under = arms
-            if any(one.needs and "motion" not in one.needs for one in asked_of(scene)):
+            if any(one.needs and "motion" not in one.needs for one in asked(scene)):
                 with together(partition.world):
                     under = {k: arm.under(scene) for k, arm in arms.items()}
             analysis = analysis_of(scene, partition, under, trajectory, profile)
-            found.append((_measured(analysis, motion), trajectory))
+            found[i] = _measured(analysis, motion), trajectory
         except ConvergenceError as error:
-            found.append(error)
-    return found
+            found[i] = error
+    return [found[i] for i in range(len(scenes))]
 
 
 def analysis_of(
@@ -352,62 +331,38 @@ def _reduced(
 
 
 def _simulated(
-    scenes: Sequence[Scene],
+    first: Scene,
+    scene: Scene,
     partition: Partition,
     owned: Mapping[int, ShapeIntegrals],
     profile: Profile,
-    starts: Sequence[Sequence[Solution]],
-) -> list[tuple[Motion | ConvergenceError, Trajectory | None]]:
-    """Simulate the scenes and their scenarios in one batch (collective)."""
-    # The bodies are those of the first scene. What became of every scene is returned on all ranks,
-    # its trajectory on the root.
-    kept: list[Trajectory | ConvergenceError] = []
+    starts: Sequence[Solution] = (),
+) -> tuple[Motion, Trajectory | None]:
+    """Simulate a scene and its scenarios, with the bodies of `first` (collective).
 
-    def run() -> list[Motion | ConvergenceError]:
-        kept.extend(_simulate(scenes, owned, profile, starts))
+    The trajectory is the root's.
+
+    Raises:
+        ConvergenceError: on all ranks.
+    """
+    kept: list[Trajectory] = []
+
+    def run() -> Motion:
+        moved: list[Trajectory] = []
+        known = list(starts)
+        for number, one in enumerate((scene, *pose_scenarios(scene))):
+            # Scenarios begin with the scene's motion unless theirs is known.
+            start = known[number] if number < len(known) else None
+            if start is None and moved:
+                start = moved[0].solution
+            bodies = chain_of(one, owned) if one is first else bodies_in(first, one, owned)
+            moved.append(simulate(one, bodies, profile, start))
+        kept.append(replace(moved[0], scenarios=tuple(moved[1:])))
         with profile.phase("objective"):
-            return [one if isinstance(one, ConvergenceError) else _motion(one) for one in kept]
+            return _motion(kept[0])
 
-    motions = on_root(partition.world, run)
-    trajectories = [one if isinstance(one, Trajectory) else None for one in kept]
-    return list(zip(motions, trajectories or [None] * len(motions), strict=True))
-
-
-def _simulate(
-    scenes: Sequence[Scene],
-    owned: Mapping[int, ShapeIntegrals],
-    profile: Profile,
-    starts: Sequence[Sequence[Solution]],
-) -> list[Trajectory | ConvergenceError]:
-    """Simulate scenes, with all their scenarios."""
-    nominal, found = chain_of(scenes[0], owned), []
-    for scene, start in zip(scenes, starts, strict=True):
-        group = [scene, *pose_scenarios(scene)]
-        bodies = [
-            nominal if one is scenes[0] else bodies_in(scenes[0], one, owned) for one in group
-        ]
-        found.append(_with_scenarios(group, bodies, profile, start))
-    return found
-
-
-def _with_scenarios(
-    group: Sequence[Scene],
-    bodies: Sequence[list[ShapeIntegrals]],
-    profile: Profile,
-    starts: Sequence[Solution],
-) -> Trajectory | ConvergenceError:
-    """Simulate a scene and its scenarios, which begin with its motion unless theirs is known."""
-    first, others = starts[0] if starts else None, starts[1:]
-    try:
-        nominal = simulate(group[0], bodies[0], profile, first)
-        guesses = [*others, *[nominal.solution] * (len(group) - 1 - len(others))]
-        scenarios = [
-            simulate(scene, own, profile, guess)
-            for scene, own, guess in zip(group[1:], bodies[1:], guesses, strict=True)
-        ]
-    except ConvergenceError as error:
-        return error
-    return replace(nominal, scenarios=tuple(scenarios))
+    motion = on_root(partition.world, run)
+    return motion, kept[0] if kept else None
 
 
 def _motion(trajectory: Trajectory) -> Motion:

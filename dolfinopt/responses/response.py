@@ -1,9 +1,8 @@
-"""What a response is, in which file it is found, and what several scenarios make of its values.
+"""What a response is, and what several scenarios make of its values.
 
 Objective and constraints of a scene are responses: `objective.kind = "deviation"`, every key of
-[constraints] and `design.volume_fraction` name one. To add one, write `responses/NAME.py` with a
-subclass of `Response` under `@register`, or name another file in `FILES`; in
-scene/tables/objective.py its word for `objective.kind` or its key, and what it needs.
+[constraints] and `design.volume_fraction` name one. To add one, decorate a class by `@response`,
+which says what the scene must know of it; see docs/pages/develop/add-response.md.
 
 The one rule of aggregation: an extreme over instants, modes, load cases or scenarios has a true
 value, which reports show and limits hold for, and a smooth one, its p-mean or p-norm with
@@ -16,7 +15,7 @@ Source: Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -29,12 +28,22 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, of_material, sca
 from dolfinopt.parallel import Partition
 from dolfinopt.responses.products import By, by_design
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.objective import declare
+from dolfinopt.scene.tables.responses import (
+    DECLARED,
+    VOLUME,
+    Declaration,
+    Limited,
+    Need,
+    limited_by,
+    need_of,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.profiling import Profile
-    from dolfinopt.scene.tables.objective import Direction, Need, Objective
+    from dolfinopt.scene.tables.objective import Objective
 
 T = TypeVar("T")
 R = TypeVar("R", bound="type[Response]")
@@ -91,43 +100,31 @@ class Response(ABC):
     """A quantity of a design with its gradient; as objective, the sum of its values is minimised.
 
     Attributes:
-        name: in scene and files.
-        label: in words.
-        unit: of the smooth values and the objective.
-        limit_unit: of the true values and of a limit; "" where it is `unit`.
-        lower: whether a limit is a lower one.
-        of_nominal: whether a limit holds for the nominal one of robust designs alone.
-        natural: what is sought of the true value as objective, if the scene does not say.
-        needs: what must be known beside the densities: the stiffness matrix, the mass matrix, a
-            simulated motion, an eigenproblem.
-        stands_for: what the true values are, where they are another quantity than the objective.
+        declared: what the scene knows of it.
         options: the scene's [objective], which has the options of all responses.
         limited: whether it is a constraint: scenarios count by the worst one then.
     """
 
-    name: ClassVar[str]
-    label: ClassVar[str]
-    unit: ClassVar[str]
-    limit_unit: ClassVar[str] = ""
-    lower: ClassVar[bool] = False
-    of_nominal: ClassVar[bool] = False
-    natural: ClassVar[Direction] = "minimize"
-    needs: ClassVar[frozenset[Need]] = frozenset()
-    stands_for: ClassVar[str] = ""
+    declared: ClassVar[Declaration]
 
     def __init__(self, options: Objective, limited: bool = False):
         self.options, self.limited = options, limited
 
     @property
+    def name(self) -> str:
+        """The word of the scene."""
+        return self.declared.name
+
+    @property
     def turned(self) -> bool:
         """Whether as objective it is sought the other way round: its smooth value maximised."""
         asked = self.options.direction
-        return not self.limited and asked is not None and asked != self.natural
+        return not self.limited and asked is not None and asked != self.declared.natural
 
     @classmethod
     def unit_of(cls, value: str) -> str:
         """Return the unit of the true value of that name, and of its limit."""
-        return cls.limit_unit or cls.unit
+        return cls.declared.limit_unit
 
     def restricted(self, limits: Sequence[Any]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of those values that have a limit, and these limits.
@@ -190,49 +187,45 @@ class Constraint:
         return self.response.smooth_limits(analysis, measured, self.limits(measured))
 
 
-# Limits whose word means another response as objective: the compliance of the whole horizon.
-LIMITED = {"compliance": "load_case_compliance"}
-
-# Files of responses whose names are not theirs.
-FILES = {
-    **dict.fromkeys(
-        (
-            "compliance",
-            "deviation",
-            "effort",
-            "esl",
-            "load_case_compliance",
-            "orientation",
-            "peak_force",
-            "settling",
-        ),
-        "motion",
-    ),
-    **dict.fromkeys(
-        ("damping_ratio", "eigenfrequency", "first_frequency", "pole_frequency"), "frequency"
-    ),
-    **dict.fromkeys(("mass", "stiffness", "tip_deflection", "volume_fraction"), "static"),
-}
-
 _known: dict[str, type[Response]] = {}
 
 
-def register(response: R) -> R:
-    """Make a response known under its name; decorates the class."""
-    _known[response.name] = response
-    return response
+def response(
+    name: str, *, label: str = "", unit: str = "", limit: Limited | str | None = None, **more: Any
+) -> Callable[[R], R]:
+    """Decorate the class of a response; with a unit, declare it to scenes, too.
+
+    Args:
+        name: the word of objective.kind.
+        label: the value in words; default: the name.
+        unit: of the value; "" of what `scene.tables.responses` declares already.
+        limit: what [constraints] says of it, or that in words with the unit.
+        **more: further attributes of `Declaration`.
+    """
+    if unit:
+        limit = Limited(limit) if isinstance(limit, str) else limit
+        words = label or name.replace("_", " ")
+        declare(Declaration(name, words, unit, limit=limit, **more))
+
+    def known(cls: R) -> R:
+        cls.declared = VOLUME if name == VOLUME.name else DECLARED[name]
+        _known[name] = cls
+        return cls
+
+    return known
 
 
 def find(name: str) -> type[Response]:
     """Return the response of that name, whose file is imported at first use."""
     if name not in _known:
-        import_module(f"dolfinopt.responses.{FILES.get(name, name)}")
+        declared = VOLUME if name == VOLUME.name else DECLARED[name]
+        import_module(f"dolfinopt.responses.{declared.file}")
     return _known[name]
 
 
 def find_limited(key: str) -> type[Response]:
     """Return the response that a key of [constraints] limits."""
-    return find(LIMITED.get(key, key))
+    return find(limited_by(key).name)
 
 
 def objective_of(scene: Scene) -> Response:
@@ -254,14 +247,9 @@ def constraints_of(scene: Scene) -> list[Constraint]:
     return found
 
 
-def asked_of(scene: Scene) -> list[Response]:
-    """Return the objective and what is limited."""
-    return [objective_of(scene), *(one.response for one in constraints_of(scene))]
-
-
 def needs(scene: Scene, what: Need) -> bool:
     """Return whether the objective or a constraint of the scene needs that."""
-    return any(what in one.needs for one in asked_of(scene))
+    return bool(need_of(scene, what))
 
 
 def by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:

@@ -18,7 +18,6 @@ from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
 from dolfinopt.fem.stress import DisplacementGradient
-from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     by_modal_loads,
@@ -28,7 +27,6 @@ from dolfinopt.multibody.shape_integrals import (
 from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
 from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
 from dolfinopt.responses.products import By, Pair, Products, by_design
-from dolfinopt.responses.response import p_norm_of_lengths
 
 
 def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.ndarray:
@@ -188,22 +186,9 @@ def pairs_at_interfaces(
     return rigid, np.zeros_like(elastic.points)
 
 
-def static_gradient(state: DesignState, response: StaticResponse, by: By = by_design) -> np.ndarray:
-    """Return d compliance / dx_phys (n_cells,): -E' sum_k u_k' k_e u_k, exact for dead loads.
-
-    Or the derivative by other variables of the design, see `Products`.
-    """
-    return tip_gradient(state, response.loads, response.loads, by)
-
-
-def deflection_gradient(
-    state: DesignState, response: StaticResponse, exponent: float, by: By = by_design
+def tip_gradient(
+    state: DesignState, left: np.ndarray, right: np.ndarray, by: By = by_design
 ) -> np.ndarray:
-    """Return d deflection / dx_phys (n_cells,), by one adjoint load a case; or by others."""
-    return tip_gradient(state, response.deflection_gradient(exponent), response.loads, by)
-
-
-def tip_gradient(state: DesignState, left: np.ndarray, right: np.ndarray, by: By) -> np.ndarray:
     """Differentiate a function of the displacements under outboard loads by the design of one arm.
 
     dJ = sum_k left_k . dtip_k = -sum_k u(left_k)' dK u(right_k), by one adjoint load a case.
@@ -268,11 +253,8 @@ def rigid_gradient(
     return by(state, Products(mass=(mass,), places=partners.by_points))
 
 
-# -- one arm under static loads of its outboard interface: compliance and deflection -------------
-
-
 @dataclass(frozen=True, eq=False)
-class StaticResponse:
+class Tip:
     """What static loads do to one arm whose inboard interface is clamped; k load cases.
 
     Attributes:
@@ -284,34 +266,8 @@ class StaticResponse:
     loads: np.ndarray
     tip: np.ndarray
 
-    @property
-    def compliance(self) -> float:
-        """Sum over the cases of load . displacement, N m."""
-        return float(np.sum(self.loads * self.tip))
 
-    @property
-    def largest(self) -> float:
-        """Largest |u_k| of the outboard point, m."""
-        return float(lengths(self.displacement).max())
-
-    @property
-    def displacement(self) -> np.ndarray:
-        """Displacement of the first outboard point (k, d), m."""
-        return self.tip[: 2 if len(self.tip) == 3 else 3].T
-
-    def deflection(self, exponent: float) -> float:
-        """Return (sum_k |u_k|^p)^(1/p) of the outboard point, m: at least the largest |u_k|."""
-        return p_norm_of_lengths(self.displacement, exponent)[0]
-
-    def deflection_gradient(self, exponent: float) -> np.ndarray:
-        """Return the derivative (3, k), or (6, k), of `deflection` by the displacements."""
-        _, by_displacement = p_norm_of_lengths(self.displacement, exponent)
-        out = np.zeros_like(self.tip)
-        out[: by_displacement.shape[1]] = by_displacement.T
-        return out
-
-
-def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
+def static_response(arm: ElasticArm, loads: np.ndarray) -> Tip:
     """Load the outboard interface of one arm (collective on its ranks).
 
     By `ElasticArm.static_fields`; neither the mass matrix nor a reduced model is needed.
@@ -324,4 +280,4 @@ def static_response(arm: ElasticArm, loads: np.ndarray) -> StaticResponse:
     free = arm.rigid.shape[2] - len(columns)  # further interfaces are
     columns = np.concatenate([columns, np.zeros((free, columns.shape[1]))])
     fields = arm.static_fields(columns)
-    return StaticResponse(columns, fields.tip @ fields.amplitudes(columns))
+    return Tip(columns, fields.tip @ fields.amplitudes(columns))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dolfinopt.arms.arm import fixed_body
-from dolfinopt.arms.design_state import DesignState
 from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.parallel import on_all_ranks, on_root, sum_over_arms, together
 from dolfinopt.responses.products import Products
 from dolfinopt.responses.response import (
@@ -18,30 +19,23 @@ from dolfinopt.responses.response import (
     Measured,
     Response,
     occurrences,
-    register,
+    p_norm_of_lengths,
+    response,
 )
-from dolfinopt.responses.sensitivity import (
-    deflection_gradient,
-    static_gradient,
-    static_response,
-    tip_gradient,
-)
+from dolfinopt.responses.sensitivity import static_response, tip_gradient
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import NEEDS, Objective, StiffnessCase
+from dolfinopt.scene.tables.objective import Objective
+from dolfinopt.scene.tables.responses import StiffnessCase
 
 # -- mass of all arms --------------------------------------------------------------------------
 
 
-@register
+@response("mass")
 class Mass(Response):
     """sum_e rho_e V_e of all arms, kg; rigid ones and those from files add what they have.
 
     rho_e by the interpolation law. Motors and payload, which no design changes, are left out.
     """
-
-    name, label, unit = "mass", "mass of the arms", "kg"
-    of_nominal = True
-    needs = NEEDS[name]
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the mass of all arms (collective)."""
@@ -74,16 +68,12 @@ class Mass(Response):
 # -- volume of every design, or of all together --------------------------------------------------
 
 
-@register
+@response("volume_fraction")
 class VolumeFraction(Response):
     """sum_e V_e x_e of every design times the arms that have it, m3; its true value over sum V_e.
 
     With `design.shared_volume` one value, of all designs together.
     """
-
-    name, label, unit = "volume_fraction", "volume", "m3"
-    limit_unit = "-"
-    of_nominal = True
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return volumes and their fractions (collective)."""
@@ -145,145 +135,125 @@ def _rows(analysis: Analysis) -> dict[int, int]:
     return {k: row[scene.patterns.get(k, k)] for k in scene.cell_counts}
 
 
-# -- compliance under given static loads -------------------------------------------------------
+# -- what static loads do to single arms: compliance, deflection, stiffness ------------------------
 
 
-@register
-class StaticCompliance(Response):
-    """Compliance of every design under `objective.loads`, times the arms that have it, N m."""
+@dataclass(frozen=True)
+class LoadedArm:
+    """What has one value of static loads: one arm, clamped at its inboard interface.
 
-    name, label, unit = "static", "compliance under static loads", "N m"
-    needs = NEEDS[name]
+    Attributes:
+        name: of the value.
+        owner: index of the arm.
+        loads: (k, 3) force, N, and moment, N m, at its outboard interface; of solids (k, 6).
+        rows: of the displacements (m) and rotations (rad) that count.
+        factor: of the value: how many arms have this design.
+    """
+
+    name: str
+    owner: int
+    loads: np.ndarray
+    rows: slice
+    factor: int = 1
+
+
+class StaticResponse(Response):
+    """Functions of how static loads move the outboard interfaces of arms."""
+
+    def cases(self, scene: Scene) -> Sequence[LoadedArm]:
+        """Return what has a value; by default every design under `objective.loads`."""
+        loads, uses = np.array(self.options.static_loads(scene)), occurrences(scene)
+        rows = slice(scene.dimension)
+        return [LoadedArm(scene.arms[k].name, k, loads, rows, uses[k]) for k in scene.cell_counts]
+
+    @abstractmethod
+    def value(self, case: LoadedArm, tip: np.ndarray) -> tuple[float, float]:
+        """Return true and smooth value of displacements, m, and rotations, rad.
+
+        Args:
+            case: whose.
+            tip: (3, k), of solids (6, k).
+        """
+
+    @abstractmethod
+    def gradient(self, case: LoadedArm, tip: np.ndarray) -> np.ndarray:
+        """Return the derivative of the smooth value by them, like `tip`."""
 
     def measure(self, analysis: Analysis) -> Measured:
-        """Return the compliance of every design (collective)."""
-        scene, uses, loads = analysis.scene, occurrences(analysis.scene), self._loads(analysis)
+        """Return every value (collective)."""
+        cases, mine = self.cases(analysis.scene), {}
         with together(analysis.partition.world):
-            mine = {
-                k: uses[k] * static_response(state.elastic, loads).compliance
-                for k, state in analysis.designs.items()
-            }
-        found = on_all_ranks(analysis.partition, mine)
-        values = tuple(found.values())
-        return Measured(self.name, tuple(scene.arms[k].name for k in found), values, values)
+            for number, one in enumerate(cases):
+                if one.owner in analysis.designs:
+                    found = static_response(analysis.designs[one.owner].elastic, one.loads)
+                    mine[number] = self.value(one, found.tip[: one.loads.shape[1]])
+        true, smooth = zip(*on_all_ranks(analysis.partition, mine).values(), strict=True)
+        return Measured(self.name, tuple(one.name for one in cases), true, smooth)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the gradient of every design's compliance (collective)."""
-        uses, designs = occurrences(analysis.scene), analysis.designs
-        rows = []
+        """Return the gradient of every value, by one adjoint load a load case (collective)."""
+        rows, designs = [], analysis.designs
         with together(analysis.partition.world):
-            for owner in analysis.scene.cell_counts:
-                row: CellGradient = {k: analysis.by(one, Products()) for k, one in designs.items()}
-                if owner in designs:
-                    response = static_response(designs[owner].elastic, self._loads(analysis))
-                    gradient = static_gradient(designs[owner], response, analysis.by)
-                    row[owner] = gradient * uses[owner]
+            for one in self.cases(analysis.scene):
+                row = {k: analysis.by(state, Products()) for k, state in designs.items()}
+                if one.owner in designs:
+                    state, count = designs[one.owner], one.loads.shape[1]
+                    found = static_response(state.elastic, one.loads)
+                    by = np.zeros_like(found.tip)
+                    by[:count] = self.gradient(one, found.tip[:count])
+                    row[one.owner] = tip_gradient(state, by, found.loads, analysis.by)
                 rows.append(row)
         return rows
 
-    def _loads(self, analysis: Analysis) -> np.ndarray:
-        return np.array(self.options.static_loads(analysis.scene))
+
+@response("static")
+class StaticCompliance(StaticResponse):
+    """Compliance of every design under `objective.loads`, times the arms that have it, N m."""
+
+    def value(self, case: LoadedArm, tip: np.ndarray) -> tuple[float, float]:
+        """Return sum load . displacement over the load cases."""
+        found = case.factor * float(np.sum(case.loads.T * tip))
+        return found, found
+
+    def gradient(self, case: LoadedArm, tip: np.ndarray) -> np.ndarray:
+        """Return the loads."""
+        return np.asarray(case.factor * case.loads.T)
 
 
-# -- static deflection of every design's outboard interface --------------------------------------
-
-
-@register
-class TipDeflection(Response):
+@response("tip_deflection")
+class TipDeflection(StaticResponse):
     """Largest displacement of the outboard point under `objective.loads`, by its p-norm, m."""
 
-    name, label, unit = "tip_deflection", "static deflection", "m"
-    needs = NEEDS[name]
+    def value(self, case: LoadedArm, tip: np.ndarray) -> tuple[float, float]:
+        """Return the largest length of the load cases' displacements, and their p-norm."""
+        vectors = tip[case.rows].T
+        smooth, _ = p_norm_of_lengths(vectors, self.options.exponent)
+        return float(lengths(vectors).max()), smooth
 
-    def measure(self, analysis: Analysis) -> Measured:
-        """Return the deflection of every design (collective)."""
-        mine = {}
-        with together(analysis.partition.world):
-            for k, state in analysis.designs.items():
-                response = static_response(state.elastic, self._loads(analysis))
-                mine[k] = response.deflection(self.options.exponent), response.largest
-        found = on_all_ranks(analysis.partition, mine)
-        smooth, largest = zip(*found.values(), strict=True)
-        names = tuple(analysis.scene.arms[k].name for k in found)
-        return Measured(self.name, names, largest, smooth)
+    def gradient(self, case: LoadedArm, tip: np.ndarray) -> np.ndarray:
+        """Return that of the p-norm."""
+        by = np.zeros_like(tip)
+        by[case.rows] = p_norm_of_lengths(tip[case.rows].T, self.options.exponent)[1].T
+        return by
 
-    def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the gradient of every design's deflection (collective)."""
-        designs, rows = analysis.designs, []
-        for owner in analysis.scene.cell_counts:
-            with together(analysis.partition.world):
-                row = {k: analysis.by(one, Products()) for k, one in designs.items()}
-                if owner in designs:
-                    response = static_response(designs[owner].elastic, self._loads(analysis))
-                    row[owner] = deflection_gradient(
-                        designs[owner], response, self.options.exponent, analysis.by
-                    )
-            rows.append(row)
-        return rows
-
-    def _loads(self, analysis: Analysis) -> np.ndarray:
-        return np.array(self.options.static_loads(analysis.scene))
-
-
-# -- stiffness of single arms under given loads --------------------------------------------------
 
 ROTATION = "_rotation"  # how the names of those values end
 
 
-@dataclass(frozen=True)
-class _Moved:
-    """One value of `Stiffness`: how far a load moves an arm's interface."""
-
-    name: str  # of the arm and the case
-    case: StiffnessCase  # the load
-    turns: bool  # whether it is the rotation, rad, or else the displacement, m
-    limit: float  # in this unit
-
-    def vector(self, state: DesignState) -> tuple[np.ndarray, np.ndarray]:
-        """Return the displacement or rotation, and the load on all outboard interfaces (b, 1)."""
-        found = static_response(state.elastic, np.array([self.case.load]))
-        return found.tip[self._rows, 0], found.loads
-
-    def value(self, state: DesignState) -> float:
-        """Return its length (collective on the arm's ranks)."""
-        return float(np.linalg.norm(self.vector(state)[0]))
-
-    def by_tip(self, state: DesignState) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivative of the length by all displacements (b, 1), and the load (b, 1)."""
-        vector, load = self.vector(state)
-        by, length = np.zeros_like(load), np.linalg.norm(vector)
-        if length > 0.0:
-            by[self._rows, 0] = vector / length
-        return by, load
-
-    @property
-    def _rows(self) -> slice:
-        d = 2 if len(self.case.load) == 3 else 3
-        return slice(d, len(self.case.load)) if self.turns else slice(d)
-
-
-@register
-class Stiffness(Response):
+@response("stiffness")
+class Stiffness(TipDeflection):
     """How far given static loads move the outboard interfaces of single arms, clamped inboard.
 
     The length of the displacement, m, or of the rotation, rad, of every case of
     `constraints.stiffness`: smooth where it is not zero.
     """
 
-    name, label, unit = "stiffness", "static displacement", "m"
-    needs = NEEDS[name]
-
     def __init__(
-        self, options: Objective, limited: bool = False, cases: Sequence[StiffnessCase] = ()
+        self, options: Objective, limited: bool = False, limits: Sequence[StiffnessCase] = ()
     ):
         """Take the options and the load cases."""
         super().__init__(options, limited)
-        self.moved = [
-            _Moved(f"{case.arm}_case{k}{ending}", case, bool(ending), limit)
-            for k, case in enumerate(cases, 1)
-            for ending, limit in (("", case.displacement), (ROTATION, case.rotation))
-            if limit is not None
-        ]
+        self.limits = limits
 
     @classmethod
     def unit_of(cls, value: str) -> str:
@@ -293,33 +263,19 @@ class Stiffness(Response):
     def restricted(self, limits: Sequence[StiffnessCase]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of these cases, and the limits of their values."""
         found = Stiffness(self.options, self.limited, limits)
-        return found, tuple(one.limit for one in found.moved)
+        both = (limit for case in limits for limit in (case.displacement, case.rotation))
+        return found, tuple(one for one in both if one is not None)
 
-    def measure(self, analysis: Analysis) -> Measured:
-        """Return every displacement and rotation (collective)."""
-        with together(analysis.partition.world):
-            mine = {
-                k: one.value(analysis.designs[owner])
-                for k, (one, owner) in enumerate(self._owned(analysis.scene))
-                if owner in analysis.designs
-            }
-        values = tuple(on_all_ranks(analysis.partition, mine).values())
-        return Measured(self.name, tuple(one.name for one in self.moved), values, values)
-
-    def gradients(self, analysis: Analysis) -> list[CellGradient]:
-        """Return the gradient of every one (collective)."""
-        rows = []
-        with together(analysis.partition.world):
-            for one, owner in self._owned(analysis.scene):
-                designs = analysis.designs
-                row = {k: analysis.by(state, Products()) for k, state in designs.items()}
-                if owner in designs:
-                    state = designs[owner]
-                    row[owner] = tip_gradient(state, *one.by_tip(state), analysis.by)
-                rows.append(row)
-        return rows
-
-    def _owned(self, scene: Scene) -> list[tuple[_Moved, int]]:
-        """Return every value with the index of the arm that owns the design."""
+    def cases(self, scene: Scene) -> Sequence[LoadedArm]:
+        """Return the displacement and the rotation of every case that limits them."""
         owners = {arm.name: k for arm, k in zip(scene.arms, scene.owners, strict=True)}
-        return [(one, owner) for one in self.moved if (owner := owners[one.case.arm]) is not None]
+        found, d = [], scene.dimension
+        for number, case in enumerate(self.limits, 1):
+            name, loads, owner = f"{case.arm}_case{number}", np.array([case.load]), owners[case.arm]
+            assert owner is not None  # the scene has checked that
+            if case.displacement is not None:
+                found.append(LoadedArm(name, owner, loads, slice(d)))
+            if case.rotation is not None:
+                turned = slice(d, loads.shape[1])
+                found.append(LoadedArm(name + ROTATION, owner, loads, turned))
+        return found

@@ -40,11 +40,10 @@ from dolfinopt.responses.response import (
     by_owner,
     cotangents_of_scene,
     factors,
-    register,
+    response,
 )
 from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import NEEDS
 
 # -- von Mises stress at the element centres of one design, relaxed for intermediate density -----
 #
@@ -325,7 +324,7 @@ def _integrals(body: ShapeIntegrals, by_P: np.ndarray, by_K: np.ndarray) -> Shap
 # -- von Mises stress of the arms along the motion -----------------------------------------------
 
 
-@register
+@response("stress")
 class Stress(Response):
     """p-mean over cells and instants of the relaxed von Mises stress at element centres, Pa.
 
@@ -334,9 +333,6 @@ class Stress(Response):
     is the largest s_en of all instants. Displacements are those of mode acceleration, see
     `fem.stress`.
     """
-
-    name, label, unit = "stress", "p-mean of the von Mises stress", "Pa"
-    needs = NEEDS[name]
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return largest stress and p-mean over all arms and scenarios (collective)."""

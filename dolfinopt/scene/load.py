@@ -54,6 +54,7 @@ from dolfinopt.scene.tables.arms import (
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
 from dolfinopt.scene.tables.closures import (
     OLD,
+    OLD_CLOSURE,
     Closures,
     read_old_closure,
     take_old_keys,
@@ -61,7 +62,8 @@ from dolfinopt.scene.tables.closures import (
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Force, Joint
 from dolfinopt.scene.tables.motion import Motion, Reduction
-from dolfinopt.scene.tables.objective import NEEDS, Objective, WorstBy
+from dolfinopt.scene.tables.objective import Objective, WorstBy
+from dolfinopt.scene.tables.responses import DECLARED, current_key, read_old_names
 
 __all__ = [
     "FILE_KEYS",
@@ -84,7 +86,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-# Arrays of tables of which --set knows single ones by their name, or their number.
+# Arrays of tables whose entries --set addresses by name or number.
 NAMED: dict[str, type[Table]] = {
     "arms": Arm,
     "joints": Joint,
@@ -144,11 +146,13 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     read_old_closure(tree, source)
     inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
     sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
-    changes = [_override(tree, text, source) for text in overrides]
+    told: list[str] = []
+    changes = [_override(tree, current_key(text, told), source) for text in overrides]
     for change in changes:
         sizes.difference_update(change.locs)
         inherited.difference_update(change.locs[:1])
         inherited.update(change.locs[1:])
+    told += read_old_names(tree)
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
@@ -166,7 +170,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
         raise InputError(message) from None
     scene._source = source
     scene._derived = derived
-    scene._has_old_closure = data.get(OLD) is not None
+    scene._old_words = (*told, *[OLD_CLOSURE] * (data.get(OLD) is not None))
     pose_scenarios(scene)
     return scene
 
@@ -623,7 +627,7 @@ def _freeze_loads(tree: dict[str, Any]) -> Keys:
         return ()
     limited = [key for key, limit in limits.items() if limit is not None]
     if objective.get("kind", Objective.model_fields["kind"].default) != "esl" or any(
-        "motion" in NEEDS.get(key, ()) for key in limited
+        one.key in limited and "motion" in one.needs for one in DECLARED.values()
     ):
         return ()
     tree["objective"] = {**objective, "gradient": "esl"}

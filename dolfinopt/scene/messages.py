@@ -25,7 +25,7 @@ from dolfinopt.scene.tables.base import (
     without_none,
 )
 from dolfinopt.scene.tables.closures import as_written
-from dolfinopt.scene.tables.objective import need_of
+from dolfinopt.scene.tables.responses import need_of
 
 _COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
 
@@ -310,15 +310,14 @@ def implausible(scene: Scene) -> list[str]:
 def _old_words(scene: Scene) -> list[str]:
     """Tell words that are translated, and keys that are read without effect."""
     keys = sorted({"integrator", "rho_inf"} & scene.simulation.model_fields_set)
-    old = (
-        "[closure] is read as one of [[closures]], closure.direction as its axis, closure.force "
-        'as the factor of the force "closure" among [[forces]]; state those'
-    )
-    return [old] * scene.has_old_closure + [
-        f"simulation.{key} is read without effect: every motion is integrated by Radau IIA, see "
-        "simulation.tolerance"
-        for key in keys
-        if key == "rho_inf" or scene.simulation.integrator != "radau"
+    return [
+        *scene.old_words,
+        *(
+            f"simulation.{key} is read without effect: every motion is integrated by Radau IIA, "
+            "see simulation.tolerance"
+            for key in keys
+            if key == "rho_inf" or scene.simulation.integrator != "radau"
+        ),
     ]
 
 

@@ -85,7 +85,7 @@ class Scene(Table):
 
     _source: str = PrivateAttr("<scene>")
     _derived: tuple[tuple[str, str], ...] = PrivateAttr(())  # (table, key), see `to_tree`
-    _has_old_closure: bool = PrivateAttr(False)  # whether its file states [closure]
+    _old_words: tuple[str, ...] = PrivateAttr(())  # a sentence on each that its data use
 
     @property
     def source(self) -> str:
@@ -93,9 +93,9 @@ class Scene(Table):
         return self._source
 
     @property
-    def has_old_closure(self) -> bool:
-        """Whether the scene's data state `[closure]`, an older word for one of `[[closures]]`."""
-        return self._has_old_closure
+    def old_words(self) -> tuple[str, ...]:
+        """Sentences on older words of the scene's data, and what they are read as."""
+        return self._old_words
 
     @property
     def owners(self) -> tuple[int | None, ...]:

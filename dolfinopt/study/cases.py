@@ -37,11 +37,12 @@ from dolfinopt.dynamics.simulation import simulate_all
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.multibody.kinematics import lengths
+from dolfinopt.optimization.result import RankResult, simulation_result
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import arms_with_design, read_history
 from dolfinopt.output.folders import working_alone
-from dolfinopt.output.run_folder import Simulated, optimize, write_result, write_simulation
+from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Counts, Profile
@@ -235,7 +236,7 @@ APART = (
 
 def simulate_scenarios(
     scenes: Sequence[Scene], design: Path | None
-) -> Iterator[Simulated | ConvergenceError]:
+) -> Iterator[RankResult | ConvergenceError]:
     """Simulate one design in many scenes, on this rank alone; of one that fails yield its error.
 
     Arms are meshed, assembled and factorised once; neighbours with the same basis share it and are
@@ -259,7 +260,7 @@ def simulate_scenarios(
             if isinstance(found, ConvergenceError):
                 yield found
             else:
-                yield Simulated(scene, partition, arms, x_phys, *found, profile, choice)
+                yield simulation_result(scene, partition, arms, x_phys, *found, profile, choice)
             profile.seconds.clear()  # the account of the next scene; the arms know the profile
             profile.counts = Counts()
 
@@ -294,7 +295,7 @@ def with_sample(scene: Scene, changes: Sequence[str], number: int) -> Scene:
 
 
 def simulate_samples(
-    nominal: Simulated | ConvergenceError | None, scenes: Sequence[Scene], design: Path | None
+    nominal: RankResult | ConvergenceError | None, scenes: Sequence[Scene], design: Path | None
 ) -> Iterator[Trajectory | ConvergenceError]:
     """Simulate a design (design.npz, or None, the initial one) in scenes, on this rank alone.
 
@@ -503,7 +504,7 @@ def _optimise(case: Case, place: _Place) -> None:
         place.fail(case, str(error))
         return
     earlier = rows[-1].seconds if rows else 0.0
-    write_result(scene, folder, result, earlier + time.perf_counter() - begun, paraview=False)
+    write_result(folder, result, earlier + time.perf_counter() - begun, paraview=False)
 
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
@@ -520,7 +521,7 @@ def _simulate(job: Job, design: Path | None, place: _Place) -> None:
                 place.fail(case, str(result))
             else:
                 make_folder(part)
-                write_simulation(part, result, wall, paraview=False)
+                write_result(part, result, wall, paraview=False)
         for case in batch:
             with suppress(FileNotFoundError):  # it failed
                 os.rename(place.work / case.key, place[case])

@@ -32,7 +32,6 @@ from dolfinopt.mesh.hollow import KINDS, Section, member
 from dolfinopt.mesh.solid_cells import msh_bytes
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.constraints import EXCESS
-from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
 from dolfinopt.scene.tables.arms import WALL_KEYS
@@ -520,7 +519,7 @@ def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
         return "No straight member within the arms' envelope has the design's mass."
     best = min(able, key=lambda row: row.outcome.objective)
     values = best.outcome.objective, design.outcome.objective
-    name, unit = objective_of(scene).label, objective_of(scene).unit
+    name, unit = scene.objective.response.label, scene.objective.response.unit
     return (
         f"With the design's mass of {design.mass:.4g} kg the best straight member, a {best.kind}, "
         f"has an objective ({name}) of {values[0]:.4g} {unit}, the design {values[1]:.4g} {unit}: "
@@ -551,7 +550,7 @@ def _cells(scene: Scene, row: Row) -> dict[str, Any]:
         "made": row.made,
         "sizes [mm]": row.sizes,
         "mass [kg]": row.mass,
-        f"objective [{objective_of(scene).unit}]": outcome.objective,
+        f"objective [{scene.objective.response.unit}]": outcome.objective,
         COMPLIANCE: outcome.compliance,
         DEVIATION: 1e3 * outcome.max_deviation,
         "settling [mm]": 1e3 * summary.get("settling", math.nan),

@@ -13,15 +13,15 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
-from dolfinopt.scene.tables.objective import LIGHTER, unused_options
+from dolfinopt.scene.tables.responses import DECLARED, unused_options
 
 # Label; kind, and the settings that make it.
 OBJECTIVES = (
     ("dynamic loads (esl)", ("esl", "gradient=esl", "worst=compliance")),
     ("dynamic loads (esl), exact gradient", ("esl", "gradient=exact", "worst=compliance")),
     ("dynamic loads (esl) chosen by deviation", ("esl", "gradient=esl", "worst=deviation")),
-    ("compliance over the horizon", ("compliance", "gradient=esl")),
-    ("compliance over the horizon, exact gradient", ("compliance", "gradient=exact")),
+    ("compliance over the horizon", ("integral_compliance", "gradient=esl")),
+    ("compliance over the horizon, exact gradient", ("integral_compliance", "gradient=exact")),
     ("deviation", ("deviation", "gradient=esl")),
     ("deviation, exact gradient", ("deviation", "gradient=exact")),
     ("static compliance", ("static",)),
@@ -172,9 +172,9 @@ def posed(scene: Scene, kind: str) -> Scene:
     """
     tree = scene.to_tree()
     tree["objective"] |= {"kind": kind, "direction": None}
-    if kind not in LIGHTER:
+    if not DECLARED[kind].lighter:
         tree["constraints"] = {"settling_after": scene.constraints.settling_after}
-    elif scene.objective.kind not in LIGHTER or "volume_fraction" not in tree["design"]:
+    elif not scene.objective.response.lighter or "volume_fraction" not in tree["design"]:
         tree["design"]["volume_fraction"] = None if kind == "mass" else 1.0
         if kind == "mass":
             tree["design"]["shared_volume"] = False
@@ -185,7 +185,7 @@ def posed(scene: Scene, kind: str) -> Scene:
 def _drop_unused(tree: dict[str, Any]) -> None:
     """Take out of a scene's data what its objective and its limits do not use."""
     limited = [key for key, limit in tree["constraints"].items() if limit is not None]
-    for key in unused_options(tree["objective"]["kind"], limited):
+    for key in unused_options(list(tree["objective"]), tree["objective"]["kind"], limited):
         tree["objective"].pop(key, None)
 
 

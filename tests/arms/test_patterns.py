@@ -9,7 +9,7 @@ from runs import STATED, TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm, Patterns, uniform_design
-from dolfinopt.optimization.problem import Evaluator
+from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.output.design import read_design
 from dolfinopt.parallel import Partition
 
@@ -48,7 +48,7 @@ def test_cells_have_the_densities_of_their_partners(projection):
     evaluator = Evaluator(scene, partition, arms, do.Profile())
     assert evaluator.variables.size == (160 if 0 in arms else 0)
     x = evaluator.variables.join({k: waves(arms[k]) for k in arms if k == 0})
-    evaluator.continuation.beta = 4.0
+    evaluator.projection.beta = 4.0
     for design in evaluator.physical_designs(x):
         mine = {k: by_place(scene, arms, k, one.x_phys) for k, one in design.items()}
         known = {k: v for part in WORLD.allgather(mine) for k, v in part.items()}
@@ -108,7 +108,7 @@ def test_gradients_by_the_design_of_both_arms(changes):
     if counted == slice(None):
         names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
         both = ("arm1", "arm2")
-        limits = [("first_frequency", both), ("tip_deflection", both)]
+        limits = [("eigenfrequency", both), ("tip_deflection", both)]
         assert names == [("volume_fraction", ("arm1",)), *limits]
 
 

@@ -159,7 +159,9 @@ def test_budget_is_the_first_thing_told(tmp_path, capsys) -> None:
     summary = summary_of(tmp_path / "run")
     found = summary["deflection_budget"]
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith(f"links hold {100.0 * found['shares']['links']:.3g} % of the defl")
+    assert lines[0].startswith(
+        f"the deviation comes from links {100.0 * found['shares']['links']:.3g} %, "
+    )
     assert lines[1].startswith(f"at {found['instant']:.3f} s")
     assert found["deviation"] == summary["max_deviation"]
     rows = (tmp_path / "run" / "budget.csv").read_text().splitlines()

@@ -471,7 +471,7 @@ def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
 
 LAWS = ["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
 METHODS = ["craig-bampton", "modal", "krylov", "balanced"]
-KINDS = ["esl", "compliance", "deviation", "static", "eigenfrequency"]
+KINDS = ["esl", "integral_compliance", "deviation", "static", "eigenfrequency"]
 JOINTS = "t,cart,{arms}\n0,0,{a}\n0.6,0.2,{b}\n1,0.1,{c}\n"
 
 

@@ -25,7 +25,7 @@ STEEL = {"young_modulus": 2.1e11, "poisson_ratio": 0.3, "density": 7850.0}
 SECTION = {"height": 0.01, "thickness": 0.01}  # m
 SOFT: Tree = {  # tables of designs that bend well, and of their gradients
     "interpolation": {"law": "two-material", "penalty": 3.0, "floor": 1e-3},
-    "objective": {"kind": "compliance", "gradient": "exact", "load_cases": 6},
+    "objective": {"kind": "integral_compliance", "gradient": "exact", "load_cases": 6},
     "reduction": {"coordinates": 6},
     "damping": {"stiffness_proportional": 1e-4},
     "design": {"initial": 0.6, "volume_fraction": 0.6, "filter_radius": 0.0},

@@ -49,7 +49,7 @@ LOOP: Tree = {
     "damping": {"stiffness_proportional": 2e-5},
     "reduction": {"coordinates": 4},
     "simulation": {"sample": 1e-3, "tolerance": 1e-3},
-    "objective": {"kind": "compliance", "gradient": "exact"},
+    "objective": {"kind": "integral_compliance", "gradient": "exact"},
     "design": {"initial": 0.5, "filter_radius": 0.0},
     "optimizer": {"max_iterations": 2},
 }  # fmt: skip
@@ -133,7 +133,7 @@ def slider_crank(height: float, cells: tuple[int, int] = (60, 4), **changes: Any
         "reduction": {"coordinates": 8},
         "simulation": {"stiffening": True, "sample": 2e-4, "tolerance": 1e-4},
         "design": {"volume_fraction": 1.0, "initial": 1.0},
-        "objective": {"kind": "compliance"},
+        "objective": {"kind": "integral_compliance"},
     })  # fmt: skip
     tree["arms"][1] |= {"height": height, "cells": list(cells)}
     return with_keys(tree, changes)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from runs import ROOT, STATED, TWO_ARM, refusal
 
 import dolfinopt as do
-from dolfinopt.optimization.problem import Evaluator
+from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.output.design import gather_views
 from dolfinopt.plots.design import REGION, design_figure
 from dolfinopt.scene.regions import grid_regions
@@ -62,7 +62,7 @@ def test_regions_stay_in_every_design(projection, symmetric):
         regions(HOLE, LUG), f"design.projection={projection}", f"arms.symmetric={symmetric}"
     )
     evaluator = Evaluator(scene, partition, arms, do.Profile())
-    evaluator.continuation.beta = 8.0
+    evaluator.projection.beta = 8.0
     variables = evaluator.variables
     x = np.clip(np.linspace(0.1, 0.9, variables.size), variables.xmin, variables.xmax)
     for design in evaluator.physical_designs(x):

@@ -10,7 +10,7 @@ from runs import QUICK, TWO_ARM, overrides, quick, run, summary_of
 from scipy.integrate import trapezoid
 
 import dolfinopt as do
-from dolfinopt.optimization.stopping import kkt_residual
+from dolfinopt.optimization.residual import kkt_residual
 from dolfinopt.output.design import ArmView, read_history, write_fields
 from dolfinopt.parallel import Partition, on_root, sum_over_arms
 from dolfinopt.responses import response
@@ -127,24 +127,6 @@ def test_residual_has_the_same_bits_on_any_number_of_ranks():
     assert together.limits == alone.limits
 
 
-def test_a_tiny_move_limit_is_no_convergence():
-    result = do.optimize(quick("optimizer.move=1e-6", "objective.kind=static", iterations=3))
-    assert not result.converged and result.iterations == 3
-    # Nor is one that just lets variables move less than the tolerance.
-    short = do.optimize(quick("optimizer.move=5e-4", "objective.kind=static", iterations=3))
-    assert not short.converged and short.iterations == 3
-    loose = ["optimizer.move=5e-4", "optimizer.kkt_tolerance=1e6", "objective.kind=static"]
-    assert not do.optimize(quick(*loose, iterations=3)).converged
-
-
-def test_a_large_residual_is_no_convergence():
-    """All changes count as small; the residual of the first steps does not."""
-    small = ["optimizer.tolerance=1", "optimizer.move=1", "objective.kind=static"]
-    result = do.optimize(quick(*small, iterations=2))
-    assert not result.converged and result.kkt > 0.1
-    assert do.optimize(quick(*small, "optimizer.kkt_tolerance=1e6", iterations=2)).converged
-
-
 @pytest.mark.parametrize(
     ("bound", "words"),
     [
@@ -174,21 +156,22 @@ def test_an_infeasible_end_has_status_1_and_one_line(bound, words, shared_tmp_pa
     assert [row.iteration for row in rows] == [0, 1, 2] and np.isfinite(rows[-1].kkt)
 
 
-def test_the_last_line_says_what_was_minimised(shared_tmp_path, capsys):
-    def last_line(command, *changes):
+def test_the_last_lines_say_what_was_minimised(shared_tmp_path, capsys):
+    def last_lines(command, *changes):
         out = ["--no-plots", "--out", shared_tmp_path / changes[-1]]
         run(command, TWO_ARM, *overrides(*QUICK, *changes), *out)
-        lines = capsys.readouterr().out.splitlines()
-        return next((one for one in lines if one.startswith("two-arm manipulator: ")), "")
+        said = capsys.readouterr().out
+        return said[said.find("two-arm manipulator: ") :]
 
-    line = last_line("optimize", "optimizer.max_iterations=1", "objective.kind=eigenfrequency")
+    line = last_lines("optimize", "optimizer.max_iterations=1", "objective.kind=eigenfrequency")
     if WORLD.rank == 0:
         assert "minimised squared longest periods" in line
         assert " s2 (first frequency of arm1" in line
         assert "N m" not in line
-    line = last_line("simulate", "objective.kind=deviation")
+    line = last_lines("simulate", "objective.kind=deviation")
     if WORLD.rank == 0:
-        assert ": simulated, p-mean of the deviation" in line and "iterations" not in line
+        assert ": simulated, " in line and "  p-mean of the deviation" in line
+        assert "iterations" not in line
 
 
 def test_sentences_tell_a_value_from_its_limit():

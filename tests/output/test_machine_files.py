@@ -11,9 +11,10 @@ from runs import TWO_ARM, by_root, contents, summary_of
 
 import dolfinopt as do
 from dolfinopt.fem.forms import ELEMENTS
+from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.design import gather_views
-from dolfinopt.output.run_folder import Simulated, write_result, write_simulation
+from dolfinopt.output.run_folder import write_result
 
 WORLD = MPI.COMM_WORLD
 
@@ -23,8 +24,8 @@ def left_by(scene, folder):
     built = built_of(scene)
     x = built.uniform()
     evaluation, trajectory = built.evaluate(x)
-    one = Simulated(*built.place, x, evaluation, trajectory, built.profile)
-    write_simulation(folder, one, 0.0, paraview=False)
+    one = simulation_result(*built.place, x, evaluation, trajectory, built.profile)
+    write_result(folder, one, 0.0, paraview=False)
     with np.load(folder / "trajectory.npz") as data:
         arrays = {name: data[name] for name in data.files}
     table = np.genfromtxt(folder / "trajectory.csv", delimiter=",", names=True)
@@ -171,7 +172,7 @@ def result():
 def simulated(result):
     profile = do.Profile()
     design = do.load_scene(TWO_ARM, SMALL), result.partition, result.arms, result.x_phys
-    return Simulated(*design, *do.evaluate(*design, profile), profile)
+    return simulation_result(*design, *do.evaluate(*design, profile), profile)
 
 
 @pytest.mark.parametrize("paraview", [True, False])
@@ -179,8 +180,8 @@ def test_files(result, shared_tmp_path, paraview):
     one, other = shared_tmp_path / "one", shared_tmp_path / "other"
     by_root(lambda: (one.mkdir(), other.mkdir()))
     scene = do.load_scene(TWO_ARM, SMALL)
-    written = write_result(scene, one, result, 12.5, paraview=paraview)
-    again = write_simulation(other, simulated(result), 2.5, paraview=paraview)
+    written = write_result(one, result, 12.5, paraview=paraview)
+    again = write_result(other, simulated(result), 2.5, paraview=paraview)
     if WORLD.rank > 0:
         assert written is None and again is None
         return
@@ -227,7 +228,7 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
     monkeypatch.setattr(results, "write_trajectory", fail)
     one = simulated(result)
     with pytest.raises(OSError, match="disk full"):
-        write_simulation(shared_tmp_path, one, 1.0)
+        write_result(shared_tmp_path, one, 1.0)
     assert not (shared_tmp_path / "summary.json").exists()
 
 

@@ -29,7 +29,7 @@ from dolfinopt.responses.response import Analysis
 
 pytestmark = pytest.mark.serial
 COARSE = ("arms.link2.rigid=true", "simulation.sample=0.02",
-          "simulation.tolerance=1e-4", "objective.kind=compliance")  # fmt: skip
+          "simulation.tolerance=1e-4", "objective.kind=integral_compliance")  # fmt: skip
 
 
 def open_box(x, y, z):

@@ -86,7 +86,7 @@ def test_curves_follow_those_of_the_part(made):
     assert ends[0] - ends[1] == pytest.approx(2.0 * outline.size_by_s() @ moves, rel=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["compliance", "mass"])
+@pytest.mark.parametrize("kind", ["integral_compliance", "mass"])
 def test_slopes_are_differences(made, kind):
     """Along an even offset and an uneven one; the sides' bulge, a per cent or two, is left out."""
     scene = with_tables(made[1], objective={"kind": kind}, constraints={"deviation": 0.1})
@@ -136,7 +136,7 @@ def test_slopes_of_a_repeated_design_are_differences(tmp_path):
     sizes = f"arms.arm2.length={size[0]}", f"arms.arm2.height={0.06 * size[1]}"
     changes = ("arms.arm2.pattern=arm1", *sizes, "arms.cells=[100,6]", "design.projection=robust",
                "simulation.sample=0.005")  # fmt: skip
-    posed = with_tables(runs.scene(*changes), objective={"kind": "compliance"})
+    posed = with_tables(runs.scene(*changes), objective={"kind": "integral_compliance"})
     images = frame, lambda x, y: frame(x / size[0], y / size[1])
     folder = write_run(tmp_path / "run", posed, *images)
     parts = make_parts(posed, folder)

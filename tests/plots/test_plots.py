@@ -227,7 +227,7 @@ def test_history_shows_the_rows(count):
 def test_history_has_a_panel_for_every_column_there_is():
     """Constraints by name, a residual: as the rows have them; limits in mm and MPa."""
     name, some = "first frequency of arm1 [Hz]", (2.0, 0.01, 0.5, 0.5, 0.1, 1.0)
-    rows = [HistoryRow(k, *some, 10.0**-k, {name: 60.0 + k}) for k in range(3)]
+    rows = [HistoryRow(k, *some, 10.0**-k, constraints={name: 60.0 + k}) for k in range(3)]
     panels = curves.history_panels(rows, "objective [N m]")
     np.testing.assert_allclose(panels["Karush-Kuhn-Tucker residual [-]"], [1.0, 0.1, 0.01])
     np.testing.assert_allclose(panels[name], [60.0, 61.0, 62.0])

@@ -13,7 +13,7 @@ from runs import TWO_ARM, overrides, refused, run, summary_of
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.dynamics.simulation import simulate
-from dolfinopt.optimization import certificate, measured
+from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.responses.order_selection import OrderSelection, estimated_error
@@ -258,9 +258,9 @@ def test_any_number_of_ranks():
 
 
 def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
-    monkeypatch.setattr(certificate, "estimated_error", lambda *_: 0.02)
+    monkeypatch.setattr(assessment, "estimated_error", lambda *_: 0.02)
     scene = small(iterations=1)
-    written = write_result(scene, shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
+    written = write_result(shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
     if written is not None:
         assert written.summary["reduction"]["error_estimate"] == 0.02
         (warning,) = (w for w in written.summary["warnings"] if "filter" not in w)

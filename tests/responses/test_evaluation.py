@@ -17,8 +17,8 @@ from dolfinopt.dynamics.collocation import Solution, radau_iia
 from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.shape_integrals import rigid_bar
-from dolfinopt.responses.constraints import load_cases, objective
 from dolfinopt.responses.evaluation import constraint_gradients, evaluate_batch
+from dolfinopt.responses.motion import motion_objective
 
 WORLD = MPI.COMM_WORLD
 
@@ -56,7 +56,7 @@ CASES = [
     ["reduction.method=modal"],
     ["objective.kind=deviation", "objective.gradient=exact"],
     ["objective.kind=deviation"],
-    ["objective.kind=compliance", "objective.gradient=exact"],
+    ["objective.kind=integral_compliance", "objective.gradient=exact"],
     ["objective.kind=static"],
     ["objective.kind=eigenfrequency"],
     ["constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6", "objective.kind=static"],
@@ -129,13 +129,13 @@ def test_a_rigid_bar_is_the_solid_arm() -> None:
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("overrides", [[], [SHARED], ["arms.arm1.rigid=true"]], ids=str)
-@pytest.mark.parametrize("kind", ["esl", "compliance", "deviation"])
+@pytest.mark.parametrize("kind", ["esl", "integral_compliance", "deviation"])
 def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: list[str]) -> None:
     """Loads f_j = K q_j, modes and instants held: q_j(x) = (V' K(x) V)^-1 f_j, remainders of 2."""
     built = build(f"objective.kind={kind}", "payload.mass=1.0", *overrides)
     x = built.fields(wave)
     _, base = built.evaluate(x)
-    slopes, where = built.gradient(base), load_cases(base, built.scene)
+    slopes, where = built.gradient(base), motion_objective(base).load_cases(base)
     bases = {k: arm.basis for k, arm in built.arms.items()}
 
     def value(h: float, d) -> float:
@@ -157,7 +157,7 @@ def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: lis
         p, share = built.scene.objective.exponent, where.weights / where.weights.sum()
         return float((share @ (e / e.max()) ** p) ** (1.0 / p) * e.max())
 
-    assert value(0.0, x) == pytest.approx(objective(base, built.scene), rel=1e-9)
+    assert value(0.0, x) == pytest.approx(motion_objective(base).of_motion(base), rel=1e-9)
     for direction in (uneven, tip):
         d = built.fields(direction)
         along = built.dot(slopes, d)
@@ -207,7 +207,9 @@ def test_load_cases_are_the_worst_instants(worst: str) -> None:
     # 3000 samples of 1 ms after the first
     parts = [[i for i in range(1, 3001) if j * 3000 < 7 * i <= (j + 1) * 3000] for j in range(7)]
     chosen = [max(part, key=lambda i: bad[i]) for part in parts]
-    np.testing.assert_array_equal(load_cases(trajectory, built.scene).indices, chosen)
+    np.testing.assert_array_equal(
+        motion_objective(trajectory).load_cases(trajectory).indices, chosen
+    )
     assert evaluation.objective == pytest.approx(compliance[chosen].sum(), rel=1e-12)
     # The summary's figure stays the paper's: it compares designs of different objectives.
     most = sum(compliance[part].max() for part in parts)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ from dolfinopt.responses.evaluation import gradient
 from dolfinopt.responses.products import Products, by_nodes
 from dolfinopt.responses.response import constraints_of
 from dolfinopt.responses.sensitivity import esl_gradient
-from dolfinopt.scene.tables.objective import EXACT_ONLY, FORCES, NEEDS, POLES, ObjectiveKind
+from dolfinopt.scene.tables.responses import DECLARED, objective_kinds
 
 ROUGHLY = ("simulation.tolerance=1e-3", "simulation.sample=0.01", "objective.gradient=exact")
 SHORT = ("arms.cells=[12,2]", "arms.passive=0", "design.filter_radius=0", "motion.horizon=2.2",
@@ -55,6 +54,7 @@ Point(4) = {0, 0.03, 0}; Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; L
 Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1}; %s Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
+WHOLE = "integral_compliance"  # of the whole horizon
 FILES = {
     "drives.csv": "t,cart,arm1,arm2\n0,0,0,0\n0.7,20,5,-3\n1.4,-20,0,2\n2.2,0,0,0\n",
     "push.csv": "t,fx,fy,mz\n0,0,20,1\n0.7,40,-20,5\n1.4,-60,0,-2\n2.0,10,30,0\n",
@@ -91,7 +91,8 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
 
 def case(base: str, kind: str, *changes: str, ranks: bool = False, slow: bool = False):
     """Return a case: base, objective ("": the base's own) and keys."""
-    kept = ["constraints.compliance=1e6"] * (kind in ("mass", *FORCES))  # N m; far away
+    lightest = kind in ("mass", "effort", "peak_force")
+    kept = ["constraints.compliance=1e6"] * lightest  # N m; far away
     told = [f"objective.kind={kind}"] * (kind != "") + kept
     marks = [*[pytest.mark.slow] * slow, *[pytest.mark.serial] * (not ranks)]
     return pytest.param(base, (*told, *changes), marks=marks, id=" ".join((base, kind, *changes)))
@@ -163,21 +164,21 @@ YIELDING_BOOM = (
 CASES = [
     # Prescribed motions in the plane.
     case("two_arm", "", "reduction.coordinates=3"),
-    case("two_arm", "compliance", "reduction.coordinates=4", ranks=True),
+    case("two_arm", WHOLE, "reduction.coordinates=4", ranks=True),
     case("two_arm", "", "reduction.coordinates=6", *LOADED),
     case("two_arm", "", MODAL, "reduction.coordinates=1"),
     case("two_arm", "", MODAL, "reduction.coordinates=4", *LOADED),
     case("two_arm", "", "damping.stiffness_proportional=0.0"),
     case("two_arm", "deviation", *LOADED),
-    case("two_arm", "compliance", "payload.mass=0.2", "arms.passive=0.09", *LOADED),
+    case("two_arm", WHOLE, "payload.mass=0.2", "arms.passive=0.09", *LOADED),
     case("two_arm", "effort", "payload.mass=0.5"),
     case("two_arm", "effort", MODAL, BENT, *LOADED),
     case("two_arm", "effort", BENT, GRAVITY),
     case("two_arm", "deviation", BENT),
-    case("two_arm", "compliance", *SKEW, BENT),
-    *(case("two_arm", "compliance", f"arms.element={name}", bent)
+    case("two_arm", WHOLE, *SKEW, BENT),
+    *(case("two_arm", WHOLE, f"arms.element={name}", bent)
       for name in ELEMENTS for bent in (LINEAR, BENT)),
-    *(case("two_arm", "compliance", "reduction.method=krylov", f"reduction.coordinates={q}",
+    *(case("two_arm", WHOLE, "reduction.method=krylov", f"reduction.coordinates={q}",
            f"reduction.shifts={shifts}", "payload.mass=1")
       for q, shifts in ((3, [0.0]), (4, [0.0]), (8, [0.0]), (13, [0.0]), (8, [0.0, 30.0]))),
     # Nothing moves: neither basis nor integrator matters.
@@ -222,19 +223,19 @@ CASES = [
       for kind in ("esl", "static", "eigenfrequency", "deviation")),
     case("two_arm", "static", *REPEATED, SIMP),
     # Other numbers of arms.
-    case("one_arm", "compliance", "motion.law=trapezoidal"),
+    case("one_arm", WHOLE, "motion.law=trapezoidal"),
     case("three_arm", "", "motion.law=s-curve", "objective.load_cases=5", slow=True),
     # Machines: control, hardware at the joints, closed loops.
     case("controlled", ""),
     case("controlled", "", BENT, GRAVITY),
-    case("controlled", "compliance", GRAVITY, "control.feed_forward=none"),
-    case("controlled", "compliance", "control.feed_forward=none", DRIVES),
-    case("controlled", "compliance", *JOINT, "motion.cart_mass=2.0", "arms.arm2.rotor_inertia=1e-4",
+    case("controlled", WHOLE, GRAVITY, "control.feed_forward=none"),
+    case("controlled", WHOLE, "control.feed_forward=none", DRIVES),
+    case("controlled", WHOLE, *JOINT, "motion.cart_mass=2.0", "arms.arm2.rotor_inertia=1e-4",
          "arms.arm2.gear_ratio=30.0", slow=True),
     case("controlled", "", GRAVITY, *SPRINGY),
     case("two_arm", "deviation", *JOINT, *YIELDING),
-    case("two_arm", "compliance", BENT, GRAVITY, BEARINGS, ranks=True),
-    case("two_arm", "compliance", TWO, BEARINGS, slow=True),
+    case("two_arm", WHOLE, BENT, GRAVITY, BEARINGS, ranks=True),
+    case("two_arm", WHOLE, TWO, BEARINGS, slow=True),
     case("controlled", "deviation", GRAVITY, *GEARS, BEARINGS, WOUND, RUB),
     case("controlled", "effort", GRAVITY, *GEARS, WOUND, RUB),
     case("two_arm", "effort", GRAVITY, BEARINGS, *YIELDING, RUB, slow=True),
@@ -312,7 +313,7 @@ CASES = [
     case("two_arm", "deviation", TWO, PUSHED, slow=True),
     case("controlled", "deviation", GRAVITY, UNFORESEEN, slow=True),
     case("controlled", "effort", GRAVITY, PUSHED, slow=True),
-    case("slider", "compliance", CRANK, TRUST),
+    case("slider", WHOLE, CRANK, TRUST),
     case("pin", "", BENT, TRUST.replace("rod", "coupler"), slow=True),
     case("fork", "deviation", PUSHED_FORK),
     case("fork", "effort", PUSHED_FORK, slow=True),
@@ -329,7 +330,7 @@ CASES = [
     case("loop", "damping_ratio", BENT, "control={stiffness=[100.0], damping=[0.1]}"),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", kind, "design.filter_radius=0.05", *FINER)
-      for kind in get_args(ObjectiveKind) if kind not in POLES),
+      for kind in objective_kinds() if "poles_at" not in DECLARED[kind].options),
 ]  # fmt: skip
 
 
@@ -347,7 +348,7 @@ def test_by_densities(base, changes, shared_tmp_path, monkeypatch) -> None:
     scene = contract(base, changes, shared_tmp_path, monkeypatch)
     kind = scene.objective.kind
     # Forces are made of accelerations, which leave more rounding.
-    steps = (1e-3, 2.5e-4) if kind in FORCES else (4e-4, 1e-4)
+    steps = (1e-3, 2.5e-4) if "effort_weights" in DECLARED[kind].options else (4e-4, 1e-4)
     test = taylor(scene, wave, steps, ("random", "smooth"))
     found = [row.rate for row in test.rows]
     if kind == "mass":  # linear in the densities of this law
@@ -355,7 +356,9 @@ def test_by_densities(base, changes, shared_tmp_path, monkeypatch) -> None:
     else:
         assert found == pytest.approx([2.0, 2.0], abs=0.1)
         assert all(row.slope != 0.0 for row in test.rows)
-    assert np.isfinite(test.angle) == ("motion" in NEEDS[kind] and kind not in EXACT_ONLY)
+    assert np.isfinite(test.angle) == (
+        "motion" in DECLARED[kind].needs and not DECLARED[kind].exact
+    )
     # Frozen loads tell the sign, no more; of three fast arms not even that.
     assert base == "three_arm" or not test.angle > 45.0  # deg
 
@@ -390,9 +393,9 @@ NODES = [
     *(case("two_arm", kind, *TRIANGLES, *changes, ranks=ranks) for kind, ranks, *changes in (
         ("mass", True), ("static", True), ("tip_deflection", False),
         ("eigenfrequency", True, "payload.inertia=0.4"), ("esl", False, LINEAR),
-        ("compliance", True, LINEAR, *LOADED), ("compliance", True, BENT, SKEWED),
-        ("compliance", False, LINEAR, SHARED), ("compliance", False, BENT, *KRYLOV),
-        ("compliance", False, LINEAR, TWO), ("deviation", False, LINEAR, SKEWED),
+        (WHOLE, True, LINEAR, *LOADED), (WHOLE, True, BENT, SKEWED),
+        (WHOLE, False, LINEAR, SHARED), (WHOLE, False, BENT, *KRYLOV),
+        (WHOLE, False, LINEAR, TWO), ("deviation", False, LINEAR, SKEWED),
         ("deviation", False, BENT, "reduction.coordinates=6"), ("settling", False, LINEAR),
         ("effort", False, LINEAR), ("peak_force", False, BENT),
         ("stress", False, LINEAR, "objective.stress_margin=0.1"),
@@ -409,13 +412,13 @@ NODES = [
     case("controlled", "settling", *TRIANGLES, BENT),
     case("controlled", "effort", *TRIANGLES, BENT),
     case("controlled", "stress", *TRIANGLES, BENT),
-    *(case("two_arm", "compliance", f"arms.element={name}", BENT)
+    *(case("two_arm", WHOLE, f"arms.element={name}", BENT)
       for name in ("incompatible", "linear", "quadratic")),
     case("two_arm", "mass", LINEAR),
     case("two_arm", "stress", BENT),
     case("two_arm", "buckling", BENT),
     *(case(base, kind, *changes) for base in ("tetrahedra", "space")
-      for kind, *changes in (("mass",), ("static",), ("compliance", LINEAR), ("deviation", BENT),
+      for kind, *changes in (("mass",), ("static",), (WHOLE, LINEAR), ("deviation", BENT),
                              ("effort", HELD, BENT), ("stress", BENT), ("buckling", LINEAR))),
     case("tetrahedra", "eigenfrequency"),
     case("tetrahedra", "settling", LINEAR, "motion.dwells=[[0.1,0.2]]"),
@@ -443,8 +446,8 @@ def test_by_nodes(base, changes, shared_tmp_path, monkeypatch) -> None:
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("kind", "part"),
-    [("effort", "places"), ("compliance", "interfaces"), ("stress", "volumes"),
-     ("stress", "stress"), ("compliance", "geometric_stiffness"), ("buckling", "prestress")],
+    [("effort", "places"), (WHOLE, "interfaces"), ("stress", "volumes"),
+     ("stress", "stress"), (WHOLE, "geometric_stiffness"), ("buckling", "prestress")],
 )  # fmt: skip
 def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
     """Each part of the chain by nodes alone: remainders become of first order."""

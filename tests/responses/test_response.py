@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from declared import withdrawn
 from remainders import beside_volume, build, limit_rates, wave
-from runs import TWO_ARM, minimising
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.parallel import on_all_ranks, together
-from dolfinopt.responses import response as registry
-from dolfinopt.responses.motion import LoadCases, MotionResponse
+from dolfinopt.responses.motion import Deviation
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -24,19 +23,17 @@ from dolfinopt.responses.response import (
     find,
     find_limited,
     needs,
-    objective_of,
     p_norm,
     p_norm_of_lengths,
+    response,
     worst_of,
 )
-from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.objective import NEEDS, Constraints
+from dolfinopt.scene.tables.responses import DECLARED, objective_kinds
 
 
 class Roughness(Response):
     """Integral of (x - x0)^2 over every design's cells, m2: least where x is x0 everywhere."""
 
-    name, label, unit = "roughness", "distance from even filling", "m2"
     level = 0.3
 
     def measure(self, analysis: Analysis) -> Measured:
@@ -61,40 +58,33 @@ class Roughness(Response):
         ]
 
 
-class MeanSquare(MotionResponse):
-    """Integral of |e|^2 over the horizon, m2 s, given by its derivatives alone."""
+class MeanSquare(Deviation):
+    """Integral of |e|^2 over the horizon, m2 s."""
 
-    name, label, unit = "mean_square", "integral of the squared deviation", "m2 s"
+    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
+        return float(weights @ (y**2).sum(axis=1))
 
-    def value(self, trajectory: Trajectory, cases: LoadCases) -> float:
-        return float(cases.weights @ (trajectory.deviation[cases.indices] ** 2).sum(axis=1))
+    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        return 2.0 * weights[:, None] * y
 
-    def derivatives(
-        self, trajectory: Trajectory, cases: LoadCases
-    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
-        by_deviation = 2.0 * cases.weights[:, None] * trajectory.deviation[cases.indices]
-        return trajectory.by_end_effector(cases.indices, by_deviation)
+    def extreme(self, trajectory: Trajectory) -> float:
+        return self.of_motion(trajectory)
 
 
-class MoreConstraints(Constraints):
-    """The keys that a new response would add to the scene."""
-
-    roughness: float | None = None
-    mean_square: float | None = None
-
-
-@pytest.fixture(autouse=True)
-def _registered() -> Iterator[None]:
-    for one in (Roughness, MeanSquare):
-        registry.register(one)
-    yield
-    for one in (Roughness, MeanSquare):
-        del registry._known[one.name]
-
-
-def limited(scene: Scene, **limits: float) -> Scene:
-    """Return the scene with other constraints."""
-    return scene.model_copy(update={"constraints": MoreConstraints(**limits)})
+@pytest.fixture(autouse=True, scope="module")
+def _declared() -> Iterator[None]:
+    """Declare both; leave the scenes of other tests without these words."""
+    with withdrawn():
+        response(
+            "roughness",
+            label="distance from even filling",
+            unit="m2",
+            needs=frozenset(),
+            limit="upper limit of the distance from even filling [m2]",
+        )(Roughness)
+        squared = "upper limit of the squared deviation [m2 s]"
+        response("mean_square", unit="m2 s", limit=squared)(MeanSquare)
+        yield
 
 
 QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
@@ -103,7 +93,8 @@ QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
 @pytest.mark.serial
 def test_a_new_response_is_minimised() -> None:
     """The optimiser finds what is known: x0 everywhere; nothing but the result is simulated."""
-    scene = minimising(do.load_scene(TWO_ARM, [*QUICK, "optimizer.max_iterations=60"]), "roughness")
+    words = [*QUICK, "optimizer.max_iterations=60", "objective.kind=roughness"]
+    scene = do.load_scene(TWO_ARM, words)
     result = do.optimize(scene)  # no limit is active: there is no gradient left to be balanced
     for k, x in result.x_phys.items():
         # The filter smooths away what is left at the solid ends, if any.
@@ -116,9 +107,10 @@ def test_a_new_response_is_minimised() -> None:
 def test_a_new_response_is_a_limit() -> None:
     """Of the stiffest design that is nearly even: the limit is met and in its row's name."""
     options = [*QUICK, "optimizer.max_iterations=60", "objective.kind=static"]
-    scene = do.load_scene(TWO_ARM, [*options, "design.initial=0.4"])
-    limit = 2e-4
-    free, kept = do.optimize(scene), do.optimize(limited(scene, roughness=limit))
+    limit, options = 2e-4, [*options, "design.initial=0.4"]
+    scene = do.load_scene(TWO_ARM, options)
+    limited = do.load_scene(TWO_ARM, [*options, f"constraints.roughness={limit}"])
+    free, kept = do.optimize(scene), do.optimize(limited)
     values = {one.name: one for one in kept.limits}
     assert set(values) == {
         *(f"volume_fraction_{arm.name}" for arm in scene.arms),
@@ -139,8 +131,8 @@ def test_a_new_response_is_a_limit() -> None:
 def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     """The same class on the other side: value over limit less 1, with the gradient of that."""
     built = build(*QUICK, "objective.kind=static", "objective.gradient=exact",
-                  "motion.horizon=1.9", "simulation.tolerance=1e-7")  # fmt: skip
-    built = replace(built, scene=limited(built.scene, **{name: 0.01}))
+                  "motion.horizon=1.9", "simulation.tolerance=1e-7",
+                  f"constraints.{name}=0.01")  # fmt: skip
     assert needs(built.scene, "motion")
     evaluation, _ = built.evaluate(built.fields(wave))
     own = evaluation.responses[-1]
@@ -150,18 +142,12 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert limit_rates(built, (4e-2, 1e-2)) == pytest.approx([2.0], abs=0.2)
 
 
-def test_needs_are_stated_by_the_responses() -> None:
-    """What the scenes' words say of themselves; the work itself is counted in test_skip."""
-    assert find("first_frequency").needs == {"stiffness", "mass", "eigenproblem"}
-    assert find("tip_deflection").needs == {"stiffness"}
-    assert find("volume_fraction").needs == frozenset()
-    assert {name: find(name).needs for name in NEEDS} == NEEDS
-    limited = NEEDS.keys() & Constraints.model_fields
-    assert {name: find_limited(name).needs for name in limited} == {n: NEEDS[n] for n in limited}
+def test_limits_are_found_by_their_keys() -> None:
+    """One response, one class, whatever its limit is called."""
     built = build("constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6")
     names = [one.response.name for one in constraints_of(built.scene)]
-    assert names == ["volume_fraction", "first_frequency", "tip_deflection"]
-    assert objective_of(built.scene).unit == "N m"
+    assert names == ["volume_fraction", "eigenfrequency", "tip_deflection"]
+    assert find_limited("compliance") is find("esl")
 
 
 @pytest.mark.parametrize("scale", [1e-150, 1.0, 1e150])
@@ -212,7 +198,6 @@ def test_the_least_made_smooth() -> None:
     assert worst_of([3.0, 0.0], 20.0, least=True) == (0.0, [0.0, 0.0])
 
 
-@pytest.mark.parametrize("name", NEEDS)
+@pytest.mark.parametrize("name", objective_kinds())
 def test_responses_stand_in_the_files_that_are_imported_for_them(name):
-    file = registry.FILES.get(name, name)
-    assert registry.find(name).__module__ == f"dolfinopt.responses.{file}"
+    assert find(name).declared is DECLARED[name]

@@ -323,7 +323,7 @@ def test_both_spellings_of_a_loaded_slider_are_the_same():
     force = {"name": "closure", "arm": "rod", "force": [1.0 / size, 0.1 / size], "factor": -200.0}
     now["forces"] = [force]
     old, new = map(scene_from_dict, (was, now))
-    assert old == new and old.has_old_closure and not new.has_old_closure
+    assert old == new and old.old_words and not new.old_words
     assert ["[closure]" in one for one in implausible(old)] == [True] and not implausible(new)
     a, b = (simulated(one).trajectory for one in (was, now))
     np.testing.assert_array_equal(a.q_r, b.q_r)

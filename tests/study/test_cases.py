@@ -291,7 +291,7 @@ def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch
     """Nothing of it is in place: it is computed anew as a whole, to the same bits."""
     _, outcomes = done
     written = []
-    whole = computing.write_simulation
+    whole = computing.write_result
 
     def stop(*args, **kwargs):
         if written:
@@ -299,7 +299,7 @@ def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch
         written.append(whole(*args, **kwargs))
 
     with monkeypatch.context() as patch:
-        patch.setattr(computing, "write_simulation", stop)
+        patch.setattr(computing, "write_result", stop)
         with pytest.raises(Killed):
             run_cases(plan[3:6], tmp_path, SELF, shown=False)
     assert not list(tmp_path.rglob("summary.json"))

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from dolfinopt.density.measured import GREY
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import BodyMesh, body_mesh
-from dolfinopt.part.part import DEFAULTS, GRAY, Curves
+from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.outline import (
     Outline,
@@ -114,11 +115,12 @@ class PlanePart:
         """What the workshop or the designer should know, a sentence each."""
         one, outline = self.domain, self.outline
         found = []
-        if one.grayness > GRAY:
+        if one.grayness > GREY:
             found.append(
                 f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
                 "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust"'
+                'design than the optimised one; optimise with design.projection = "robust" until '
+                "it is crisp"
             )
         if one.crisp:
             found.append(

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import filled, mesh_size, solid_mesh
-from dolfinopt.part.part import DEFAULTS, GRAY, Curves
+from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.surface import (
@@ -196,11 +197,12 @@ class SolidPart:
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
         one, found = self.domain, []
-        if one.grayness > GRAY:
+        if one.grayness > GREY:
             found.append(
                 f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
                 "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust"'
+                'design than the optimised one; optimise with design.projection = "robust" until '
+                "it is crisp"
             )
         if self.pieces:
             pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
@@ -346,7 +348,7 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
             f"arm {domain.name!r}: no level of its density keeps its volume, "
             f"{1e9 * domain.volume:.6g} mm3, and joins both interfaces: the nearest, {level:.3g}, "
             f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
-            'longer, or with design.projection = "robust"'
+            'with design.projection = "robust" until it is crisp'
         )
     check_surface(domain.name, found)
     return SolidPart(domain, found, level, distance, pieces, lost)

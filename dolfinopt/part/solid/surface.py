@@ -473,8 +473,8 @@ def check_surface(name: str, surface: Surface) -> None:
     x, y, z = 1e3 * where.mean(axis=0)
     raise InputError(
         f"arm {name!r}: the surface of its part {what}, the first at ({x:.1f}, {y:.1f}, {z:.1f}) "
-        "mm; optimise with larger members (design.filter_radius) or with design.projection = "
-        '"robust"'
+        "mm; optimise with larger members (design.filter_radius), and with "
+        'design.projection = "robust" until the design is crisp'
     )
 
 

@@ -263,7 +263,7 @@ class Arm(Table):
     hull: FileName | None = Field(
         default=None,
         description="mesh file (.msh) of a solid whose outer surface a hollow arm has in place of "
-        "a section; seen from the arm's axis it lies nowhere one behind the other [-]",
+        "a section; every ray from the arm's axis meets it once [-]",
     )
     wall: WallThickness | None = Field(
         default=None, description="initial thickness of the wall of a hollow arm [m]"

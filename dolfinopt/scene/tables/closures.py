@@ -32,7 +32,7 @@ from dolfinopt.scene.tables.machine import (
     Gain,
     check_joint_name,
 )
-from dolfinopt.scene.tables.objective import asked, need_of
+from dolfinopt.scene.tables.responses import asked, need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -76,8 +76,8 @@ class Closures(Table):
     )
     rpy: tuple[Angle, Angle, Angle] = Field(
         default=(0.0, 0.0, 0.0),
-        description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; at zero the "
-        "first interface's frame lies like it [rad]",
+        description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; zero: "
+        "parallel to the first interface's frame [rad]",
     )
     axis: Line | tuple[Component, Component, Component] | None = Field(
         default=None,
@@ -265,7 +265,7 @@ class Closures(Table):
             if force.name == OLD:
                 reason = "expected 0.0, the default, with a pin: its end does not move"
                 raise Refusal(reason, ("forces", n, "factor"), (*at, "kind"))
-        for key in set(OF_THE_END).intersection(asked(scene)):
+        for key in set(OF_THE_END).intersection(one.name for one in asked(scene)):
             place = ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
             raise Refusal(
                 "expected another response with a pin: the end of the last arm is held, it "
@@ -307,6 +307,12 @@ def closing_site(scene: Scene, one: Closures, which: int) -> tuple[int, int] | N
 # The tree is the scene as read, before it is validated: values of any type may stand in it.
 
 OLD = "closure"  # the table, and the name of what it states among [[closures]] and [[forces]]
+
+
+OLD_CLOSURE = (
+    "[closure] is read as one of [[closures]], closure.direction as its axis, closure.force as the "
+    'factor of the force "closure" among [[forces]]; state those'
+)
 
 
 def read_old_closure(tree: dict[str, Any], source: str) -> None:

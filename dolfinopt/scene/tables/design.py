@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, model_validator
 
 from dolfinopt.scene.tables.base import MAX_ITERATIONS, Length, Loc, Position, Refusal, Table
-from dolfinopt.scene.tables.objective import need_of
+from dolfinopt.scene.tables.responses import need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -462,20 +462,21 @@ class Optimizer(Table):
         default=1e-3,
         ge=0,
         le=1,
-        description="largest change of x of a converged design [-]",
+        description="relative gain of the best design in 20 iterations that ends the run [-]",
     )
     kkt_tolerance: float = Field(
         default=2e-2,
         ge=0,
         le=1e6,
-        description="largest Karush-Kuhn-Tucker residual of a converged design [-]",
+        description="Karush-Kuhn-Tucker residual up to which the certificate calls a design "
+        "stationary [-]",
     )
     exact_iterations: int = Field(
         default=0,
         ge=0,
         le=MAX_ITERATIONS,
-        description="further iterations with the exact gradient, which tell how far the finished "
-        "design is from the optimum; it stays as it is [-]",
+        description="iterations with the exact gradient that follow where frozen loads (gradient = "
+        '"esl") bring no further gain [-]',
     )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:

@@ -121,8 +121,8 @@ class Motion(Table):
     )
     dwells: bool | tuple[tuple[Instant, Instant], ...] = Field(
         default=True,
-        description="rests in which settling counts besides that after the motion: true, every "
-        "stop of the path; false, none; or [start, end] of each [s]",
+        description="further rest intervals for settling: true, every stop of the path; false, "
+        "none; or a list of [start, end] [s]",
     )
     base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
     base_position: Position = Field(

@@ -3,41 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator
+from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import Loc, Refusal, Table, shown
+from dolfinopt.scene.tables.responses import (
+    DECLARED,
+    LARGEST_LOAD,
+    Declaration,
+    Delay,
+    Direction,
+    Frequency,
+    Need,
+    StiffnessCase,
+    asked,
+    limited_by,
+    need_of,
+    objective_kinds,
+    unused_options,
+    users_of,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
     from dolfinopt.scene.tables.motion import Motion
 
-ObjectiveKind = Literal[
-    "esl",
-    "compliance",
-    "deviation",
-    "settling",
-    "orientation",
-    "stress",
-    "buckling",
-    "mass",
-    "effort",
-    "peak_force",
-    "static",
-    "eigenfrequency",
-    "first_frequency",
-    "tip_deflection",
-    "damping_ratio",
-    "pole_frequency",
-]
-Direction = Literal["minimize", "maximize"]
+if TYPE_CHECKING:
+    ObjectiveKind = str
+else:  # the words of the responses that are declared
+    ObjectiveKind = Literal[tuple(objective_kinds())]
 GradientKind = Literal["esl", "exact"]
 Attached = Literal["rigid-body", "point-mass", "none"]
 Combination = Literal["sum", "worst"]
 WorstBy = Literal["compliance", "deviation"]
-LARGEST_LOAD = 1e9  # N, N m
 MANY_CASES = 1000  # load cases that a motion may have however short it is
 Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
 SpatialLoad = tuple[float, float, float, float, float, float]  # force N, moment N m
@@ -153,14 +153,19 @@ class Objective(Table):
             )
         return loads
 
+    @property
+    def response(self) -> Declaration:
+        """What is minimised or maximised."""
+        return DECLARED[self.kind]
+
     def needs(self, what: Need) -> bool:
         """Return whether the objective needs that."""
-        return what in NEEDS.get(self.kind, ())
+        return what in self.response.needs
 
     @property
     def has_esl_gradient(self) -> bool:
         """Whether the objective has a gradient with frozen equivalent static loads."""
-        return self.needs("motion") and self.kind not in EXACT_ONLY
+        return self.needs("motion") and not self.response.exact
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
@@ -173,7 +178,7 @@ class Objective(Table):
         if not need_of(scene, "motion"):
             if scene.scenarios:
                 moving = [
-                    shown(kind) for kind in get_args(ObjectiveKind) if "motion" in NEEDS[kind]
+                    shown(kind) for kind in objective_kinds() if "motion" in DECLARED[kind].needs
                 ]
                 raise Refusal(
                     f"expected {', '.join(moving[:-1])} or {moving[-1]}, or a limit of one under "
@@ -198,10 +203,10 @@ class Objective(Table):
 
     def _why_exact(self, scene: Scene) -> tuple[str, Loc]:
         """Return what asks for the exact gradient of a motion, and its key; "" if nothing does."""
-        if self.kind in EXACT_ONLY:
+        if self.response.exact:
             return f'objective.kind = "{self.kind}"', ("objective", "kind")
         for key in scene.constraints.limits:
-            if key in EXACT_ONLY:
+            if limited_by(key).exact:
                 return f"constraints.{key}", ("constraints", key)
         exact = 'objective.gradient = "exact"' if self.gradient == "exact" else ""
         return exact, ("objective", "gradient")
@@ -209,11 +214,11 @@ class Objective(Table):
     def _check_unused(self, scene: Scene) -> None:
         """Refuse options that neither the objective nor a limit uses."""
         fields = type(self).model_fields
-        for key in unused_options(self.kind, scene.constraints.limits):
+        for key in unused_options(fields, self.kind, scene.constraints.limits):
             default = fields[key].default
             if getattr(self, key) == default:
                 continue
-            objectives, limits = OPTIONS[key]
+            objectives, limits = users_of(key)
             users = f"objective.kind = {' or '.join(map(shown, objectives))}"
             users += "".join(f", or constraints.{name}" for name in limits)
             expected = "none" if default is None else f"{shown(default)}, the default,"
@@ -265,8 +270,8 @@ class Objective(Table):
 
     def _check_lightest(self, scene: Scene) -> None:
         """Refuse what the removal of all material makes least, unless something keeps it."""
-        limited = set(scene.constraints.limits) - LIGHTER
-        if self.kind in LIGHTER and self.direction != "maximize" and not limited:
+        limited = not all(limited_by(key).lighter for key in scene.constraints.limits)
+        if self.response.lighter and self.direction != "maximize" and not limited:
             least = "the lightest design is an empty one"
             if self.kind != "mass":
                 least = "the design that drives feel least is an empty one"
@@ -291,179 +296,37 @@ class Objective(Table):
 
 # -- `[constraints]` -----------------------------------------------------------------------------
 
-Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
-Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
-Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
-Angle = Annotated[float, Field(ge=1e-15, le=math.pi)]  # rad
-Delay = Annotated[float, Field(ge=0, le=1e5)]  # s
-Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
-Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
-Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
-Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
-Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
-Ratio = Annotated[float, Field(ge=-0.99, le=0.99)]  # -
-Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
-
-
-class StiffnessCase(Table):
-    """A static load on one arm, and how far it may move the arm's outboard interface."""
-
-    arm: str = Field(description="name of the arm, which is clamped at its inboard interface [-]")
-    force: tuple[Component, Component] | tuple[Component, Component, Component] | None = Field(
-        default=None,
-        description="force at the outboard interface in the arm's frame: two components, three of "
-        "a solid [N]",
-    )
-    moment: Component | tuple[Component, Component, Component] | None = Field(
-        default=None,
-        description="moment there: one number, of a solid three components [N m]",
-    )
-    displacement: Distance | None = Field(
-        default=None, description="upper limit of the length of the interface's displacement [m]"
-    )
-    rotation: Angle | None = Field(
-        default=None,
-        description="upper limit of its rotation, of a solid its vector's length [rad]",
-    )
-
-    @property
-    def load(self) -> tuple[float, ...]:
-        """Force and moment, three components in the plane and six in space."""
-        force, moment = self.force, self.moment
-        spatial = isinstance(moment, tuple) or (force is not None and len(force) == 3)
-        none = 3 * (0.0,) if spatial else (0.0, 0.0)
-        turning = moment if isinstance(moment, tuple) else (moment or 0.0,)
-        if spatial and moment is None:
-            turning = none
-        return (*(force or none), *turning)
-
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse what is no arm with a design, no load on it, or without limit."""
-        names = [arm.name for arm in scene.arms if arm.flexible]
-        if self.arm not in names:
-            raise Refusal(
-                f"expected the name of an arm with a design: {', '.join(names)}", (*at, "arm")
-            )
-        if self.displacement is None and self.rotation is None:
-            raise Refusal("expected displacement or rotation, or both", at)
-        if not any(self.load):
-            raise Refusal("expected force or moment, not all of them zero", at)
-        if len(self.load) != (6 if scene.is_spatial else 3):
-            kind = "three components each" if scene.is_spatial else "two components and one number"
-            raise Refusal(f"expected force and moment of {kind} in this scene", at)
-
-
 Limit = float | tuple[float | None, ...] | tuple[StiffnessCase, ...]
 
 
-class Constraints(Table):
-    """Limits of a design besides its volume: true extremes, of the worst scenario."""
+class ConstraintOptions(Table):
+    """Options of limits."""
 
-    mass: Mass | None = Field(
-        default=None, description="upper limit of the mass of all arms together [kg]"
-    )
-    compliance: Energy | None = Field(
-        default=None,
-        description="upper limit of the compliance of the load cases, as summary.json has it [N m]",
-    )
-    esl: Energy | None = Field(
-        default=None,
-        description="the same for the instants that objective.worst chooses [N m]",
-    )
-    deviation: Distance | None = Field(
-        default=None,
-        description="upper limit of the largest deviation of the end-effector [m]",
-    )
-    settling: Distance | None = Field(
-        default=None,
-        description="upper limit of the largest deviation in every rest: after the motion, and in "
-        "motion.dwells [m]",
-    )
     settling_after: Delay = Field(
         default=0.0,
         description="time from the beginning of each rest after which settling counts [s]",
-    )
-    orientation: Angle | None = Field(
-        default=None,
-        description="upper limit of the largest rotation of the end-effector against that of "
-        "rigid links [rad]",
-    )
-    stress: Pressure | None = Field(
-        default=None,
-        description="upper limit of the largest von Mises stress of all arms along the motion, "
-        "relaxed for intermediate density [Pa]",
-    )
-    buckling: Factor | None = Field(
-        default=None,
-        description="lower limit of the buckling factor, by which all loads of an instant may grow "
-        "until an arm buckles, in the plane of a plane arm; above 1000 nothing buckles [-]",
-    )
-    effort: Effort | None = Field(
-        default=None,
-        description="upper limit of the weighted root mean square of the drives' forces, see "
-        "objective.effort_weights [-]",
-    )
-    peak_force: tuple[Force | None, ...] | None = Field(
-        default=None,
-        description="upper limits of the largest force of every drive, the cart's first, then the "
-        "joints' from the base outwards; inf leaves one without limit [N, N m]",
-    )
-    first_frequency: Frequency | tuple[Frequency, ...] | None = Field(
-        default=None,
-        description="lower limit of the first natural frequency of every flexible arm with what "
-        "it carries (objective.attached), one for all or one for each [Hz]",
-    )
-    damping_ratio: Ratio | None = Field(
-        default=None,
-        description="lower limit of the least damping ratio of the closed loop's poles, of the "
-        "machine under [control] linearised at constraints.poles_at [-]",
     )
     damping_below: Frequency | None = Field(
         default=None,
         description="frequency below which poles count for constraints.damping_ratio; default: "
         "all do [Hz]",
     )
-    pole_frequency: Frequency | None = Field(
-        default=None,
-        description="lower limit of the least natural frequency of the closed loop's poles [Hz]",
-    )
     poles_at: tuple[Delay, ...] | None = Field(
         default=None,
         description="instants at which poles count; default: start, middle and end of the motion "
         "[s]",
     )
-    tip_deflection: Distance | tuple[Distance, ...] | None = Field(
-        default=None,
-        description="upper limit of the static deflection of the outboard interface of every "
-        "designed arm under objective.loads, one for all or one for each [m]",
-    )
-    stiffness: tuple[StiffnessCase, ...] | None = Field(
-        default=None, description="static load cases, each with the largest displacement [-]"
-    )
-
-    @field_validator("peak_force", mode="before")
-    @classmethod
-    def _leave_free(cls, value: Any) -> Any:
-        """Take None for inf, which JSON does not know."""
-        if not isinstance(value, list | tuple):
-            return value
-        free = tuple(None if one == math.inf else one for one in value)
-        if free and all(one is None for one in free):
-            raise Refusal("expected a limit for one drive at least")
-        return free
-
-    @field_validator("stiffness")
-    @classmethod
-    def _check_cases(cls, cases: tuple[StiffnessCase, ...] | None) -> Any:
-        if cases == ():
-            raise Refusal("expected at least one table [[constraints.stiffness]]")
-        return cases
 
     @property
     def limits(self) -> dict[str, Limit]:
         """What is limited, in the order of the keys."""
-        stated = {key: limit for key, limit in vars(self).items() if limit is not None}
-        return {key: limit for key, limit in stated.items() if key not in NO_LIMITS}
+        own = ConstraintOptions.model_fields
+        return {k: x for k, x in vars(self).items() if x is not None and k not in own}
+
+    def limit(self, key: str) -> float | None:
+        """Return the limit of a response that has one for all its values, None without one."""
+        found = self.limits.get(key)
+        return found if isinstance(found, float) else None
 
     def pole_instants(self, motion: Motion) -> tuple[float, ...]:
         """Return the instants at which poles count, s."""
@@ -483,7 +346,7 @@ class Constraints(Table):
             if key in owners and isinstance(limit, tuple) and len(limit) != len(names):
                 number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
                 raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
-        for index, one in enumerate(self.stiffness or ()):
+        for index, one in enumerate(vars(self)["stiffness"] or ()):
             one.check_in_scene(scene, (*at, "stiffness", index))
         self._check_delay(scene.motion, (*at, "settling_after"))
         self._check_poles(scene, at)
@@ -491,16 +354,18 @@ class Constraints(Table):
 
     def _check_arms(self, scene: Scene, at: Loc) -> None:
         """Refuse responses of flexible arms where there are none."""
-        for name in OF_ARMS.intersection(asked(scene)) if not scene.cell_counts else ():
-            where = (*at, name) if name in self.limits else ("objective", "kind")
-            raise Refusal("expected another response: no arm is flexible", where)
+        for one in asked(scene) if not scene.cell_counts else ():
+            if one.of_arms:
+                where = (*at, one.key) if one.key in self.limits else ("objective", "kind")
+                raise Refusal("expected another response: no arm is flexible", where)
 
     def _check_poles(self, scene: Scene, at: Loc) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
-        used = [name for name in POLES if name in asked(scene)]
-        for key, names in (("damping_below", POLES[:1]), ("poles_at", POLES)):
-            if getattr(self, key) is not None and not set(names) & set(used):
-                users = " or ".join(f"constraints.{name}" for name in names)
+        used = [one.name for one in asked(scene) if "poles_at" in one.options]
+        options = ("damping_below", "poles_at")
+        for key in unused_options(options, scene.objective.kind, self.limits):
+            if getattr(self, key) is not None:
+                users = " or ".join(f"constraints.{name}" for name in users_of(key)[1])
                 raise Refusal(f"expected none without {users}: nothing else uses it", (*at, key))
         if not used:
             return
@@ -541,93 +406,51 @@ class Constraints(Table):
                 )
 
 
-# Keys of [constraints] that are options of limits.
-NO_LIMITS = ("settling_after", "damping_below", "poles_at")
-POLES = ("damping_ratio", "pole_frequency")  # limits of the closed loop's poles
+class Constraints(ConstraintOptions):
+    """Limits of a design besides its volume: true extremes, of the worst scenario."""
 
-# -- what the responses that a scene can name need; `dolfinopt.responses` computes them ----------
+    @field_validator("peak_force", mode="before", check_fields=False)
+    @classmethod
+    def _leave_free(cls, value: Any) -> Any:
+        """Take None for inf, which JSON does not know."""
+        if not isinstance(value, list | tuple):
+            return value
+        free = tuple(None if one == math.inf else one for one in value)
+        if free and all(one is None for one in free):
+            raise Refusal("expected a limit for one drive at least")
+        return free
 
-# What must be known beside the densities.
-Need = Literal["stiffness", "mass", "motion", "eigenproblem"]
-MOTION: frozenset[Need] = frozenset({"stiffness", "mass", "motion"})
-VIBRATION: frozenset[Need] = frozenset({"stiffness", "mass", "eigenproblem"})
-STATICS: frozenset[Need] = frozenset({"stiffness"})
-NEEDS: Mapping[str, frozenset[Need]] = {
-    "mass": frozenset(),
-    "esl": MOTION,
-    "compliance": MOTION,
-    "deviation": MOTION,
-    "settling": MOTION,
-    "orientation": MOTION,
-    "stress": MOTION,
-    "buckling": MOTION,
-    "static": STATICS,
-    "eigenfrequency": VIBRATION,
-    "first_frequency": VIBRATION,
-    "tip_deflection": STATICS,
-    "stiffness": STATICS,
-    "effort": MOTION,
-    "peak_force": MOTION,
-    "damping_ratio": MOTION,
-    "pole_frequency": MOTION,
-}
-# Those of flexible arms, without which there is nothing to measure.
-OF_ARMS = frozenset(k for k, need in NEEDS.items() if need in (STATICS, VIBRATION)) | {
-    "stress",
-    "buckling",
-}
-# Forces of drives, of which no equivalent static load tells anything: their gradient is always the
-# exact one, and so is that of buckling and of poles.
-FORCES = frozenset({"effort", "peak_force"})
-EXACT_ONLY = FORCES | {"buckling", *POLES}
-# What uses an option of [objective]: as objective, and under [constraints].
-OPTIONS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "worst": (("esl",), ("esl",)),
-    "stress_exponent": (("stress",), ("stress",)),
-    "loads": (("static", "tip_deflection"), ("tip_deflection",)),
-    "effort_weights": (("effort", "peak_force"), ("effort",)),
-    "attached": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
-    "elbow_angle": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
-    "modes": (("eigenfrequency", "first_frequency"), ("first_frequency",)),
-    "follow": (("eigenfrequency",), ()),
-}
-# Those that fall with the mass, down to that of no arm at all.
-LIGHTER = frozenset({"mass", "effort", "peak_force"})
+    @field_validator("stiffness", check_fields=False)
+    @classmethod
+    def _check_cases(cls, cases: tuple[StiffnessCase, ...] | None) -> Any:
+        if cases == ():
+            raise Refusal("expected at least one table [[constraints.stiffness]]")
+        return cases
 
 
-def asked(scene: Scene) -> list[str]:
-    """Return the words of the objective and of everything under [constraints]."""
-    return [scene.objective.kind, *scene.constraints.limits]
+def _add_key(one: Declaration) -> None:
+    """Add the key that limits a response to `Constraints`, which is to be rebuilt."""
+    if one.limit:
+        field = FieldInfo(
+            default=None, description=one.limit.help, annotation=one.limit.type | None
+        )
+        Constraints.model_fields[one.key] = field
 
 
-def unused_options(kind: str, limited: Collection[str]) -> list[str]:
-    """Return the options of [objective] that nothing uses.
-
-    Args:
-        kind: the objective.
-        limited: keys under [constraints].
-    """
-    return [
-        key
-        for key, (objectives, limits) in OPTIONS.items()
-        if kind not in objectives and not set(limits) & set(limited)
-    ]
+for _one in DECLARED.values():
+    _add_key(_one)
+Constraints.model_rebuild(force=True)
 
 
-def freezes(scene: Scene) -> bool:
-    """Return whether a gradient of the scene differs with frozen loads from the exact one."""
-    return bool(set(need_of(scene, "motion")) - EXACT_ONLY)
+def declare(one: Declaration) -> None:
+    """Let scenes that are read from now on name a response."""
+    from dolfinopt.scene.schema import Scene
 
-
-def needs_alone(scene: Scene, what: Collection[Need]) -> bool:
-    """Return whether nothing of `asked` needs anything else; of unknown words nothing is known."""
-    known = [NEEDS.get(name) for name in asked(scene)]
-    return all(needs is not None and needs <= frozenset(what) for needs in known)
-
-
-def need_of(scene: Scene, what: Need) -> list[str]:
-    """Return those of `asked` that need that; of words that are no scene's nothing is known."""
-    return [name for name in asked(scene) if what in NEEDS.get(name, ())]
+    DECLARED[one.name] = one
+    Objective.model_fields["kind"].annotation = Literal[tuple(objective_kinds())]  # type: ignore
+    _add_key(one)
+    for table in (Objective, Constraints, Scene):
+        table.model_rebuild(force=True)
 
 
 # -- `[[scenarios]]` -----------------------------------------------------------------------------

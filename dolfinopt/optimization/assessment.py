@@ -1,0 +1,207 @@
+"""What is still to be known of an optimised design when the iterations have ended.
+
+And designs that it is compared with, which the iterations do not come to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from dolfinopt.arms.arm import uniform_design
+from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.work import counted
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, CRISP_NEWTON_ITERATIONS
+from dolfinopt.parallel import together
+from dolfinopt.responses.constraints import Limit, limits_of
+from dolfinopt.responses.evaluation import Evaluation, evaluate
+from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates, estimated_error
+from dolfinopt.responses.response import constraints_of, needs
+from dolfinopt.scene.tables.responses import STATICS, limited_by
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+
+BISECTIONS = 40  # of a bar's size
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """The final design with its motion, as `Result` has it.
+
+    Attributes:
+        evaluation: of the design, with the motion.
+        crisp: of the design cut at x_phys = 1/2 without what hangs on it by contacts alone, see
+            `Contacts.kept`; None without a projection, or where the interfaces do not hang together
+            or the motion of what is left cannot be simulated.
+        initial: trajectory of the uniform initial design where the iterations had no motion.
+        selection: of the coordinates, with the error that they make of this design's motion.
+    """
+
+    evaluation: Evaluation
+    crisp: Evaluation | None
+    initial: Trajectory | None
+    selection: OrderSelection | None
+
+
+def initial_selection(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]
+) -> OrderSelection | None:
+    """Choose the coordinates by the initial design, where the scene says "auto" (collective)."""
+    return _choose(evaluator, x_phys, COORDINATE_RESERVE_FACTOR)
+
+
+def assess(
+    evaluator: Evaluator,
+    x_phys: Mapping[int, np.ndarray],
+    evaluation: Evaluation,
+    selection: OrderSelection | None,
+) -> Assessment:
+    """Evaluate what the iterations left out: motions not simulated, and the crisp design.
+
+    Collective; the arms, and `evaluator.trajectory`, are those of the design afterwards.
+
+    Args:
+        evaluator: of the iterations.
+        x_phys, evaluation: of the final design.
+        selection: of the coordinates so far.
+    """
+    scene, arms = evaluator.scene, evaluator.arms
+    moves = needs(scene, "motion")
+    if not moves:
+        selection = _choose(evaluator, x_phys, 1.0)
+    elif selection is not None:
+        selection = replace(selection, error=_selection_error(evaluator, x_phys, selection))
+    # A followed mode is known by those before it: the initial and the crisp design's are not.
+    vectors = {k: arm.initial_vectors for k, arm in arms.items()}
+    initial = crisp = None
+    if not moves:
+        uniform = uniform_design(scene, evaluator.partition, arms)
+        evaluator.evaluate_densities(uniform, simulated=True)
+        initial = evaluator.trajectory
+    if scene.design.projection:
+        crisp = _crisp(evaluator, x_phys)
+    if scene.design.projection or not moves:
+        for k, arm in arms.items():
+            arm.initial_vectors = vectors[k]
+        evaluation = evaluator.evaluate_densities(x_phys, simulated=True)
+    return Assessment(evaluation, crisp, initial, selection)
+
+
+def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+    """Return the evaluation of the design cut at 1/2, contacts opened; None if it falls apart."""
+    # The same on all ranks.
+    arms, trajectory = evaluator.arms, evaluator.trajectory
+    with together(evaluator.partition.world):
+        found = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
+    whole = all(one.joins for one in found.values())
+    if not evaluator.partition.world.allreduce(whole, MPI.MIN):
+        return None
+    cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
+    steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
+    with suppress(ConvergenceError), counted(CRISP_NEWTON_ITERATIONS * steps):
+        return evaluator.evaluate_densities(cut, simulated=True)
+    return None
+
+
+def _choose(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray], reserve: float
+) -> OrderSelection | None:
+    one = evaluator
+    return choose_coordinates(
+        one.scene, one.partition, one.arms, x_phys, one.profile, reserve=reserve
+    )
+
+
+def _selection_error(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray], selection: OrderSelection
+) -> float:
+    place = evaluator.scene, evaluator.partition, evaluator.arms
+    try:
+        return estimated_error(*place, x_phys, selection.coordinates, evaluator.profile)
+    except ConvergenceError:  # of the richer motion; the design is not lost for it
+        return np.inf
+
+
+# -- comparison with solid arms and straight bars --------------------------------------------
+
+
+def evaluated_beside(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+    """Evaluate another design, of which the run knows nothing afterwards (collective).
+
+    None where its motion cannot be simulated.
+    """
+    one, scene = evaluator, evaluator.scene
+    arms = {k: arm.fresh() for k, arm in one.arms.items()}
+    for k, arm in arms.items():
+        arm.coordinates = one.arms[k].coordinates
+        if (known := one.arms[k].stiffening) is not None:
+            arm.set_stiffening(known)
+    counts = replace(one.profile.counts)
+    with suppress(ConvergenceError):
+        beside = evaluate(scene, one.partition, arms, x_phys, one.profile, simulated=False)[0]
+        one.profile.counts = counts
+        return beside
+    one.profile.counts = counts
+    return None
+
+
+def solid_limits(evaluator: Evaluator) -> tuple[Limit, ...]:
+    """Return what solid arms make of the limits but those of the material (collective).
+
+    None where there are no others, or where their motion cannot be simulated.
+    """
+    scene = evaluator.scene
+    if all(one.response.declared.of_nominal for one in constraints_of(scene)):
+        return ()
+    solid = uniform_design(scene, evaluator.partition, evaluator.arms, 1.0)
+    found = evaluated_beside(evaluator, solid)
+    return () if found is None else tuple(o for o in limits_of(scene, found) if not o.of_mass)
+
+
+def solid_sentence(limits: Sequence[Limit]) -> str:
+    """Say what solid arms make of limits; "cannot be kept" where no lighter ones do better.
+
+    Only loads that no mass adds to tell that: under inertia lighter arms may keep the limit.
+    """
+    parts = []
+    for one in limits:
+        never = not one.met and limited_by(one.quantity).needs == STATICS
+        parts.append(one.usage + " (cannot be kept)" * never)
+    return f"solid arms: {', '.join(parts)}"
+
+
+def straight_bars(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]
+) -> dict[int, np.ndarray] | None:
+    """Return straight solid bars of the same mass along the arms' axes (collective).
+
+    Their section is the arms' made smaller alike. None where an arm is no box of cells.
+    """
+    scene, arms = evaluator.scene, evaluator.arms
+    if any(scene.arms[k].cells is None or scene.arms[k].hollow for k in scene.cell_counts):
+        return None
+    with together(evaluator.partition.world):
+        return {k: _bar(arm, arm.volume_fraction(x_phys[k])) for k, arm in arms.items()}
+
+
+def _bar(arm: Arm, fraction: float) -> np.ndarray:
+    """Return the densities (n_cells,) of a bar that fills this fraction of an arm's volume."""
+    mesh, one = arm.mesh, arm.scene.arms[arm.places[0]]
+    assert one.cells is not None
+    sides = np.array([one.height, one.thickness][: mesh.dim - 1])
+    half = sides / np.array(one.cells[1:]) / sides  # a cell, of the section's half
+    away = (2.0 * np.abs(mesh.centroid[:, 1:]) / sides).max(axis=1)
+    low, high, least = 0.0, 1.0, arm.scene.design.minimum
+    for _ in range(BISECTIONS):
+        size = 0.5 * (low + high)
+        x = mesh.keep(np.clip(0.5 + (size - away) / (2.0 * half.max()), least, 1.0))
+        low, high = (size, high) if arm.volume_fraction(x) < fraction else (low, size)
+    return x

@@ -1,0 +1,190 @@
+"""From design variables to the designs that they stand for, what these do, and its gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.arms.arm import PhysicalDesign
+from dolfinopt.dynamics.collocation import Solution
+from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.optimization.problem import EvaluatedDesign
+from dolfinopt.optimization.projection import Projection
+from dolfinopt.optimization.variables import Variables
+from dolfinopt.parallel import Partition, together
+from dolfinopt.profiling import Profile
+from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
+from dolfinopt.responses.response import constraints_of
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.fem.interior import Guesses
+
+
+# Solutions, and of every arm eigenvectors and what iterative solves set out from.
+Start = tuple[tuple[Solution, ...], dict[int, list[np.ndarray]], dict[int, "Guesses | None"]]
+
+
+class Evaluator:
+    """Evaluates one x after the other, each with the last one's motion as its initial guess.
+
+    Attributes:
+        scene, partition, arms, profile: of the run.
+        variables, projection: how x makes designs.
+        trajectory: of the design evaluated last; None without a motion and off the root.
+        solutions: its motions; the next evaluation sets out from them.
+        initial_solutions, initial_vectors, initial_guesses: from where that of the last x set out,
+            so that it can be repeated in the same bits.
+    """
+
+    def __init__(
+        self, scene: Scene, partition: Partition, arms: Mapping[int, Arm], profile: Profile
+    ):
+        self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
+        self.variables = Variables(scene, partition, arms)
+        self.projection = Projection(scene, partition, arms)
+        self.trajectory: Trajectory | None = None
+        self.solutions: tuple[Solution, ...] = ()
+        self.initial_solutions: tuple[Solution, ...] = ()
+        self.initial_vectors: dict[int, list[np.ndarray]] = {}
+        self.initial_guesses: dict[int, Guesses | None] = {}
+
+    def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
+        """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
+
+        Collective; of this rank's arms.
+        """
+        designs = self.projection.physical_designs(self.variables.split(x))
+        count = 3 if self.scene.design.projection == "robust" else 1
+        return [{k: one[variant] for k, one in designs.items()} for variant in range(count)]
+
+    def evaluate(self, x: np.ndarray) -> list[EvaluatedDesign]:
+        """Evaluate the designs that x stands for, the nominal one last (collective)."""
+        return self.accepted(self.tried(x))
+
+    def tried(self, x: np.ndarray) -> list[EvaluatedDesign]:
+        """Evaluate the designs that x stands for; the last one without gradients (collective).
+
+        `accepted` adds them, `undo` takes the whole back. Of robust designs the others have theirs
+        at once, as long as their factors are at hand.
+        """
+        self.initial_solutions = self.solutions
+        self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
+        self.initial_guesses = {k: arm.guesses for k, arm in self.arms.items()}
+        *others, nominal = self.physical_designs(x)
+        found = []
+        for design in others:
+            found.append(self.differentiated(design, self.evaluate_densities(densities(design))))
+        evaluation = self.evaluate_densities(densities(nominal))
+        of_nominal = [
+            one.response.declared.of_nominal
+            for one, measured in zip(
+                constraints_of(self.scene), evaluation.responses[1:], strict=True
+            )
+            for _ in measured.values
+        ]
+        none = np.empty((len(of_nominal), 0))
+        found.append(
+            EvaluatedDesign(
+                nominal, evaluation, np.empty(0), none, np.array(of_nominal, dtype=bool), False
+            )
+        )
+        return found
+
+    def accepted(self, designs: list[EvaluatedDesign]) -> list[EvaluatedDesign]:
+        """Add the gradients to designs that were `tried` last (collective)."""
+        *others, last = designs
+        return [*others, self.differentiated(last.physical, last.evaluation)]
+
+    def undo(self) -> None:
+        """Set out from where the last evaluation did (collective)."""
+        self.solutions = self.initial_solutions
+        for k, vectors in self.initial_vectors.items():
+            self.arms[k].initial_vectors = vectors
+            self.arms[k].guesses = self.initial_guesses[k]
+
+    @property
+    def start(self) -> Start:
+        """From where the evaluation of the last x set out, for `restart`."""
+        return self.initial_solutions, self.initial_vectors, self.initial_guesses
+
+    def restart(self, start: Start) -> None:
+        """Let the next evaluation set out from there (collective)."""
+        self.initial_solutions, self.initial_vectors, self.initial_guesses = start
+        self.undo()
+
+    def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:
+        """Evaluate the last x again, from the same initial guesses: in the same bits (collective).
+
+        Args:
+            x: (n,) the design variables of the last `evaluate`, whatever the arms have since.
+        """
+        self.undo()
+        return self.evaluate(x)
+
+    @property
+    def gradient(self) -> str:
+        """Gradient in use, "exact" or "esl"."""
+        return self.scene.objective.gradient
+
+    def use_gradient(self, kind: str) -> None:
+        """Use another gradient from the next evaluation on."""
+        objective = self.scene.objective.model_copy(update={"gradient": kind})
+        self.scene = self.scene.model_copy(update={"objective": objective})
+
+    def with_gradient(self, kind: str) -> Evaluator:
+        """Return an evaluator of the same arms with another gradient.
+
+        This one keeps its trajectory and initial guesses.
+        """
+        other = copy(self)
+        other.use_gradient(kind)
+        return other
+
+    def evaluate_densities(
+        self, x_phys: Mapping[int, np.ndarray], simulated: bool = False
+    ) -> Evaluation:
+        """Evaluate one design (collective); `simulated` even where no response needs a motion."""
+        evaluation, self.trajectory = evaluate(
+            self.scene,
+            self.partition,
+            self.arms,
+            x_phys,
+            self.profile,
+            self.solutions,
+            simulated=simulated,
+        )
+        return evaluation
+
+    def differentiated(
+        self, design: Mapping[int, PhysicalDesign], evaluation: Evaluation
+    ) -> EvaluatedDesign:
+        """Add the gradients by x of the design evaluated last (collective)."""
+        if self.trajectory is not None:
+            self.solutions = self.trajectory.solutions
+        analysed = self.scene, self.partition, self.arms, self.trajectory, self.profile
+        collect = self.projection.patterns.collect
+        objective = collect(gradient(*analysed))
+        rows = constraint_gradients(*analysed, measured=evaluation.responses)
+        smooth = [collect(row.smooth) for row in rows]
+        with together(self.partition.world):
+            by_x = [
+                self.variables.by_x(by, design) / row.limit
+                for by, row in zip(smooth, rows, strict=True)
+            ]
+            return EvaluatedDesign(
+                design,
+                evaluation,
+                self.variables.by_x(objective, design),
+                np.array(by_x).reshape(len(rows), self.variables.size),
+                np.array([row.response.declared.of_nominal for row in rows], dtype=bool),
+            )
+
+
+def densities(design: Mapping[int, PhysicalDesign]) -> dict[int, np.ndarray]:
+    """Return the physical densities of every arm."""
+    return {k: one.x_phys for k, one in design.items()}

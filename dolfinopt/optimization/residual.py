@@ -1,0 +1,157 @@
+"""How far a design is from the Karush-Kuhn-Tucker conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dolfinopt.optimization.measured import (
+    DEPENDENT_EIGENVALUE_SHARE,
+    FREE_SET_ROUNDS,
+    LARGEST_EXPONENT,
+    ROOM_SHARE,
+    TRIAL_STEP_SHARE,
+)
+
+Sum = Callable[[Mapping[int, np.ndarray]], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """How far a design is from the Karush-Kuhn-Tucker conditions, see `kkt_residual`.
+
+    Attributes:
+        rms: root mean square over the variables that can move.
+        largest: of any of them, over the largest of the objective's gradient.
+        multipliers: (m,) of the constraints, for the objective scaled to a root mean square of 1.
+        scale: that root mean square of its gradient, by which they are in the objective's unit.
+    """
+
+    rms: float
+    largest: float
+    multipliers: np.ndarray
+    scale: float = 0.0
+
+    @classmethod
+    def unknown(cls) -> Residual:
+        """Return that of a design without gradients."""
+        return cls(np.nan, np.nan, np.empty(0))
+
+
+def kkt_residual(
+    x: np.ndarray,
+    xmin: np.ndarray,
+    xmax: np.ndarray,
+    df0dx: np.ndarray,
+    f: np.ndarray,
+    dfdx: np.ndarray,
+    parts: Mapping[int, slice],
+    total: Sum,
+) -> Residual:
+    """Return the Karush-Kuhn-Tucker residual of min f0, f_i <= 0, xmin <= x <= xmax (collective).
+
+    With y the variables in units of their range and L = df0dy + sum_i l_i df_idy, the projected
+    gradient is s = (y - P(y - t L)) / t, P the projection on the bounds and t |L| at most a tenth:
+    0 where a bound holds a variable back, L where there is room. Variables can move where there is
+    room or s is not 0. Over these, and n in number,
+
+        residual^2 = (sum s^2 + sum_i (l_i min(f_i, 0))^2 / n) / sum (df0dy)^2 :
+
+    0 exactly where the conditions hold, about 1 where no constraint holds the objective back, and
+    independent of the units of f0, f_i and x and of how many variables matter. The second term is
+    complementarity. The multipliers l_i >= 0 are those that make it least: least squares over the
+    variables with room for their step, repeated until these no longer change. Feasibility is not
+    part of it.
+    Source: Nocedal & Wright, Numerical Optimization (2006), doi:10.1007/978-0-387-40065-5, 12.3;
+    Calamai & More, Math. Program. 39 (1987) 93-116, doi:10.1007/BF02592073.
+
+    Args:
+        x, xmin, xmax: (n,) this rank's variables.
+        df0dx, dfdx: (n,), (m, n) gradients of objective and constraints.
+        f: (m,) values of the constraints, relative, the same on all ranks.
+        parts: this rank's variables arm by arm.
+        total: adds an array an arm to the same bits on all ranks.
+
+    Returns:
+        The residual; 0 for an objective without gradient.
+    """
+    width = xmax - xmin
+    free = width > 0.0  # passive variables have no gradient and no room
+    unit = np.where(free, width, 1.0)
+    down, up = (x - xmin) / unit, (xmax - x) / unit
+    roomy = free & (np.minimum(down, up) > ROOM_SHARE)
+    g0, g = df0dx * width, dfdx * width
+
+    def added(*terms: np.ndarray) -> np.ndarray:
+        """Return the sums of (n,) terms over all variables."""
+        return total({k: np.array([one[part].sum() for one in terms]) for k, part in parts.items()})
+
+    def largest(term: np.ndarray) -> float:
+        """Return the largest |term|, see `LARGEST_EXPONENT`."""
+        return float(added(np.abs(term) ** LARGEST_EXPONENT)[0] ** (1.0 / LARGEST_EXPONENT))
+
+    square, count = added(g0**2, free)
+    if square == 0.0:
+        return Residual(0.0, 0.0, np.zeros(f.size))
+    if not np.isfinite(square):
+        return Residual(np.inf, np.inf, np.zeros(f.size))
+    scale = float(np.sqrt(square / count))
+    g0 = g0 / scale
+    slack = np.maximum(-f, 0.0)
+    best, inside = Residual(np.inf, np.inf, np.zeros(f.size)), roomy
+    for _ in range(FREE_SET_ROUNDS):
+        movable = inside | roomy
+        n = max(1.0, float(added(movable)[0]))
+        found = _multipliers(g0, g, inside, slack / np.sqrt(n), parts, total)
+        L = g0 + found @ g
+        t = TRIAL_STEP_SHARE / (largest(L) or 1.0)
+        moving = free & (t * L <= down) & (t * L >= -up)
+        step = np.where(moving, L, np.clip(t * L, -up, down) / t)
+        movable = roomy | (step != 0.0)
+        sums = added(step**2, np.where(movable, g0, 0.0) ** 2, movable)
+        own = float(sums[0] + ((found * slack) ** 2).sum() / max(1.0, sums[2]))
+        if own == 0.0:
+            return Residual(0.0, 0.0, found, scale)
+        rms = np.sqrt(own / sums[1]) if sums[1] > 0.0 else np.inf
+        if rms < best.rms:
+            most = largest(np.where(movable, g0, 0.0)) or 1.0
+            best = Residual(float(rms), largest(step) / most, found, scale)
+        changed = added(moving != inside)
+        if changed[0] == 0 or f.size == 0:
+            break
+        inside = moving
+    return best
+
+
+def _multipliers(
+    g0: np.ndarray,
+    g: np.ndarray,
+    inside: np.ndarray,
+    slack: np.ndarray,
+    parts: Mapping[int, slice],
+    total: Sum,
+) -> np.ndarray:
+    """Return l >= 0 that makes |g0 + l g|^2 + |l slack|^2 least over the variables inside."""
+    m = len(g)
+    if m == 0:
+        return np.zeros(0)
+    sums = {}
+    for k, part in parts.items():
+        chosen = g[:, part] * inside[part]
+        sums[k] = np.column_stack([chosen @ chosen.T, chosen @ g0[part]])
+    added = total(sums)
+    gram, right = added[:, :m] + np.diag(slack**2), -added[:, m]
+    scale = np.sqrt(np.diag(gram))
+    scale[scale == 0.0] = 1.0
+    # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > DEPENDENT_EIGENVALUE_SHARE * values[-1]
+    if not kept.any():
+        return np.zeros(m)
+    root = np.sqrt(values[kept])
+    A, b = root[:, None] * vectors[:, kept].T, (vectors[:, kept].T @ (right / scale)) / root
+    from scipy.optimize import nnls  # takes as long to import as NumPy
+
+    return np.asarray(nnls(A, b)[0] / scale)

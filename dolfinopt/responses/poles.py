@@ -1,0 +1,203 @@
+"""Poles of the controlled machine.
+
+Under [control] the machine is linearised about its simulated motion at the instants of
+`constraints.poles_at`: damping ratio and frequency of the closed loop's poles have exact gradients.
+Poles move with the bodies and with the motion: `dynamics.poles` has both derivatives, the
+adjoint of the trajectory the second part.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+from dolfinopt.dynamics.linearised import linearised
+from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
+from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
+from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
+from dolfinopt.responses.motion import By, LoadCases, MotionResponse, all_instants
+from dolfinopt.responses.response import Analysis, Measured, p_norm, response
+from dolfinopt.scene.load import Scene
+
+Seen = list[tuple[Poles, np.ndarray]]  # at every instant, with which of them count
+
+
+class PoleResponse(MotionResponse):
+    """The least of a function of the poles, of all instants together; limits are lower ones.
+
+    Its smooth value, that of the values of all poles that count (P, 1), grows as the true one
+    falls.
+    """
+
+    of_none: ClassVar[float] = np.inf  # the value where no pole counts
+
+    @abstractmethod
+    def of_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return the value of every pole (P,)."""
+
+    @abstractmethod
+    def by_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return complex g (P,), the change of a pole's value being Re(g dlambda)."""
+
+    @abstractmethod
+    def badness(self, value: np.ndarray | float) -> np.ndarray | float:
+        """Return what the smooth value is of a single pole."""
+
+    def counts(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
+        """Return which poles count (P,): by default all."""
+        return np.ones(len(poles), dtype=bool)
+
+    def load_cases(self, trajectory: Trajectory) -> LoadCases:
+        """Return the instants of the scene, of a trajectory that is seen at these."""
+        return all_instants(trajectory)
+
+    def quantity(self, trajectory: Trajectory) -> np.ndarray:
+        """Return the values of the poles that count (P, 1), at the scene's instants."""
+        return self._values(self._poles(_seen(trajectory)))[:, None]
+
+    def extreme(self, trajectory: Trajectory) -> float:
+        """Return the least value of all poles that count."""
+        return float(np.min(self.quantity(trajectory), initial=self.of_none))
+
+    def value_at(self, trajectory: Trajectory, cases: LoadCases) -> float:
+        """Return the smooth value of the poles at the scene's instants, whatever the cases."""
+        values = self.quantity(trajectory)
+        return self.value(values, values) if len(values) else float(self.badness(self.of_none))
+
+    def smooth_limits(
+        self, analysis: Analysis, measured: Measured, limits: np.ndarray
+    ) -> np.ndarray:
+        """Return the smooth limits, scaled like the smooth value of this design."""
+        true, smooth = np.array(measured.values), np.array(measured.smooth)
+        return np.asarray(self.badness(limits) * smooth / self.badness(true))
+
+    def cotangents(self, trajectory: Trajectory) -> list[ShapeIntegrals]:
+        """Return the exact derivatives by the shape integrals of every body, of one motion."""
+        seen = _seen(trajectory)
+        by_rates, own = self.derivatives(seen, self.load_cases(seen))
+        followed = trajectory.adjoint.gradient(seen.t, by_rates)
+        return [add_integrals(a, fields) for a, fields in zip(followed, own, strict=True)]
+
+    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> By:
+        """Return those by coordinates, rates and accelerations at the scene's instants, and bodies.
+
+        Whatever the cases are.
+        """
+        every = self._poles(_seen(trajectory))
+        values = self._values(every)[:, None]
+        by_values = self.gradient(values, values)[:, 0] if len(values) else values[:, 0]
+        # Poles far from the least one count for nothing, and cost as much.
+        least = NEGLIGIBLE_POLE_SHARE * np.abs(by_values).max(initial=0.0)
+        by_values = np.where(np.abs(by_values) > least, by_values, 0.0)
+        ends = np.cumsum([counted.sum() for _, counted in every])[:-1]
+        by_rates, bodies = [], []
+        for (poles, counted), by in zip(every, np.split(by_values, ends), strict=True):
+            weights = np.zeros(len(poles.values), dtype=complex)
+            weights[counted] = by * self.by_poles(poles.values[counted])
+            rates, own = poles.gradient(weights)
+            by_rates.append(rates)
+            bodies.append(own)
+        total = bodies[0]
+        for own in bodies[1:]:
+            total = [a + b for a, b in zip(total, own, strict=True)]
+        return np.concatenate(by_rates, axis=1), [integrals_of(one) for one in total]
+
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+        """Return `derivatives`, which follow poles instant by instant."""
+        return self.derivatives(trajectory, cases)
+
+    def _poles(self, trajectory: Trajectory) -> Seen:
+        """Return the poles at the instants of a trajectory with which of them count."""
+        system, every = trajectory.problem, []
+        for t in map(float, trajectory.t):
+            poles = poles_of(linearised(system, t, trajectory.at(np.array([t])).unknowns))
+            every.append((poles, self.counts(poles.values, trajectory.scene)))
+        return every
+
+    def _values(self, every: Seen) -> np.ndarray:
+        return np.concatenate([self.of_poles(one.values[counted]) for one, counted in every])
+
+
+def _seen(trajectory: Trajectory) -> Trajectory:
+    """Return a motion seen at the instants at which the scene asks for poles."""
+    scene = trajectory.scene
+    return trajectory.at(np.array(scene.constraints.pole_instants(scene.motion)))
+
+
+# -- damping ratio -------------------------------------------------------------------------------
+
+
+@response("damping_ratio")
+class DampingRatio(PoleResponse):
+    """Least damping ratio -Re / |lambda| of the closed loop's poles, 1 where none is limited.
+
+    Smooth: 1 less Kreisselmeier and Steinhauser's least, -1/k ln sum exp(-k ratio).
+    """
+
+    of_none = 1.0
+
+    def counts(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
+        """Return which poles are below `constraints.damping_below`."""
+        limit = scene.constraints.damping_below
+        if limit is None:
+            return np.ones(len(poles), dtype=bool)
+        return np.abs(poles) <= 2.0 * np.pi * limit
+
+    def of_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return the damping ratios."""
+        return damping_ratios(poles)
+
+    def by_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return -(Im^2 + i Re Im) / |lambda|^3."""
+        size = np.maximum(np.abs(poles), np.finfo(float).tiny) ** 3
+        return -poles.imag * (poles.imag + 1j * poles.real) / size
+
+    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
+        """Return 1 less the smooth least ratio."""
+        least = float(y.min())
+        total = np.exp(-DAMPING_SHARPNESS * (y - least)).sum()
+        return float(1.0 - least + np.log(total) / DAMPING_SHARPNESS)
+
+    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return its derivative by the ratios."""
+        powers = np.exp(-DAMPING_SHARPNESS * (y - y.min()))
+        return -powers / powers.sum()
+
+    def badness(self, value: np.ndarray | float) -> np.ndarray | float:
+        """Return what is missing to a ratio of 1."""
+        return 1.0 - value
+
+
+# -- frequency -----------------------------------------------------------------------------------
+
+
+@response("pole_frequency")
+class PoleFrequency(PoleResponse):
+    """Least natural frequency |lambda| / 2 pi of the closed loop's poles, Hz.
+
+    Smooth: the p-norm of the periods, s.
+    """
+
+    def of_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return the frequencies, Hz."""
+        return np.abs(poles) / (2.0 * np.pi)
+
+    def by_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return conj(lambda) / (2 pi |lambda|)."""
+        size = np.maximum(np.abs(poles), np.finfo(float).tiny)
+        return np.conj(poles) / (2.0 * np.pi * size)
+
+    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
+        """Return the smooth longest period, s."""
+        return p_norm(1.0 / y, self.options.exponent)[0]
+
+    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return its derivative by the frequencies."""
+        return -p_norm(1.0 / y, self.options.exponent)[1] / y**2
+
+    def badness(self, value: np.ndarray | float) -> np.ndarray | float:
+        """Return the period, s."""
+        return 1.0 / value
