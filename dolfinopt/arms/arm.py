@@ -27,7 +27,6 @@ from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.elements import element_of
-from dolfinopt.fem.interior import Guesses
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
@@ -380,7 +379,6 @@ class Arm:
         other = copy(self)
         other.coordinates = self.scene.reduction.count or None
         other.stiffening, other.initial, other._state = None, InitialVectors(), None
-        other.guesses = None
         return other
 
     # -- initial vectors of searches for modes -----------------------------------------------
@@ -400,16 +398,6 @@ class Arm:
         for place, one in zip(self.places, vectors[1:], strict=True):
             if one.shape[1]:
                 self.initial.loaded[place] = one
-
-    @property
-    def guesses(self) -> Guesses | None:
-        """What the next design's iterative solves set out from; None where there is nothing."""
-        return self.substructure.guesses
-
-    @guesses.setter
-    def guesses(self, guesses: Guesses | None) -> None:
-        if (self.substructure.extended or self.substructure.interior).is_iterative:
-            self.substructure.set_guesses(guesses)
 
     def forget_modes(self) -> None:
         """Let the next searches for modes set out from nothing."""

@@ -323,11 +323,9 @@ def static_modes(arm: ElasticArm) -> ConstraintModes:
         ConvergenceError: the contrast between solid and void is too large for this design.
     """
     floating = floats(arm)
-    if not floating:  # of a machine that moves after static loads
-        arm.substructure.release_extended()
     coupling, corner = arm.restrict(arm.substructure.rigid_forces(arm.young))
     # With the interior at rest the interface's motion has up to 1e5 of the modes' energy.
-    interior = arm.solve(-coupling, "constraint modes", np.diag(corner))
+    interior = arm.solve(-coupling, held=np.diag(corner))
     modes = _with_energies(arm, interior, coupling, corner)
     if floating:
         modes = _refined(arm, modes)
@@ -379,15 +377,16 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
         known = StaticFields(*(np.empty((*n, 0)) for n in ((b,), arm.points.shape, (b,), (0,))))
     extended = arm.substructure.extended
     # What a symmetric design's deflection has across the load is an error of the fields.
-    error = extended.tolerance if extended and extended.is_iterative else DEFLECTION_ROUNDING_ERROR
-    new = on_root(arm.comm, _new_directions, known.directions, loads, error)
+    error = extended.solver.tolerance if extended else 0.0
+    new = on_root(
+        arm.comm, _new_directions, known.directions, loads, error or DEFLECTION_ROUNDING_ERROR
+    )
     if new.shape[1] == 0:
         return known
     if arm.has_constraint_modes or extended is None or floats(arm):
         modes = arm.constraint_modes()
         return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
-    purpose = "adjoint loads" if known.directions.shape[1] else "static loads"
-    interior, tip = arm.solve_loads(new, purpose)
+    interior, tip = arm.solve_loads(new)
     field = np.concatenate([known.field, arm.expand(interior, tip)], axis=2)
     found = StaticFields(
         np.hstack([known.directions, new]),

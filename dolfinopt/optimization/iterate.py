@@ -467,7 +467,6 @@ class Iterate:
             change=self.change,
             cells=self.variables.split(np.column_stack(columns)),
             modes=self.evaluator.initial_vectors,
-            guesses={k: one for k, one in self.evaluator.initial_guesses.items() if one},
             multipliers=state.multipliers,
             convexity=self.convexity,
             stage=self.stage,
@@ -492,7 +491,6 @@ class Iterate:
         self.evaluator.solutions = memory.solutions
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
-            arm.guesses = memory.guesses.get(k)
         self.iteration, self.change = memory.iteration, memory.change
         projection = self.continuation
         projection.beta, projection.age, projection.held = memory.beta, memory.age, memory.held

@@ -28,7 +28,6 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.fem.interior import Guesses
 
 
 class Variables:
@@ -365,8 +364,8 @@ class Evaluator:
         variables, continuation: how x makes designs.
         trajectory: of the design evaluated last; None without a motion and off the root.
         solutions: its motions; the next evaluation sets out from them.
-        initial_solutions, initial_vectors, initial_guesses: from where that of the last x set out,
-            so that it can be repeated in the same bits.
+        initial_solutions, initial_vectors: from where that of the last x set out, so that it can be
+            repeated in the same bits.
     """
 
     def __init__(
@@ -379,7 +378,6 @@ class Evaluator:
         self.solutions: tuple[Solution, ...] = ()
         self.initial_solutions: tuple[Solution, ...] = ()
         self.initial_vectors: dict[int, list[np.ndarray]] = {}
-        self.initial_guesses: dict[int, Guesses | None] = {}
 
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
         """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
@@ -402,7 +400,6 @@ class Evaluator:
         """
         self.initial_solutions = self.solutions
         self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
-        self.initial_guesses = {k: arm.guesses for k, arm in self.arms.items()}
         *others, nominal = self.physical_designs(x)
         found = []
         for design in others:
@@ -433,7 +430,6 @@ class Evaluator:
         self.solutions = self.initial_solutions
         for k, vectors in self.initial_vectors.items():
             self.arms[k].initial_vectors = vectors
-            self.arms[k].guesses = self.initial_guesses[k]
 
     def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:
         """Evaluate the last x again, from the same initial guesses: in the same bits (collective).

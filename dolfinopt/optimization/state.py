@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.optimization.measured import IMPROVED_SHARE
 from dolfinopt.optimization.mma import Search
@@ -150,7 +149,6 @@ class IterateMemory:
         stage, search: that the design belongs to, and how the next step is sought.
         age, held: updates since beta rose, and whether it stays as it is.
         best: the best design so far; its variables are the last column of `cells`.
-        guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
         thresholds: per arm its eta.
@@ -160,7 +158,6 @@ class IterateMemory:
     change: float
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
-    guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
     convexity: np.ndarray
     stage: Stage

@@ -14,7 +14,6 @@ import numpy as np
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.collocation import Solution, Strategy
 from dolfinopt.errors import InputError
-from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.optimization.mma import Search
 from dolfinopt.optimization.problem import Stage
@@ -231,7 +230,6 @@ def _difference(theirs: Any, ours: Any, key: str = "") -> str:
 
 # -- one design of an optimisation as arrays of whole arms, for the checkpoint, and back ---------
 
-GUESS = "guess/"  # before what iterative solves set out from
 # A solution's arrays: name in the file, field.
 SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
 
@@ -261,7 +259,6 @@ def arrays_of(
         columns[f"outboard{j}"] = gather_cells(
             partition, {k: last for k, (_, last) in by_arm.items()}
         )
-    columns |= _guesses(partition, arms, memory)
     if partition.world.rank != 0:
         return {}
     arrays: dict[str, Any] = {
@@ -284,31 +281,10 @@ def arrays_of(
     return arrays
 
 
-def _guesses(
-    partition: Partition, arms: Mapping[int, Arm], memory: IterateMemory
-) -> dict[str, dict[int, np.ndarray]]:
-    """Return what iterative solves set out from, by its name and arm (collective)."""
-    known = {k: memory.guesses[k] for k in arms if k in memory.guesses}
-    every = partition.world.allgather({name for one in known.values() for name in one.fields})
-    found = {
-        f"{GUESS}{name}": gather_cells(
-            partition, {k: one.fields[name] for k, one in known.items() if name in one.fields}
-        )
-        for name in sorted(set().union(*every))
-    }
-    if any(partition.world.allgather(bool(known))):
-        young = {k: one.young for k, one in known.items()}
-        found["hierarchy"] = gather_cells(partition, young)
-        solver = {k: np.array([one.gradual, *one.progress]) for k, one in known.items()}
-        found["solver"] = gather_arms(partition, solver)
-    return found
-
-
 def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
     """Return the fields of `IterateMemory`."""
     cells: dict[int, np.ndarray] = {}
     modes: dict[int, list[np.ndarray]] = {}
-    guesses: dict[int, Guesses] = {}
     for k, arm in arms.items():
         if f"arm{k}/cells" in arrays:  # an arm that repeats another's design has no variables
             rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
@@ -316,13 +292,6 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
         rows = (arm.mesh.dim * rows[:, None] + np.arange(arm.mesh.dim)).ravel()
         last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
-        if f"arm{k}/hierarchy" in arrays:
-            names = [key for key in arrays if key.startswith(f"arm{k}/{GUESS}")]
-            fields = {name.removeprefix(f"arm{k}/{GUESS}"): arrays[name][rows] for name in names}
-            own = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
-            gradual, *rates = arrays[f"arm{k}/solver"].tolist()
-            young = arrays[f"arm{k}/hierarchy"][own]
-            guesses[k] = Guesses(fields, young, bool(gradual), (rates[0], rates[1]))
         modes[k] = []
         for j in range(len(arm.initial_vectors)):
             interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
@@ -345,7 +314,6 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         "change": change,
         "cells": cells,
         "modes": modes,
-        "guesses": guesses,
         "multipliers": arrays["multipliers"],
         "convexity": arrays["convexity"],
         "stage": Stage(tuple(arrays["held"]), float(arrays["price"])),

@@ -18,6 +18,9 @@ LOBPCG_TOLERANCE = 1e-8  # of the vectors in energy
 # Part of a direction's length, squared, below which it is the others'.
 LOBPCG_INDEPENDENT_SHARE = 1e-12
 
+# Relative, in energy, of iterative solutions of which a Krylov space is made.
+INVERSE_TOLERANCE = 1e-12
+
 # -- eigenproblem: modes by a factor ---------------------------------------------------------
 
 # Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
@@ -28,9 +31,6 @@ EIGEN_TOLERANCE = 1e-12
 EIGENVALUE_GAP = 1e-6
 # Part of a nearby mode, in M, beyond which the modes that were found do not contain it.
 LOST_MODE_SHARE = 1e-2
-# Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
-# to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
-WIDE_SPECTRUM_RATIO = 1e6
 # Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
 # finds modes of another symmetry, up to 1e-4 it is not slower.
 RAMP_SHARE = 1e-6

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from dolfinopt.fem.box_multigrid import BoxMultigrid, BoxSolver
 from mpi4py import MPI
 from petsc4py import PETSc
 from solids import elastic_link, link_mesh, solid_arm, solid_scene
@@ -12,7 +13,6 @@ from solids import elastic_link, link_mesh, solid_arm, solid_scene
 from dolfinopt.arms.arm import Arm, field_tolerance
 from dolfinopt.fem import interior, multigrid
 from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
-from dolfinopt.fem.box_multigrid import BoxMultigrid, BoxSolver
 from dolfinopt.fem.multigrid import Level
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.profiling import Profile
