@@ -13,6 +13,7 @@ class Counts:
     """How often the costly steps ran, over all arms.
 
     Attributes:
+        forms: whose kernels give the cells' matrices, stresses and their derivatives.
         assemblies: of a stiffness or a mass matrix.
         factorisations, solves: of and with the stiffness of an arm's interior.
         eigenproblems: of an arm.
@@ -23,6 +24,7 @@ class Counts:
         energy_fields: whose energy was taken cell by cell, for gradients.
     """
 
+    forms: int = 0
     assemblies: int = 0
     factorisations: int = 0
     solves: int = 0

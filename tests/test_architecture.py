@@ -9,7 +9,7 @@ from runs import ROOT
 
 from dolfinopt import profiling as profile
 from dolfinopt.density.interpolation import LAWS
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.scene.tables.arms import ElementName
@@ -56,7 +56,7 @@ def test_words_of_the_scene_are_those_of_the_code():
     """A method is known to the scene by the word under which its room lists it."""
     assert set(get_args(ReductionMethod)) == METHODS.keys()
     assert set(get_args(Law)) == LAWS.keys()
-    assert set(get_args(ElementName)) == ELEMENTS.keys()
+    assert set(get_args(ElementName)) == set(ELEMENTS)
     limited = Constraints.model_fields.keys() - set(NO_LIMITS)
     assert {*get_args(ObjectiveKind), *limited} == NEEDS.keys()
 

@@ -15,8 +15,7 @@ from runs import TWO_ARM, by_root, environment, overrides
 import dolfinopt as do
 from dolfinopt.arms import arm, design_state
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
-from dolfinopt.fem import elasticity, elements
-from dolfinopt.fem.elements import IncompatibleElement
+from dolfinopt.fem import elasticity, tensors
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.output import checkpoint, design, run_folder, summary
@@ -219,7 +218,7 @@ PLACES = [
     (building, LONE, mesh, "snap"),
     (building, LONE, mesh, "build_model", "arms.1.mesh=meshes/arm.geo"),
     (building, LONE, mesh, "_arm_mesh", "arms.1.mesh=meshes/arm.geo"),
-    (building, LONE, IncompatibleElement, "operators"),
+    (building, LONE, tensors, "compile_kernels"),
     (building, LONE, arm, "Substructure"),
     (evaluating, LONE, design_state, "interpolate"),
     (evaluating, LONE, design_state, "shape_integrals"),
@@ -311,7 +310,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(mesh, "snap"), (elements, "_full"), (elasticity, "AffineMatrix"),
+    [(mesh, "snap"), (tensors, "compile_kernels"), (elasticity, "AffineMatrix"),
      (design_state, "interpolate")],
 )  # fmt: skip
 def test_a_shared_arm(owner, name, monkeypatch):

@@ -26,7 +26,8 @@ from dolfinopt.density.filter import (
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import element_of
+from dolfinopt.fem.laws import isotropic
+from dolfinopt.fem.tensors import ElementTensors, element_of
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
@@ -112,9 +113,10 @@ class Arm:
                 element = element_of(self.mesh, arm.element)
             except InputError as error:
                 raise InputError(f"{scene.source}: {error}") from None
-            operators = element.operators(self.mesh, arm.depth, self.solid.poisson_ratio)
+            law = isotropic(self.mesh.dim, self.solid.poisson_ratio)
+            operators = ElementTensors(self.mesh, element, arm.depth, law, profile)
             self.substructure = Substructure(
-                self.mesh, operators, profile, field_tolerance(scene), needs_alone(scene, STATICS)
+                operators, field_tolerance(scene), needs_alone(scene, STATICS)
             )
             # A design that is another arm's is filtered there.
             radius = scene.filter_radius(index) if pattern is None else 0.0

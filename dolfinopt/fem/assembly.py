@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -12,14 +12,13 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.fem.measured import (
-    ALIKE_CELLS_ERROR,
     BUFFER_ENTRIES,
     FIELD_CHUNK_ENTRIES,
     STRESS_CHUNK_CELLS,
     STRESS_CHUNK_ENTRIES,
 )
+from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.profiling import Profile
 
 
@@ -37,8 +36,9 @@ class AffineMatrix:
     block = 1
 
     def __init__(self, dofs: np.ndarray, elements: np.ndarray, size: int):
-        """Set up the pattern from element dofs (n_cells, n) and matrices (n_cells, n, n)."""
+        """Set up the pattern from element dofs (n_cells, n), matrices (1 or n_cells, n, n)."""
         count, width = dofs.shape
+        elements = np.broadcast_to(elements, (count, width, width))
         rows = np.repeat(dofs, width, axis=1).ravel().astype(np.int64)
         keys = rows * size + np.tile(dofs, (1, width)).ravel()
         unique, place = np.unique(keys, return_inverse=True)
@@ -339,25 +339,6 @@ def runs_of_columns(field: np.ndarray) -> list[slice]:
 # directions.
 
 
-def single(comm: MPI.Comm, matrices: np.ndarray) -> np.ndarray | None:
-    """Return the mean of all ranks' matrices (n_cells, ...) that are the same but for rounding.
-
-    Or None; collective. One of them and the mean difference from it: the rounding of a sum over
-    all cells would resist motions of a rigid cell with up to 1e-11 of its stiffness.
-    """
-    count = comm.allreduce(len(matrices))
-    if count == 0:
-        return None
-    one = len(matrices) == 0 or (len(matrices) > 1 and matrices.strides[0] == 0)
-    if comm.allreduce(one, op=MPI.LAND):  # computed once on every rank already
-        matrices, count = matrices[:1], comm.allreduce(min(len(matrices), 1))
-    some = comm.allgather(matrices[0].copy() if len(matrices) else None)
-    first = next(one for one in some if one is not None)
-    mean = first + comm.allreduce((matrices - first).sum(axis=0)) / count
-    error = comm.allreduce(np.abs(matrices - mean).max(initial=0.0), op=MPI.MAX)
-    return mean if error <= ALIKE_CELLS_ERROR * np.abs(mean).max() else None
-
-
 def times(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return A_e v_e (rows, k, n_cells) of (1 or n_cells, rows, n) and (n, k, n_cells)."""
     if len(matrices) == 1:
@@ -367,7 +348,7 @@ def times(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray((matrices @ by_cell).transpose(1, 2, 0))
 
 
-def of_cells(matrices: np.ndarray, cells: slice) -> np.ndarray:
+def of_cells(matrices: np.ndarray, cells: slice | np.ndarray) -> np.ndarray:
     """Return those of some cells; what all share as it is."""
     return matrices if len(matrices) == 1 else matrices[cells]
 
@@ -376,13 +357,14 @@ class Cells:
     """The cells of one rank; n nodes a cell.
 
     Attributes:
-        operators: of the arm.
+        operators: their tensors.
         stiffness: (1 or n_cells, dn, dn), one for all cells where those of all ranks are alike.
         mass: (1 or n_cells, n, n).
     """
 
-    def __init__(self, operators: ElementOperators, stiffness: np.ndarray, mass: np.ndarray):
-        self.operators, self.stiffness, self.mass = operators, stiffness, mass
+    def __init__(self, operators: ElementTensors):
+        self.operators = operators
+        self.stiffness, self.mass = operators.stiffness, operators.mass
         self._corners = np.ascontiguousarray(operators.cells.T)
         count = self._corners.size
         self._sum = sp.csr_matrix(
@@ -515,24 +497,6 @@ class Cells:
         return values
 
 
-def cells_of(comm: MPI.Comm, operators: ElementOperators) -> Cells:
-    """Return the cells of this rank (collective).
-
-    If those of all ranks are alike, their operators then have exactly the same matrices. What is
-    assembled from these knows no rounding of the nodes' places; and the same mean belongs in the
-    other operators of a cell, or rotations of a cell would strain it by that rounding.
-    """
-    stiffness, mass = single(comm, operators.stiffness), single(comm, operators.mass)
-    if stiffness is None or mass is None:
-        return Cells(operators, operators.stiffness, operators.mass)
-    same = replace(
-        operators,
-        stiffness=np.broadcast_to(stiffness, operators.stiffness.shape),
-        mass=np.broadcast_to(mass, operators.mass.shape),
-    )
-    return Cells(same, stiffness[None], mass[None])
-
-
 def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the sum of left times right over all axes but the last, the cells'."""
     rows = left.reshape(-1, left.shape[-1])
@@ -547,49 +511,8 @@ def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 #     K0[i, j] = sum_e E_e sum_bcd T[bc, d] u_d (a_ib . a_jc)
 #
 # needs no quadrature points: bilinear cells have 6 products bc of differences where four points
-# have 3 stresses each, and all products with T are dense matrix products over many cells.
-
-
-class StressTensor:
-    """The tensor T of cells; r = n - 1 differences of each component.
-
-    Attributes:
-        cells: which.
-        tensor: (1 or n_cells, r (r + 1) / 2, d r) T, b <= c; of b < c twice as much, for c and b.
-    """
-
-    def __init__(self, cells: Cells, derivatives: np.ndarray, stress: np.ndarray):
-        """Set up from the cells' operators, see `Quadrature`; (1, dp, n), (1, sp, dn) of all."""
-        self.cells = cells
-        dim = cells.operators.points.shape[1]
-        kinds = 3 if dim == 2 else 6
-        # Of a translation neither is left: the first node's columns are minus the others' sum.
-        count, n = len(derivatives), derivatives.shape[2]
-        D = derivatives.reshape(count, -1, dim, n)[:, :, :, 1:]
-        S = stress.reshape(*D.shape[:2], kinds, -1)[:, :, :, dim:]
-        b, c = np.triu_indices(n - 1)
-        twice = np.where(b == c, 1.0, 2.0)
-        self.tensor = np.empty((count, len(b), S.shape[3]))
-        pairs: list[tuple[tuple[int, int], ...]] = [((k, k),) for k in range(dim)]
-        pairs += [((x, y), (y, x)) for x, y in ((0, 1), (1, 2), (2, 0))[: kinds - dim]]
-        step = max(1, STRESS_CHUNK_ENTRIES // (D.shape[1] * len(b) * kinds))
-        for run in (slice(i, i + step) for i in range(0, count, step)):
-            d = D[run]
-            products = np.stack(
-                [sum(d[:, :, x, b] * d[:, :, y, c] for x, y in terms) for terms in pairs], axis=2
-            ).reshape(len(d), -1, len(b))
-            weighted = (twice * products).swapaxes(1, 2)
-            self.tensor[run] = weighted @ S[run].reshape(len(d), -1, S.shape[3])
-
-    def of(self, fields: np.ndarray, young: np.ndarray, V: np.ndarray) -> StiffenedModes:
-        """Return the geometric stiffness of modes by the stress of fields.
-
-        Args:
-            fields: (n_nodes, d, loads) whose stress stiffens.
-            young: (n_cells,).
-            V: (n_nodes, d, q) modes.
-        """
-        return StiffenedModes(self, fields, young, V)
+# have 3 stresses each, and all products with T are dense matrix products over many cells. T is
+# (1 or n_cells, r (r + 1) / 2, d r) for r = n - 1 and b <= c; of b < c twice as much, for c and b.
 
 
 @dataclass(frozen=True, eq=False)
@@ -610,10 +533,17 @@ class StiffenedModes:
     What the value has gathered its derivatives do not gather again.
     """
 
-    def __init__(self, tensor: StressTensor, fields: np.ndarray, young: np.ndarray, V: np.ndarray):
-        """See `StressTensor.of`."""
-        self._tensor, self._shape = tensor, (V.shape[2], fields.shape[2])
-        cells, count = tensor.cells, len(young)
+    def __init__(self, cells: Cells, fields: np.ndarray, young: np.ndarray, V: np.ndarray):
+        """Gather the nodal values.
+
+        Args:
+            cells: of the arm.
+            fields: (n_nodes, d, loads) whose stress stiffens.
+            young: (n_cells,).
+            V: (n_nodes, d, q) modes.
+        """
+        self._cells, self._shape = cells, (V.shape[2], fields.shape[2])
+        count = len(young)
         b, c = np.triu_indices(cells.num_nodes - 1)
         self._pairs = list(zip(b, c, strict=True))
         step = max(STRESS_CHUNK_ENTRIES // (len(b) * V.shape[2] ** 2), STRESS_CHUNK_CELLS)
@@ -622,8 +552,8 @@ class StiffenedModes:
         self._runs = [self._run(run, rows, young[run]) for run in runs]
 
     def _run(self, cells: slice, rows: np.ndarray, young: np.ndarray) -> _Run:
-        (q, loads), T = self._shape, of_cells(self._tensor.tensor, cells)
-        values = self._tensor.cells.differences(rows, cells)
+        (q, loads), T = self._shape, of_cells(self._cells.operators.geometric, cells)
+        values = self._cells.differences(rows, cells)
         values = values.reshape(len(values), -1, q + loads, len(young))
         a, u = values[:, :, :q].copy(), values[:, :, q:].copy()
         return _Run(cells, young, a, u, times(T, u.reshape(T.shape[2], loads, -1)))
@@ -652,7 +582,7 @@ class StiffenedModes:
             b, (n_nodes, d, loads), contributions of this rank's cells; by Young's modulus
             (n_cells,), both held; and Psi' times the derivatives by u_F (b, b), or None.
         """
-        (q, loads), cells, T = self._shape, self._tensor.cells, self._tensor.tensor
+        (q, loads), cells, T = self._shape, self._cells, self._cells.operators.geometric
         symmetric = (0.5 * (by_K0 + by_K0.swapaxes(1, 2))).reshape(loads, -1)
         # Of b = c both factors are the same.
         twice = np.array([2.0 if b == c else 1.0 for b, c in self._pairs])
@@ -687,7 +617,7 @@ class StiffenedModes:
             left: (n_nodes, d, q).
             adjoint: (n_nodes, d, k).
         """
-        cells, k = self._tensor.cells, adjoint.shape[2]
+        cells, k = self._cells, adjoint.shape[2]
         rows, out = cells.by_component(left, adjoint), np.empty(cells.count)
         for run in self._runs:
             values = cells.differences(rows, run.cells)
@@ -725,6 +655,29 @@ class StiffenedModes:
                 found[b] += np.einsum("ije,xje->xie", weight, a[c], out=term)
                 found[c] += np.einsum("ije,xje->xie", weight, a[b], out=term)
         return found
+
+
+def geometric_matrix(cells: Cells, u: np.ndarray, modulus: np.ndarray) -> sp.csr_matrix:
+    """Return K0 (n_nodes, n_nodes) of this rank's cells, of any direction, by the stress of u, N/m.
+
+    Args:
+        cells: of the arm.
+        u: (n_nodes, d, 1).
+        modulus: (n_cells,) of the stress, Pa.
+    """
+    differences = cells.differences(cells.by_component(u))
+    force = (
+        times(cells.operators.geometric, differences.reshape(-1, 1, cells.count))[:, 0] * modulus
+    )
+    n, nodes = cells.num_nodes, cells.operators.cells
+    reduced = np.zeros((cells.count, n - 1, n - 1))
+    b, c = np.triu_indices(n - 1)
+    reduced[:, b, c] = 0.5 * force.T
+    reduced += reduced.swapaxes(1, 2)
+    D = np.hstack([-np.ones((n - 1, 1)), np.eye(n - 1)])
+    entries = (D.T @ reduced @ D).ravel()
+    places = np.repeat(nodes, n, axis=1).ravel(), np.tile(nodes, n).ravel()
+    return sp.coo_matrix((entries, places), 2 * (len(u),)).tocsr()
 
 
 @contextmanager

@@ -21,12 +21,10 @@ from scipy.spatial import cKDTree
 from dolfinopt.fem.assembly import (
     AssembledMatrix,
     CellMatrix,
+    Cells,
     NodePairs,
-    StressTensor,
-    cells_of,
-    single,
+    of_cells,
 )
-from dolfinopt.fem.elements import ElementOperators, Quadrature, moved_operators, quadrature
 from dolfinopt.fem.interface import (
     Connectivity,
     ConstraintModes,
@@ -45,11 +43,11 @@ from dolfinopt.fem.interior import (
 from dolfinopt.fem.measured import ENERGY_TOLERANCE, STATICS_TOLERANCE
 from dolfinopt.fem.multigrid import box_of
 from dolfinopt.fem.shape_derivative import ShapeDerivative
-from dolfinopt.fem.stress import element_centres, stress_operator
+from dolfinopt.fem.stress import stress_operator
+from dolfinopt.fem.tensors import ElementTensors, element_centre
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
-from dolfinopt.profiling import Profile
 
 Columns = Callable[[np.ndarray], np.ndarray]
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
@@ -60,7 +58,7 @@ class Substructure:
 
     Attributes:
         mesh: the arm.
-        operators: its element operators.
+        operators: the tensors of its cells.
         cells: those of this rank, with one element matrix where all are alike, as in a grid.
         profile: of this rank.
         T: the interface transformation.
@@ -71,30 +69,26 @@ class Substructure:
 
     def __init__(
         self,
-        mesh: ArmMesh,
-        operators: ElementOperators,
-        profile: Profile,
+        operators: ElementTensors,
         tolerance: float = ENERGY_TOLERANCE,
         statics_alone: bool = False,
     ):
         """Number the interior dofs and lay down the sparsity patterns (collective).
 
         Args:
-            mesh, operators, profile: see above.
+            operators: see above.
             tolerance: of iterative solutions in energy, relative.
             statics_alone: whether nothing is asked of its designs but what static loads do.
 
         Raises:
             InputError: the mesh lacks an interface.
         """
-        self.mesh = mesh
-        self.cells = cells_of(mesh.comm, operators)
-        self.operators = operators = self.cells.operators
-        self.profile = profile
+        self.mesh, self.profile = mesh, profile = operators.mesh, operators.profile
+        self.operators, self.cells = operators, Cells(operators)
         with together(mesh.comm):
             self._pairs = NodePairs(operators.cells, len(operators.points))
-            self._stiffness = CellMatrix(self._pairs, self.cells.stiffness)
-            self._mass = CellMatrix(self._pairs, self.cells.mass)
+            self._stiffness = CellMatrix(self._pairs, operators.stiffness)
+            self._mass = CellMatrix(self._pairs, operators.mass)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
         solid = mesh.dim == 3 and mesh.wall is None
         box = box_of(self.T, self.cells, mesh.centroid) if solid else None
@@ -119,8 +113,8 @@ class Substructure:
             if isinstance(value, cached_property):
                 other.__dict__.pop(name, None)
         other.mesh = mesh
-        other.cells = cells_of(mesh.comm, moved_operators(self.operators, mesh, points))
-        other.operators = other.cells.operators
+        other.operators = self.operators.moved(mesh, points)
+        other.cells = Cells(other.operators)
         other._stiffness = CellMatrix(self._pairs, other.cells.stiffness)
         other._mass = CellMatrix(self._pairs, other.cells.mass)
         other.T, other._last = self.T.moved(points), None
@@ -158,7 +152,7 @@ class Substructure:
         near = np.flatnonzero(self.T.outboard[cells].any(axis=1))
         b = self.T.num_coordinates
         values = self.T.rigid[cells[near]].reshape(len(near), self.T.dim * cells.shape[1], b)
-        return near, self.operators.stiffness[near] @ values
+        return near, of_cells(self.operators.stiffness, near) @ values
 
     def rigid_forces(self, young: np.ndarray) -> np.ndarray:
         """Return K times unit motions of the outboard interface (n_nodes, d, b), of these cells.
@@ -173,21 +167,14 @@ class Substructure:
         return field
 
     @cached_property
-    def quadrature(self) -> Quadrature:
-        """Stress and gradients at the quadrature points."""
-        return quadrature(self.mesh, self.operators)
-
-    @cached_property
     def shape_derivative(self) -> ShapeDerivative:
         """Derivatives of what cells add to, by the places of their corners."""
-        return ShapeDerivative(self.mesh, self.cells)
+        return ShapeDerivative(self.operators)
 
     @cached_property
     def stress_operator(self) -> sp.csr_matrix:
         """That of `fem.stress` at the element centres (s n_cells, d n_nodes), 1/m."""
-        corners = compat.cell_corner_count(self.mesh.mesh)
-        centres = element_centres(corners, self.mesh.dim)
-        return stress_operator(self.mesh, self.operators, centres)
+        return stress_operator(self.operators, element_centre(self.operators.cell))
 
     @cached_property
     def interface_distance(self) -> np.ndarray:
@@ -198,17 +185,6 @@ class Substructure:
         T = self.T
         nodes = np.concatenate(T.comm.allgather(T.points[T.inboard | T.outboard]))
         return cKDTree(nodes).query(self.mesh.centroid)[0]
-
-    @cached_property
-    def stress_tensor(self) -> StressTensor:
-        """How stress stiffens cells (collective)."""
-        points = quadrature(self.mesh, self.operators)  # not kept: of tetrahedra 10 kB a cell
-        every = points.derivatives, points.stress
-        # Turned by half a turn k_e and m_e are the same, but not these.
-        derivatives, stress = (single(self.mesh.comm, operator) for operator in every)
-        if len(self.cells.stiffness) != 1 or derivatives is None or stress is None:
-            return StressTensor(self.cells, *every)
-        return StressTensor(self.cells, derivatives[None], stress[None])
 
     def extend(self, K: AssembledMatrix) -> ExtendedStiffness:
         """Return what `extended` takes of K of a design (collective)."""

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.fem.assembly import StiffenedModes, combine
+from dolfinopt.fem.assembly import StiffenedModes, combine, of_cells
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
@@ -103,8 +103,8 @@ class UnitLoads:
         """Return what is known of these modes; for the last ones the same."""
         known = self._last.get("modes")
         if known is None or known[0] is not V:
-            tensor = self.arm.substructure.stress_tensor
-            known = self._last["modes"] = V, tensor.of(self.fields, self.arm.young, V)
+            cells = self.arm.substructure.cells
+            known = self._last["modes"] = V, StiffenedModes(cells, self.fields, self.arm.young, V)
         return known[1]
 
     def gradient(
@@ -356,6 +356,11 @@ class FaceRotation:
         cells = arm.operators.cells
         self._near = np.flatnonzero(arm.outboard[cells].any(axis=1))
         self._nodes = cells[self._near]
+        operators = arm.operators
+        self._stiffness = of_cells(operators.stiffness, self._near)
+        self._mass = np.broadcast_to(
+            of_cells(operators.mass, self._near), (len(self._near), *operators.mass.shape[1:])
+        )
         self._levers = _levers(arm.rigid)
 
     def _rotations(self, V: np.ndarray) -> np.ndarray:
@@ -379,7 +384,7 @@ class FaceRotation:
         arm, nodes = self.arm, self._nodes
         values = fields[nodes] - fields[nodes].mean(axis=1, keepdims=True)
         forces = self._stiffness_times(values)
-        inertia = np.einsum("enm,emap->enap", arm.operators.mass[self._near], accelerations[nodes])
+        inertia = np.einsum("enm,emap->enap", self._mass, accelerations[nodes])
         inertia *= arm.density[self._near, None, None, None]
         forces[..., : accelerations.shape[2]] -= inertia
         return forces
@@ -436,7 +441,7 @@ class FaceRotation:
 
     def _unit_stiffness_times(self, values: np.ndarray) -> np.ndarray:
         count, n, dim, p = values.shape
-        forces = self.arm.operators.stiffness[self._near] @ values.reshape(count, dim * n, p)
+        forces = self._stiffness @ values.reshape(count, dim * n, p)
         return forces.reshape(values.shape)
 
 

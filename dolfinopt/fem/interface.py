@@ -18,7 +18,6 @@ from mpi4py import MPI
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.fem.elements import ElementOperators
 from dolfinopt.fem.measured import (
     DEFLECTION_ROUNDING_ERROR,
     HARMLESS_CONTRAST,
@@ -27,6 +26,7 @@ from dolfinopt.fem.measured import (
     SAME_PLACE_SHARE,
     STIFFNESS_ROUNDING_LIMIT,
 )
+from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import on_root
@@ -60,12 +60,12 @@ class InterfaceTransformation:
             a cross-section.
     """
 
-    def __init__(self, mesh: ArmMesh, operators: ElementOperators, graph: sp.csr_matrix):
+    def __init__(self, mesh: ArmMesh, operators: ElementTensors, graph: sp.csr_matrix):
         """Find the interfaces and number the interior dofs (collective).
 
         Args:
             mesh: the arm.
-            operators: its element operators.
+            operators: the tensors of its cells.
             graph: (n_nodes, n_nodes) with an entry where two nodes share a cell.
 
         Raises:

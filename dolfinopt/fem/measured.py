@@ -3,7 +3,7 @@
 Each stands with its unit, what it rules, and what was measured.
 """
 
-# -- cells: assembly, elements ---------------------------------------------------------------
+# -- cells: assembly, tensors ----------------------------------------------------------------
 
 # Largest difference of cells' matrices, or edges, from their mean, in its largest entry, that is
 # rounding of the nodes' places: 1e-16 m in cells of 1 mm, and what Gmsh adds in a file's grid.
@@ -16,10 +16,7 @@ STRESS_CHUNK_CELLS = 256
 # these: by default 8192, which takes longer than the products.
 BUFFER_ENTRIES = 256
 FIELD_CHUNK_ENTRIES = 4_000_000  # of nodal fields that are copied at a time: 32 MB
-QUADRATURE_CHUNK_CELLS = 4096  # whose matrices are summed up at a time
-# Entries of displacement gradients at a time, for derivatives by the places of corners.
-SHAPE_CHUNK_ENTRIES = 250_000
-TWIST_COUPLING = 0.8  # s; 1 has no energy left where two faces of a cell turn against each other
+KERNEL_CHUNK_ENTRIES = 8_000_000  # of cells' tensors that are computed at a time: 64 MB
 
 # -- interface -------------------------------------------------------------------------------
 

@@ -16,12 +16,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import basix
 import numpy as np
 import scipy.sparse as sp
 
-from dolfinopt.fem.assembly import combine, runs_of_columns
-from dolfinopt.fem.elements import KINDS, ElementOperators, by_cells, elasticity, gauss_points
+from dolfinopt.fem.assembly import StiffenedModes, combine, geometric_matrix, runs_of_columns
 from dolfinopt.fem.geometric_stiffness import (
     NUM_INERTIAL,
     FaceRotation,
@@ -30,69 +28,39 @@ from dolfinopt.fem.geometric_stiffness import (
     by_inertia,
     interface_fields,
 )
+from dolfinopt.fem.laws import VON_MISES
 from dolfinopt.fem.measured import FEWER_DIRECTIONS, MOTION_RANK_SHARE, SUMS_RANK_SHARE
-from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.fem.tensors import ElementTensors, corner_functions
 from dolfinopt.parallel import on_root
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
 
-# Components whose length is von Mises's stress, of stresses xx, yy, xy:
-# s^2 = ((xx + yy) / 2)^2 + 3/4 (xx - yy)^2 + 3 xy^2. In space, of xx, yy, zz, xy, yz, zx:
-# s^2 = ((xx - yy)^2 + (yy - zz)^2 + (zz - xx)^2) / 2 + 3 (xy^2 + yz^2 + zx^2), with the first sum
-# that of ((xx + yy) / 2 - zz)^2 and 3/4 (xx - yy)^2.
-VON_MISES = np.array([[0.5, 0.5, 0.0], [0.75**0.5, -(0.75**0.5), 0.0], [0.0, 0.0, 3.0**0.5]])
 
-SOLID_VON_MISES = np.zeros((5, 6))
-SOLID_VON_MISES[0, :3], SOLID_VON_MISES[1, :2] = (0.5, 0.5, -1.0), (0.75**0.5, -(0.75**0.5))
-SOLID_VON_MISES[2:, 3:] = 3.0**0.5 * np.eye(3)
-
-
-def element_centres(corners: int, dim: int = 2) -> np.ndarray:
-    """Return the centre (1, d) of the reference cell with so many corners."""
-    return np.full((1, dim), 1.0 / (dim + 1.0) if corners == dim + 1 else 0.5)
-
-
-def stress_points(corners: int, dim: int = 2) -> np.ndarray:
-    """Return centre and 2 x 2 (x 2) Gauss points (p, d) of the reference cell."""
-    return np.concatenate([element_centres(corners, dim), gauss_points(corners, 2, dim)[0]])
-
-
-def places_of(mesh: ArmMesh, points: np.ndarray) -> np.ndarray:
+def places_of(operators: ElementTensors, points: np.ndarray) -> np.ndarray:
     """Return where points (p, d) of the reference cell are in every cell (n_cells, p, d), m."""
-    corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
-    element = basix.create_element(basix.ElementFamily.P, KINDS[mesh.dim, corners.shape[1]], 1)
-    return element.tabulate(0, points)[0, :, :, 0] @ corners
+    return corner_functions(operators.cell, points) @ operators.corners
 
 
-def stress_operator(
-    mesh: ArmMesh, operators: ElementOperators, points: np.ndarray
-) -> sp.csr_matrix:
+def stress_operator(operators: ElementTensors, points: np.ndarray) -> sp.csr_matrix:
     """Return the components `VON_MISES` of unit E by nodal values (s n_cells p, d n_nodes), 1/m.
 
     Their number s is 3, in space 5.
 
     Args:
-        mesh, operators: of the arm.
+        operators: of the arm's cells.
         points: (p, d) of the reference cell.
     """
-    components = VON_MISES if mesh.dim == 2 else SOLID_VON_MISES
-    law = components @ elasticity(mesh.dim, operators.poisson_ratio)
-
-    def stress(strain: np.ndarray) -> np.ndarray:
-        found = law @ strain
-        return np.ascontiguousarray(found.reshape(len(found), -1, found.shape[-1]))
-
-    found = by_cells(stress, operators.element.strain_operator(mesh, operators, points))
-    dim, nodes = mesh.dim, operators.cells
+    dim, nodes = operators.cell.dim, operators.cells
     dofs = (dim * nodes[:, :, None] + np.arange(dim)).reshape(len(nodes), -1)
-    kinds, (count, rows, size) = len(components), found.shape
-    values = np.moveaxis(found.reshape(count, len(points), kinds, size), 2, 0)
-    columns = np.broadcast_to(dofs.astype(np.int32)[:, None], values.shape)
+    found = VON_MISES[dim] @ operators.stress(points)  # (1 or n_cells, p, s, dn)
+    kinds, size = found.shape[2:]
+    shape = kinds, len(nodes), len(points), size
+    values = np.broadcast_to(np.moveaxis(found, 2, 0), shape)
+    columns = np.broadcast_to(dofs.astype(np.int32)[:, None], shape)
     starts = np.arange(0, values.size + 1, size)
     return sp.csr_matrix(
-        (values.ravel(), columns.ravel(), starts), (count * rows, dim * len(operators.points))
+        (values.ravel(), columns.ravel(), starts), (len(starts) - 1, operators.points.size)
     )
 
 
@@ -202,7 +170,7 @@ class LoadFields:
 
         In Pa per unit of the columns for an operator times Young's modulus.
         """
-        kinds = len(VON_MISES if self.arm.mesh.dim == 2 else SOLID_VON_MISES)
+        kinds = len(VON_MISES[self.arm.mesh.dim])
         columns = self.columns.reshape(operator.shape[1], -1)
         return (operator @ columns).reshape(kinds, -1, columns.shape[1])
 
@@ -401,8 +369,6 @@ def _factors(c: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray
 # Source: Neves, Rodrigues & Guedes, Struct. Optim. 10 (1995) 71-78; Gao & Ma, Comput. Struct. 157
 # (2015) 142-152; Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 
-TENSOR = {2: [0, 2, 2, 1], 3: [0, 3, 5, 3, 1, 4, 5, 4, 2]}  # places of sigma_ab in `elasticity`'s
-
 
 @dataclass(frozen=True, eq=False)
 class StressedModulus:
@@ -457,23 +423,16 @@ class Prestress:
 
     def matrix(self, instant: int = 0) -> sp.csr_matrix:
         """Return K0 (n_nodes, n_nodes) but for `rotation`, of any direction, N/m; of this rank."""
-        arm, u = self.arm, self.u[:, :, instant]
-        points, cells, dim = arm.substructure.quadrature, arm.operators.cells, arm.mesh.dim
-        count, n = cells.shape
-        D = points.derivatives.reshape(count, -1, dim, n)
-        s = np.einsum("ekj,ej->ek", points.stress, u[cells].reshape(count, -1))
-        s = (s * self.modulus.value[:, None]).reshape(count, D.shape[1], -1)
-        sigma = s[:, :, TENSOR[dim]].reshape(count, -1, dim, dim)
-        elements = D.swapaxes(2, 3) @ (sigma @ D)
-        rows, columns = np.repeat(cells, n, axis=1).ravel(), np.tile(cells, n).ravel()
-        entries = elements.sum(axis=1).ravel()
-        return sp.coo_matrix((entries, (rows, columns)), 2 * (len(u),)).tocsr()
+        u = self.u[:, :, instant : instant + 1]
+        return geometric_matrix(self.arm.substructure.cells, u, self.modulus.value)
 
     def stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (p, q, q) in motions V (n_nodes, d, q) (collective on the arm's ranks)."""
-        tensor, arm = self.arm.substructure.stress_tensor, self.arm
-        own = arm.comm.allreduce(tensor.of(self.u, self.modulus.value, V).stiffness())
+        own = self.arm.comm.allreduce(self._stiffened(V).stiffness())
         return own + self._face.stiffness(self.rotation, V)
+
+    def _stiffened(self, V: np.ndarray) -> StiffenedModes:
+        return StiffenedModes(self.arm.substructure.cells, self.u, self.modulus.value, V)
 
     def gradient(self, V: np.ndarray, by_K0: np.ndarray) -> PrestressGradient:
         """Differentiate a function of K0 in modes V (collective on the arm's ranks).
@@ -483,8 +442,7 @@ class Prestress:
             by_K0: (p, q, q).
         """
         arm, fields = self.arm, self.fields
-        known = arm.substructure.stress_tensor.of(self.u, self.modulus.value, V)
-        by_modes, by_u, direct, _ = known.gradient(by_K0)
+        by_modes, by_u, direct, _ = self._stiffened(V).gradient(by_K0)
         face = self._face.gradient(self.rotation, V, by_K0)
         by_u = by_u + face.by_fields
         through = fields.gradient(self.a, by_u)

@@ -14,6 +14,9 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.parallel import on_root
+from dolfinopt.progress import log
+from dolfinopt.scene.tables.arms import CellShape
 
 # DOLFINx 0.5 logs each JIT compilation through the root logger; a handler set beforehand keeps
 # `logging.basicConfig` from being triggered by the first message.
@@ -21,7 +24,9 @@ logging.getLogger().addHandler(logging.NullHandler())
 for _name in ("UFL", "FFCx"):
     logging.getLogger(_name).setLevel(logging.ERROR)
 
+import basix  # noqa: E402
 import dolfinx  # noqa: E402
+import dolfinx.jit  # noqa: E402
 import ufl  # noqa: E402
 from dolfinx import fem, la  # noqa: E402
 from dolfinx.mesh import GhostMode  # noqa: E402
@@ -53,7 +58,7 @@ def check_form_cache() -> None:
 
 
 @contextmanager
-def _quiet_compilers() -> Iterator[None]:
+def quiet_compilers() -> Iterator[None]:
     """Keep the C compiler's command lines, which setuptools logs, from standard error."""
     before = logging.root.manager.disable
     logging.disable(logging.INFO)
@@ -63,7 +68,7 @@ def _quiet_compilers() -> Iterator[None]:
         logging.disable(before)
 
 
-@_quiet_compilers()
+@quiet_compilers()
 def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]:
     """Distribute the Gmsh model of rank 0 over `comm`; return (mesh, cell tags, facet tags).
 
@@ -83,9 +88,46 @@ def model_to_mesh(model: Any, comm: MPI.Comm, gdim: int) -> tuple[Any, Any, Any]
     return data.mesh, data.cell_tags, data.facet_tags
 
 
-@_quiet_compilers()
+def lagrange_element(shape: str, degree: int, components: int | None = None) -> Any:
+    """Return a Lagrange element of UFL, with components or scalar; constants of degree 0."""
+    if VERSION < (0, 7):
+        family = "Lagrange" if degree else "DG"
+        if components is None:
+            return ufl.FiniteElement(family, shape, degree)
+        # FFCx 0.5 writes this variant into the element of a mesh when it compiles: without it the
+        # signatures of all forms of the mesh would change then, and miss what was compiled before.
+        variant = {"variant": "equispaced"} if degree == 1 else {}
+        return ufl.VectorElement(family, shape, degree, dim=components, **variant)
+    from basix.ufl import element
+
+    size = () if components is None else (components,)
+    return element("P", shape, degree, discontinuous=degree == 0, shape=size)
+
+
+def mixed_element(*parts: Any) -> Any:
+    """Return a mixed element of UFL."""
+    if VERSION < (0, 7):
+        return ufl.MixedElement(*parts)
+    from basix.ufl import mixed_element
+
+    return mixed_element(list(parts))
+
+
 def lagrange_space(mesh: Any, degree: int, components: int = 1) -> Any:
-    """Return the continuous Lagrange space of `degree` with 1 or more components a node."""
+    """Return the continuous Lagrange space of `degree` with 1 or more components a node.
+
+    DOLFINx 0.5 compiles its element; what an interrupted run has left of it is compiled anew.
+    """
+    try:
+        return _lagrange_space(mesh, degree, components)
+    except (RuntimeError, TimeoutError):  # the first on several ranks
+        if not on_root(mesh.comm, _remove_interrupted):
+            raise
+        return _lagrange_space(mesh, degree, components)
+
+
+@quiet_compilers()
+def _lagrange_space(mesh: Any, degree: int, components: int) -> Any:
     if VERSION < (0, 7):
         if components == 1:
             return fem.FunctionSpace(mesh, ("Lagrange", degree))
@@ -93,6 +135,23 @@ def lagrange_space(mesh: Any, degree: int, components: int = 1) -> Any:
     if components == 1:
         return fem.functionspace(mesh, ("Lagrange", degree))
     return fem.functionspace(mesh, ("Lagrange", degree, (components,)))
+
+
+def form_folder() -> Path:
+    """Return DOLFINx's folder for what it compiles."""
+    known = "get_parameters" if VERSION < (0, 6) else "get_options"
+    return Path(getattr(dolfinx.jit, known)()["cache_dir"])
+
+
+def _remove_interrupted() -> bool:
+    """Remove what interrupted compilations left; return whether there was any."""
+    left = [
+        path for path in form_folder().glob("*.c") if not path.with_suffix(".c.cached").exists()
+    ]
+    for path in left:
+        log.info("%s: its compilation was interrupted and is repeated", path)
+        path.unlink(missing_ok=True)
+    return bool(left)
 
 
 def _rows(adjacency: Any, columns: int) -> np.ndarray:
@@ -106,8 +165,10 @@ def cell_nodes(space: Any, num_cells: int) -> np.ndarray:
     return _rows(space.dofmap.list, nodes)[:num_cells].astype(np.int32)
 
 
-# Facets of a cell by its number of corners, in the plane and in space.
-FACETS = {(2, 3): 3, (2, 4): 4, (3, 4): 4, (3, 8): 6}
+def cell_shape(mesh: Any) -> CellShape:
+    """Return "triangle", "quadrilateral", "tetrahedron" or "hexahedron"."""
+    shape: CellShape = mesh.topology.cell_type.name
+    return shape
 
 
 def cell_corner_count(mesh: Any) -> int:
@@ -154,8 +215,8 @@ def cell_facets(mesh: Any, num_cells: int) -> np.ndarray:
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim, dim - 1)
     links = mesh.topology.connectivity(dim, dim - 1)
-    facets = FACETS[dim, cell_corner_count(mesh)]
-    return _rows(links, facets)[:num_cells].astype(np.int32)
+    facets = basix.topology(getattr(basix.CellType, cell_shape(mesh)))[dim - 1]
+    return _rows(links, len(facets))[:num_cells].astype(np.int32)
 
 
 def facets_on(mesh: Any, plane: float, tolerance: float) -> np.ndarray:
@@ -204,48 +265,7 @@ def scatter_reverse_add(function: Any) -> None:
         function.x.scatter_reverse(la.ScatterMode.add)
 
 
-@_quiet_compilers()
+@quiet_compilers()
 def compile_form(form: ufl.Form) -> Any:
     """Compile a UFL form; the JIT cache of DOLFINx keeps it between runs."""
     return fem.form(form)
-
-
-def tabulate_cells(form: Any, constants: list[float], coordinates: np.ndarray) -> np.ndarray:
-    """Evaluate FFCx's cell kernel of a bilinear form on every cell.
-
-    Args:
-        form: compiled bilinear form with one cell integral and no coefficients.
-        constants: values of its `fem.Constant`s in UFL's order.
-        coordinates: (n_cells, points a cell, 3), m.
-
-    Returns:
-        Element matrices (n_cells, dofs a cell, dofs a cell) in the kernel's dof order.
-    """
-    ffi = form.module.ffi if hasattr(form, "module") else _cffi()
-    compiled = form.ufcx_form
-    if hasattr(compiled, "form_integrals"):
-        integral = compiled.form_integrals[compiled.form_integral_offsets[0]]
-    else:
-        integral = compiled.integrals(0)[0]
-    kernel = integral.tabulate_tensor_float64
-    maps = [space.dofmap for space in form.function_spaces]
-    sizes = [one.dof_layout.num_dofs * one.index_map_bs for one in maps]  # dofs of a cell
-    matrices = np.zeros((len(coordinates), sizes[0], sizes[1]))
-    coordinates = np.ascontiguousarray(coordinates, dtype=np.float64)
-    values = np.asarray(constants, dtype=np.float64)
-    none = ffi.NULL
-    tail = [none] if VERSION >= (0, 10) else []  # FFCx 0.10 hands custom data through
-
-    def address(array: np.ndarray) -> Any:
-        return ffi.cast("double *", array.ctypes.data)
-
-    c = address(values)
-    for k in range(len(coordinates)):
-        kernel(address(matrices[k]), none, c, address(coordinates[k]), none, none, *tail)
-    return matrices
-
-
-def _cffi() -> Any:
-    import cffi
-
-    return cffi.FFI()

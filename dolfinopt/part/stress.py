@@ -153,7 +153,7 @@ class CornerStress(PointStress):
         apart = np.einsum("cim,cim->i", by_own, self.own @ columns - (self.A @ columns)[:, at])
         by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area
         young = state.solid.young_modulus
-        operator = young * stress_operator(state.mesh, state.elastic.operators, self.vertices)
+        operator = young * stress_operator(state.elastic.operators, self.vertices)
         by_u = self.fields.stress_transposed(operator, by_own)
         stress = StressProduct(self.vertices, young * by_own, partial(self.fields.displacements, a))
         return by_u, Products(volumes=by_areas, stress=stress)
@@ -177,7 +177,7 @@ def mean_at_corners(
     """
     mesh, fields = state.mesh, fields or state.load_fields
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
-    operator = stress_operator(mesh, state.elastic.operators, vertices)
+    operator = stress_operator(state.elastic.operators, vertices)
     own = fields.stress(state.solid.young_modulus * operator)
     points = mesh.mesh.geometry.x[:, : mesh.dim]
     area = (mesh.area[:, None] * counts).ravel()

@@ -163,7 +163,7 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
     elastic = state.elastic
     shape, young = elastic.substructure.shape_derivative, elastic.young
     stiffness, mass = list(products.stiffness), list(products.mass)
-    by_corners = np.zeros_like(shape.corners)
+    by_corners = np.zeros_like(elastic.operators.corners)
     if products.volumes is not None:
         by_corners += shape.volume(products.volumes)
     geometric = products.geometric

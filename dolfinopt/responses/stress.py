@@ -14,8 +14,8 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.load_gradient import load_counts, load_gradient
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.fem.stress import LoadFields, element_centres
-from dolfinopt.mesh import compat
+from dolfinopt.fem.stress import LoadFields
+from dolfinopt.fem.tensors import element_centre
 from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import STIFFENING, ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_all_ranks, on_root, together
@@ -143,7 +143,7 @@ class CellStress(PointStress):
         by_stress = state.solid.young_modulus * self.root[:, None] * by
         operator = state.elastic.substructure.stress_operator
         by_u = self.fields.stress_transposed(operator, by_stress)
-        centre = element_centres(compat.cell_corner_count(state.mesh.mesh), state.mesh.dim)
+        centre = element_centre(state.elastic.operators.cell)
         by_x = np.divide(0.5 * by_logs, x, out=np.zeros_like(x), where=x > 0.0)
         stress = StressProduct(centre, by_stress, partial(self.fields.displacements, a))
         return by_u, Products(densities=by_x, volumes=by_weights, stress=stress)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.fem.stress import places_of, stress_operator, stress_points
-from dolfinopt.mesh import compat
+from dolfinopt.fem.stress import places_of, stress_operator
+from dolfinopt.fem.tensors import stress_points
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.stress import (
     ArmLoads,
@@ -152,14 +152,15 @@ def _arm_stress(
         by_cell[largest.point], when[largest.point] = largest.largest, largest.instant
     where = state.mesh.centroid
     centre = largest.largest, _shared(partition, where, largest.point), largest.instant
-    mesh = state.mesh
-    points = stress_points(compat.cell_geometry_nodes(mesh.mesh, 0).shape[1], mesh.dim)
-    operator = stress_operator(mesh, state.elastic.operators, points)
+    operators = state.elastic.operators
+    points = stress_points(operators.cell)
+    operator = stress_operator(operators, points)
     A = cells.fields.stress(operator)
     solid = state.solid.young_modulus * cells.root * (cells.weights > 0.0)
     A *= np.repeat(solid, len(points))[:, None]
     largest = screen(comm, A, a, coarse)
-    place = _shared(partition, places_of(mesh, points).reshape(-1, mesh.dim), largest.point)
+    places = places_of(operators, points).reshape(-1, state.mesh.dim)
+    place = _shared(partition, places, largest.point)
     peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant))
     return peaks, np.column_stack([by_cell, when])
 

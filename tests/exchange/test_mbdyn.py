@@ -18,7 +18,7 @@ from dolfinopt.cli import commands
 from dolfinopt.exchange.in_space import in_space, plate_moments
 from dolfinopt.exchange.mbdyn import fem_text, write_fem
 from dolfinopt.exchange.standard_input import load_body, lumped_nodes, modal_element
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.shape_integrals import shape_integrals

@@ -14,11 +14,10 @@ from remainders import substructure
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 
 COMM = MPI.COMM_WORLD
@@ -39,9 +38,7 @@ def plane(cells, height=HEIGHT, poisson=0.0, element="incompatible"):
 
 def solid(element: str, height: float, thickness: float, cells: tuple[int, int, int]) -> ElasticArm:
     mesh = box_arm(MPI.COMM_SELF, "a", (solids.LENGTH, height, thickness), cells)
-    return uniform(
-        Substructure(mesh, ELEMENTS[element].operators(mesh, 1.0, solids.POISSON), Profile())
-    )
+    return uniform(Substructure(solids.tensors_of(mesh, element)))
 
 
 class Beam(NamedTuple):

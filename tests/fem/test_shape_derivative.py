@@ -7,13 +7,13 @@ import pytest
 from dolfinx.mesh import CellType, create_rectangle
 from moved_nodes import noise, with_moves
 from mpi4py import MPI
-from solids import link_mesh
+from solids import link_mesh, tensors_of
 
-from dolfinopt.fem.assembly import StressTensor, cells_of
-from dolfinopt.fem.elements import ELEMENTS, quadrature
+from dolfinopt.fem.assembly import Cells, StiffenedModes
 from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
 from dolfinopt.fem.shape_derivative import ShapeDerivative
-from dolfinopt.fem.stress import stress_operator, stress_points
+from dolfinopt.fem.stress import stress_operator
+from dolfinopt.fem.tensors import stress_points
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.checks import cell_areas
@@ -59,13 +59,11 @@ def mesh_of(shape: str, h: float) -> ArmMesh:
 def functions(shape: str, element: str, h: float, weights: dict) -> dict[str, float]:
     """Return what cells of a moved mesh add up to, with random weights."""
     mesh = mesh_of(shape, h)
-    operators = ELEMENTS[element].operators(mesh, 0.01 if mesh.dim == 2 else 1.0, 0.3)
-    cells = cells_of(mesh.comm, operators)
+    operators = tensors_of(mesh, element, 0.01 if mesh.dim == 2 else 1.0, 0.3)
+    cells = Cells(operators)
     u, v, e = weights["u"], weights["v"], weights["e"]
-    one = quadrature(mesh, operators)
-    K0 = StressTensor(cells, one.derivatives, one.stress).of(u, e, v).stiffness()
-    points = stress_points(compat.cell_corner_count(mesh.mesh), mesh.dim)
-    operator = stress_operator(mesh, operators, points)
+    K0 = StiffenedModes(cells, u, e, v).stiffness()
+    operator = stress_operator(operators, stress_points(operators.cell))
     s = 3 if mesh.dim == 2 else 5
     stress = operator @ u.reshape(operator.shape[1], -1)
     return {
@@ -82,16 +80,16 @@ def functions(shape: str, element: str, h: float, weights: dict) -> dict[str, fl
 def test_derivatives_of_cells(shape: str, element: str) -> None:
     """Of uneven cells, random fields: central differences leave their square, 1e-8."""
     mesh, rng = mesh_of(shape, 0.0), np.random.default_rng(3)
-    operators = ELEMENTS[element].operators(mesh, 0.01 if mesh.dim == 2 else 1.0, 0.3)
+    operators = tensors_of(mesh, element, 0.01 if mesh.dim == 2 else 1.0, 0.3)
     n, count, d, k = len(operators.points), mesh.num_cells, mesh.dim, 2
-    points = stress_points(compat.cell_corner_count(mesh.mesh), d)
+    points = stress_points(operators.cell)
     u, v = rng.normal(size=(2, n, d, k))
     weights = {
         "u": u, "v": v, "e": rng.uniform(1.0, 2.0, count), "K0": rng.normal(size=(k, k, k)),
         "s": rng.normal(size=(3 if d == 2 else 5, count * len(points), k)),
         "x": rng.normal(size=(n, d)),
     }  # fmt: skip
-    shape_of = ShapeDerivative(mesh, cells_of(mesh.comm, operators))
+    shape_of = ShapeDerivative(operators)
     e = weights["e"]
     found = {
         "stiffness": shape_of.stiffness(u, v, e),

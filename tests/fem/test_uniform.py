@@ -7,14 +7,14 @@ import copy
 import numpy as np
 import pytest
 from mpi4py import MPI
+from solids import tensors_of
 
 from dolfinopt.fem import assembly
-from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs, StressTensor
+from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.profiling import Profile
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, CELLS = 1.0, 0.06, (30, 5)
@@ -26,7 +26,7 @@ def make_arm(element: str, shift: float = 0.0) -> ElasticArm:
     points = mesh.mesh.geometry.x
     away = np.sin(1e4 * points[:, 0] + 7e4 * points[:, 1])  # the same on all ranks
     points[:, 0] += shift * LENGTH / CELLS[0] * away * (points[:, 0] % LENGTH > 1e-9)
-    sub = Substructure(mesh, ELEMENTS[element].operators(mesh, 0.01, 0.33), Profile())
+    sub = Substructure(tensors_of(mesh, element, 0.01, 0.33))
     x, y = mesh.centroid.T
     wave = 0.6 + 0.3 * np.sin(40.0 * x) * np.cos(90.0 * y)
     return sub.at(70e9 * wave**3, 2700.0 * wave)
@@ -36,9 +36,11 @@ def cell_by_cell(arm: ElasticArm) -> ElasticArm:
     """Return the same arm, its cells told apart."""
     other = copy.copy(arm)
     own = other.substructure = copy.copy(arm.substructure)
-    operators, quadrature = arm.operators, own.quadrature
-    own.cells = Cells(operators, operators.stiffness.copy(), operators.mass.copy())
-    own.stress_tensor = StressTensor(own.cells, quadrature.derivatives, quadrature.stress)
+    other.operators = own.operators = copy.copy(arm.operators)
+    for name in ("stiffness", "mass", "geometric"):
+        tensor = getattr(arm.operators, name)
+        setattr(own.operators, name, np.repeat(tensor, arm.mesh.num_cells, axis=0))
+    own.cells = Cells(own.operators)
     return other
 
 
@@ -79,7 +81,7 @@ def test_one_tensor_for_all_cells(monkeypatch, element, static) -> None:
     monkeypatch.setattr(assembly, "STRESS_CHUNK_CELLS", 7)
     arm = make_arm(element)
     other = cell_by_cell(arm)
-    assert len(arm.substructure.stress_tensor.tensor) == 1
+    assert len(arm.operators.geometric) == 1
     V = np.concatenate([arm.constraint_modes().field, fields(arm, 1.0, 2)], axis=2)
     loads, others = unit_loads(arm), unit_loads(other)
     K0, expected = loads.geometric_stiffness(V), others.geometric_stiffness(V)
@@ -102,7 +104,7 @@ def test_cells_that_are_not_alike() -> None:
     arm = make_arm("linear", 1e-3)
     count = arm.mesh.num_cells
     assert len(arm.substructure.cells.stiffness) == count
-    assert len(arm.substructure.stress_tensor.tensor) == count
+    assert len(arm.operators.geometric) == count
     assert len(make_arm("linear", 1e-13).substructure.cells.stiffness) == 1
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import TWO_ARM
+from solids import tensors_of
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem.elasticity import Substructure
-from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.optimization import gradient_check
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
@@ -106,8 +106,7 @@ def substructure(
     mesh = box_arm(comm, "arm", size[:2], cells)
     if skew:
         mesh.mesh.geometry.x[:, :2] += bulge(mesh.mesh.geometry.x[:, :2], size[0], size[1])
-    operators = ELEMENTS[element].operators(mesh, size[2], poisson_ratio)
-    return Substructure(mesh, operators, do.Profile())
+    return Substructure(tensors_of(mesh, element, size[2], poisson_ratio))
 
 
 def bulge(points: np.ndarray, length: float, height: float) -> np.ndarray:
@@ -122,11 +121,15 @@ def dense_matrices(elastic, young, density) -> tuple[np.ndarray, np.ndarray]:
     operators = elastic.operators
     points, size = operators.points, len(operators.points)
     K, M = np.zeros((2, 2 * size, 2 * size))
+    stiffness, mass = (
+        np.broadcast_to(one, (len(operators.cells), *one.shape[1:]))
+        for one in (operators.stiffness, operators.mass)
+    )
     for e, cell in enumerate(operators.cells):
         dofs = (2 * cell[:, None] + [0, 1]).ravel()
-        K[np.ix_(dofs, dofs)] += young[e] * operators.stiffness[e]
+        K[np.ix_(dofs, dofs)] += young[e] * stiffness[e]
         for c in (0, 1):
-            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * operators.mass[e]
+            M[np.ix_(dofs[c::2], dofs[c::2])] += density[e] * mass[e]
     length = elastic.mesh.outboard_point[0]
     clamped, end = np.isclose(points[:, 0], 0.0), np.isclose(points[:, 0], length)
     inner = np.flatnonzero(~(clamped | end))

@@ -11,7 +11,8 @@ from scipy.sparse import csr_matrix, lil_matrix
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.laws import isotropic
+from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_volumes
@@ -112,9 +113,17 @@ def rigid_tip(basis: Any, length: float) -> csr_matrix:
     return T.tocsr()
 
 
+def tensors_of(
+    mesh: ArmMesh, element: str, thickness: float = 1.0, poisson_ratio: float = POISSON
+) -> ElementTensors:
+    """Return the tensors of a mesh's cells of isotropic material."""
+    law = isotropic(mesh.dim, poisson_ratio)
+    return ElementTensors(mesh, element, thickness, law, Profile())
+
+
 def elastic_link(name: str, mesh: ArmMesh) -> ElasticArm:
     """Return the solid link made of an element."""
-    substructure = Substructure(mesh, ELEMENTS[name].operators(mesh, 1.0, POISSON), Profile())
+    substructure = Substructure(tensors_of(mesh, name))
     ones = np.ones(mesh.num_cells)
     return substructure.at(YOUNG * ones, DENSITY * ones)
 

@@ -10,7 +10,7 @@ from remainders import built_of
 from runs import TWO_ARM, by_root, contents, summary_of
 
 import dolfinopt as do
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.output import run_folder as results
 from dolfinopt.output.design import gather_views
 from dolfinopt.output.run_folder import Simulated, write_result, write_simulation

@@ -8,13 +8,11 @@ import scipy.linalg
 from mpi4py import MPI
 from remainders import built_of
 from runs import ROOT
-from solids import DENSITY, HEIGHT, LENGTH, POISSON, THICKNESS, YOUNG
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, YOUNG, tensors_of
 
 import dolfinopt as do
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.elements import ELEMENTS
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis, Options, frame_fields
 
 pytestmark = pytest.mark.serial  # ranks: tests/arms/test_solid_arm.py
@@ -26,9 +24,8 @@ class Full:
 
     def __init__(self) -> None:
         mesh = box_arm(MPI.COMM_SELF, "a", (LENGTH, HEIGHT, THICKNESS), (6, 2, 2))
-        operators = ELEMENTS["incompatible"].operators(mesh, 1.0, POISSON)
         x = 0.6 + 0.35 * np.sin(mesh.centroid @ [9.0, 170.0, 260.0])
-        self.arm = Substructure(mesh, operators, Profile()).at(YOUNG * x**3, DENSITY * x)
+        self.arm = Substructure(tensors_of(mesh, "incompatible")).at(YOUNG * x**3, DENSITY * x)
         unit = np.eye(self.arm.num_dofs)
         T = self.arm.expand(unit[:-6], unit[-6:])
         self.K = np.vstack(self.arm.restrict(self.arm.stiffness_times(T)))

@@ -21,7 +21,7 @@ from runs import by_root, minimising
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.fem.elements import ELEMENTS
+from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.responses.evaluation import gradient

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import basix
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -76,16 +77,20 @@ def all_loads(arm, body, rates_at, outboard, n):
 
 def geometric_matrix(arm, c):
     """Return sum_p p K0_p of all nodal displacements, assembled from the loads' stress."""
-    # Of the loads -p = c of frame, outboard interface and modes at one instant.
+    # Of the loads -p = c of frame, outboard interface and modes at one instant; 3 x 3 Gauss points.
     elastic, loads = arm.current.elastic, arm.current.stiffening_loads
     frame, outboard, modes = np.split(-c[: 7 + arm.coordinates], [4, 7])
     p = np.concatenate([frame, modes, outboard])
-    quadrature = elastic.substructure.quadrature
-    count, n = elastic.operators.cells.shape
-    values = (loads.fields @ p)[elastic.operators.cells].reshape(count, -1, 1)
-    stress = elastic.young[:, None, None] * (quadrature.stress @ values)
-    xx, yy, xy = np.moveaxis(stress.reshape(count, -1, 3), 2, 0)
-    D = quadrature.derivatives.reshape(count, -1, 2, n)
+    operators, corners = elastic.operators, elastic.operators.corners
+    points, weights = basix.make_quadrature(basix.CellType.quadrilateral, 4)
+    count = len(operators.cells)
+    values = (loads.fields @ p)[operators.cells].reshape(count, 1, -1, 1)
+    stress = elastic.young[:, None, None] * (operators.stress(points) @ values)[..., 0]
+    Q1 = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 1)
+    local = np.moveaxis(Q1.tabulate(1, points)[1:, :, :, 0], 0, 2)
+    J = np.einsum("eni,pnk->epik", corners, local)
+    xx, yy, xy = np.moveaxis(stress, 2, 0) * weights * np.linalg.det(J) * operators.thickness
+    D = (local @ np.linalg.inv(J)).swapaxes(2, 3)
     tensor = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
     blocks = np.einsum("epai,epab,epbj->eij", D, tensor, D)
     rows, columns = (np.broadcast_to(x, blocks.shape).ravel() for x in (
@@ -411,10 +416,10 @@ def turned(arm: dict[str, Any], speed: float, duration: float, damping: float):
 def stress_at(arm: Arm, trajectory: Trajectory, points: np.ndarray, sample: int):
     """Return places (k, 2), m, and stress (k,), Pa, at points of the reference cell."""
     state = arm.current
-    operator = stress_operator(arm.mesh, state.elastic.operators, points)
+    operator = stress_operator(state.elastic.operators, points)
     A = state.load_fields.stress(YOUNG * operator)
     [loads] = arm_loads(arm.scene, [trajectory])[0]
-    places = places_of(arm.mesh, points).reshape(-1, 2)
+    places = places_of(state.elastic.operators, points).reshape(-1, 2)
     return places, np.linalg.norm(A @ loads.coefficients[sample], axis=0)
 
 

@@ -1,0 +1,232 @@
+"""The finite elements of an arm as UFL forms; d directions, n nodes a cell.
+
+    stiffness            int B' C B
+    mass                 int N_a N_b, of one component: the moments of inertia, too
+    geometric stiffness  int sigma(u)_ab d_a p d_b w
+    stress               C eps(u) at points of the reference cell
+
+`Cell` is a shape with an element on it; functions make forms of a `Cell`. `tensors` runs their
+kernels on the cells of an arm. All are of unit thickness, Young's modulus and density: these weigh
+the cells' tensors, or are the coefficient `weight`.
+
+Displacements are those of the nodes, and behind them the amplitudes of incompatible modes, which
+are constants of a cell: one mixed element, so that every form is written once. `tensors` condenses
+the amplitudes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import ufl
+
+from dolfinopt.fem.laws import SHEARS
+from dolfinopt.mesh.compat import lagrange_element, mixed_element
+
+ELEMENTS = "incompatible", "linear", "quadratic"
+DIMENSIONS = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 3, "hexahedron": 3}
+# Where stresses are in their tensor.
+ROWS = {2: [[0, 2], [2, 1]], 3: [[0, 3, 5], [3, 1, 4], [5, 4, 2]]}
+
+
+class Cell:
+    """A shape of cells with straight sides and an element on it, for forms on any mesh of them.
+
+    UFL knows reference coordinates and corners, but the first do not compile on quadrilaterals and
+    hexahedra, and derivatives by places take the second for constants. Here they are coefficients.
+
+    Attributes:
+        shape, element: their names, see `DIMENSIONS` and `ELEMENTS`.
+        dim: d.
+        degree: of the nodes' functions.
+        is_simplex: whether the cell is a triangle or a tetrahedron.
+        mesh, x, J: of UFL; places, and their derivatives in the reference cell.
+        xi: reference coordinates: its values are the reference corners.
+        corners: places of the corners, one behind the other, as constants of a cell.
+        weight: of a cell.
+        C: the law, see `laws`.
+        nodal, scalar: spaces of the nodes' displacements, and of one component.
+        modes: gradients of the incompatible modes; none of other elements.
+        displacement: the space of nodes' displacements and modes' amplitudes.
+        u, v, p, w, tau: coefficients: displacements u and v, nodal vectors p and w, stresses of a
+            cell tau.
+    """
+
+    def __init__(self, shape: str, element: str):
+        self.shape, self.element, self.dim = shape, element, DIMENSIONS[shape]
+        self.is_simplex = shape in ("triangle", "tetrahedron")
+        self.degree = 2 if element == "quadratic" else 1
+        d = self.dim
+        self.num_corners = d + 1 if self.is_simplex else 2**d
+        self.mesh = ufl.Mesh(lagrange_element(shape, 1, d))
+        self.x, self.J = ufl.SpatialCoordinate(self.mesh), ufl.Jacobian(self.mesh)
+        self.linear = self._space(lagrange_element(shape, 1, d))
+        self.constants = self._space(lagrange_element(shape, 0, self.num_corners * d))
+        # Numbered below 10: FFCx 0.5 gives the others names that C does not know.
+        self.xi = ufl.Coefficient(self.linear, count=0)
+        self.corners = ufl.Coefficient(self.constants, count=1)
+        self.weight = ufl.Coefficient(self._space(lagrange_element(shape, 0)), count=2)
+        kinds = d + len(SHEARS[d])
+        self.C = ufl.Constant(self.mesh, shape=(kinds, kinds))
+        self.scalar = self._space(lagrange_element(shape, self.degree))
+        self.nodal = self.displacement = self._space(lagrange_element(shape, self.degree, d))
+        self.modes = incompatible_modes(self) if element == "incompatible" else []
+        if self.modes:
+            amplitudes = lagrange_element(shape, 0, len(self.modes))
+            nodal = lagrange_element(shape, self.degree, d)
+            self.displacement = self._space(mixed_element(nodal, amplitudes))
+        stresses = self._space(lagrange_element(shape, 0, kinds))
+        spaces = self.displacement, self.displacement, self.nodal, self.nodal, stresses
+        self.u, self.v, self.p, self.w, self.tau = (
+            ufl.Coefficient(space, count=3 + k) for k, space in enumerate(spaces)
+        )
+
+    def _space(self, element: Any) -> Any:
+        return ufl.FunctionSpace(self.mesh, element)
+
+    def dx(self, degree: int, simplex_degree: int) -> ufl.Measure:
+        """Return the measure that is exact to a degree; on quadrilaterals in every direction."""
+        return ufl.dx(self.mesh, degree=simplex_degree if self.is_simplex else degree)
+
+    def gradient(self, u: Any) -> Any:
+        """Return d_b u_a of a displacement, modes included."""
+        if not self.modes:
+            return ufl.grad(u)
+        nodal, amplitudes = ufl.split(u)
+        return sum((amplitudes[k] * mode for k, mode in enumerate(self.modes)), ufl.grad(nodal))
+
+    def strain(self, u: Any) -> Any:
+        """Return the strains of a displacement, see `laws`."""
+        H = self.gradient(u)
+        shears = [H[i, j] + H[j, i] for i, j in SHEARS[self.dim]]
+        return ufl.as_vector([H[k, k] for k in range(self.dim)] + shears)
+
+    def stress(self, u: Any) -> Any:
+        """Return the stresses of a displacement, see `laws`."""
+        return ufl.dot(self.C, self.strain(u))
+
+    def stress_tensor(self, u: Any) -> Any:
+        """Return sigma_ab of a displacement."""
+        s = self.stress(u)
+        return ufl.as_matrix([[s[k] for k in row] for row in ROWS[self.dim]])
+
+
+def incompatible_modes(cell: Cell) -> list[Any]:
+    """Return the gradients of (1 - x_k^2) / 4 in every component, x in [-1, 1]^d: QM6.
+
+    They let a cell bend without shear. Mapped by the Jacobian J_0 of the centre and scaled by
+    det J_0 / det J, so that their mean over a cell of any shape is zero and constant strain does
+    not excite them (the patch test). They carry no mass.
+
+    Source: Taylor, Beresford & Wilson, Int. J. Numer. Methods Eng. 10 (1976) 1211-1219,
+    doi:10.1002/nme.1620100602.
+    """
+    J0, ratio = centre(cell)
+    inverse = ufl.inv(J0)
+    return [
+        ratio * (1.0 - 2.0 * cell.xi[k]) * ufl.outer(ufl.as_vector(way), inverse[k, :])
+        for k in range(cell.dim)
+        for way in np.eye(cell.dim)
+    ]
+
+
+def centre(cell: Cell) -> tuple[Any, Any]:
+    """Return the Jacobian J_0 at the centre of a quadrilateral or hexahedron, det J_0 / det J."""
+    d, n = cell.dim, cell.num_corners
+    signs = 2.0 * np.indices((2,) * d).reshape(d, -1)[::-1] - 1.0  # of the reference corners
+    x = cell.corners
+    rows = [[sum(s[k] * x[d * k + i] for k in range(n)) for s in signs] for i in range(d)]
+    J0 = ufl.as_matrix(rows) / 2 ** (d - 1)
+    return J0, ufl.det(J0) / ufl.det(cell.J)
+
+
+# -- measures: Gauss points that are exact on parallelepipeds and simplices --------------------
+
+
+def dx_stiffness(cell: Cell) -> ufl.Measure:
+    """Return that of a product of two gradients: degree + 1 Gauss points a direction."""
+    # Quadrilaterals without modes have had one more.
+    more = 2 if cell.shape == "quadrilateral" and not cell.modes else 0
+    return cell.dx(2 * cell.degree + more, 2 * (cell.degree - 1))
+
+
+def dx_mass(cell: Cell) -> ufl.Measure:
+    """Return that of a product of two functions."""
+    return cell.dx(2 * cell.degree + 2, 2 * cell.degree)
+
+
+def dx_geometric(cell: Cell) -> ufl.Measure:
+    """Return that of a product of three gradients."""
+    return cell.dx(2 * (3 * cell.degree // 2), 3 * (cell.degree - 1))
+
+
+# -- tensors of a cell --------------------------------------------------------------------------
+
+
+def stiffness(cell: Cell) -> ufl.Form:
+    """Return int sigma(u) : eps(v)."""
+    u, v = ufl.TrialFunction(cell.displacement), ufl.TestFunction(cell.displacement)
+    return ufl.inner(cell.stress(u), cell.strain(v)) * dx_stiffness(cell)
+
+
+def mass(cell: Cell) -> ufl.Form:
+    """Return int p w of one component."""
+    return ufl.TrialFunction(cell.scalar) * ufl.TestFunction(cell.scalar) * dx_mass(cell)
+
+
+def geometric_stiffness(cell: Cell) -> ufl.Form:
+    """Return int sigma(u)_ab d_a p d_b w, trilinear, u last."""
+    spaces = cell.scalar, cell.scalar, cell.displacement
+    p, w, u = (ufl.Argument(space, k) for k, space in enumerate(spaces))
+    return ufl.inner(cell.stress_tensor(u) * ufl.grad(p), ufl.grad(w)) * dx_geometric(cell)
+
+
+def stress_at(cell: Cell, points: np.ndarray) -> tuple[Any, np.ndarray]:
+    """Return the stress by displacements at points (p, d) of the reference cell."""
+    return cell.stress(ufl.TrialFunction(cell.displacement)), points
+
+
+# -- functionals of fields, which are differentiated by the corners' places -----------------------
+
+
+def volume(cell: Cell) -> ufl.Form:
+    """Return the weighted volume, in the plane area."""
+    return cell.weight * cell.dx(2, 0)
+
+
+def stiffness_product(cell: Cell) -> ufl.Form:
+    """Return the weighted int sigma(u) : eps(v)."""
+    return cell.weight * ufl.inner(cell.stress(cell.u), cell.strain(cell.v)) * dx_stiffness(cell)
+
+
+def mass_product(cell: Cell) -> ufl.Form:
+    """Return the weighted int p . w."""
+    return cell.weight * ufl.inner(cell.p, cell.w) * dx_mass(cell)
+
+
+def geometric_product(cell: Cell) -> ufl.Form:
+    """Return the weighted int sigma(u)_ab d_a p . d_b w."""
+    both = ufl.dot(ufl.transpose(ufl.grad(cell.p)), ufl.grad(cell.w))
+    return cell.weight * ufl.inner(cell.stress_tensor(cell.u), both) * dx_geometric(cell)
+
+
+def stress_component(cell: Cell, *point: float) -> ufl.Form:
+    """Return sigma(u) . tau at a point (d,) of the reference cell, tau as stresses are."""
+    rule = {"quadrature_rule": "custom", "quadrature_degree": 1, "quadrature_weights": np.ones(1)}
+    dx = ufl.dx(cell.mesh, metadata={**rule, "quadrature_points": np.array([point])})
+    return ufl.inner(cell.stress(cell.u), cell.tau) / abs(ufl.det(cell.J)) * dx
+
+
+def by_corners(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
+    """Return forms whose sum is the derivative by the corners (c d,), fields held in the cell."""
+    forms = [ufl.derivative(functional, cell.x, ufl.TestFunction(cell.linear))]
+    if cell.corners in functional.coefficients():
+        moved = ufl.TestFunction(cell.constants)
+        forms.append(ufl.derivative(functional, cell.corners, moved))
+    return forms
+
+
+def by_displacement(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
+    """Return the derivative of a functional by u, as a list of one."""
+    return [ufl.derivative(functional, cell.u, ufl.TestFunction(cell.displacement))]

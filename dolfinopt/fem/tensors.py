@@ -1,0 +1,229 @@
+"""Tensors of the cells of one arm: the kernels of `forms`, run once where all cells are alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from copy import copy
+from functools import cached_property
+from typing import Any
+
+import basix
+import numpy as np
+import ufl
+from mpi4py import MPI
+
+from dolfinopt.errors import InputError
+from dolfinopt.fem import forms
+from dolfinopt.fem.kernels import Expression, Kernel, Values, compile_kernels
+from dolfinopt.fem.measured import ALIKE_CELLS_ERROR, KERNEL_CHUNK_ENTRIES
+from dolfinopt.mesh import compat
+from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.parallel import together
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT, SIMPLICES
+
+
+class ElementTensors:
+    """Tensors of the cells of one rank, for unit Young's modulus and mass density; n nodes a cell.
+
+    d is 2 in plane stress and 3 in space, where the thickness is 1 and volumes take the place of
+    areas. Arrays by cells have length 1 where the cells of all ranks are alike.
+
+    Attributes:
+        mesh: the arm.
+        cell: shape and element.
+        space: vector-valued Lagrange space, its block dofs number the nodes.
+        cells: (n_cells, n) local nodes of the owned cells, corners first.
+        points: (n_nodes, d) reference positions, m.
+        corners: (n_cells, c, d) of the owned cells, m.
+        thickness: t, m.
+        law: C, see `laws`.
+        stiffness: (1 or n_cells, dn, dn) m, thickness included; times E0 gives N/m.
+        mass: (1 or n_cells, n, n) of one displacement component, m3; times rho0 gives kg.
+        modal: (1 or n_cells, m, m) stiffness of the m incompatible modes, without thickness.
+        recovery: (1 or n_cells, m, dn) their amplitudes by the nodal displacements.
+    """
+
+    def __init__(
+        self, mesh: ArmMesh, element: str, thickness: float, law: np.ndarray, profile: Profile
+    ):
+        """Compile the forms; compute stiffness and mass (collective on the arm's ranks).
+
+        Args:
+            mesh: the arm.
+            element: one of `forms.ELEMENTS` that these cells have, see `element_of`.
+            thickness: t, m; 1 in space.
+            law: C of unit Young's modulus.
+            profile: of this rank, which counts the forms.
+        """
+        self.thickness, self.law, self.profile = thickness, law, profile
+        self.cell = cell = forms.Cell(compat.cell_shape(mesh.mesh), element)
+        self.space = compat.lagrange_space(mesh.mesh, cell.degree, components=mesh.dim)
+        self.cells = compat.cell_nodes(self.space, mesh.num_cells)
+        points = self.space.tabulate_dof_coordinates()[:, : mesh.dim].copy()
+        with together(mesh.comm):
+            self._known = self._compiled()
+        self._place(mesh, points)
+
+    def _compiled(self) -> dict[Hashable, list[Kernel]]:
+        """Return the kernels of every run, which are compiled together."""
+        cell, points = self.cell, stress_points(self.cell)
+        made: dict[Hashable, ufl.Form | Expression] = {
+            "stiffness": forms.stiffness(cell),
+            "mass": forms.mass(cell),
+            "geometric stiffness": forms.geometric_stiffness(cell),
+        }
+        made |= {at.tobytes(): forms.stress_at(cell, at) for at in (points[:1], points)}
+        kernels = self._counted(compile_kernels([*made.values()]))
+        return {key: [kernel] for key, kernel in zip(made, kernels, strict=True)}
+
+    def kernels(
+        self, key: Hashable, make: Callable[[], Sequence[ufl.Form | Expression]]
+    ) -> list[Kernel]:
+        """Return the kernels of forms; they are made and compiled when first asked for."""
+        if key not in self._known:
+            self._known[key] = self._counted(compile_kernels(make()))
+        return self._known[key]
+
+    def _counted(self, kernels: list[Kernel]) -> list[Kernel]:
+        self.profile.counts.forms += len(kernels)
+        return kernels
+
+    def moved(self, mesh: ArmMesh, points: np.ndarray) -> ElementTensors:
+        """Return those of the same cells with their corners elsewhere (collective).
+
+        Args:
+            mesh: `ArmMesh.moved`.
+            points: (n_nodes, d) of the elements' nodes, m.
+        """
+        other = copy(self)
+        other.__dict__.pop("geometric", None)
+        other._place(mesh, points)
+        return other
+
+    def _place(self, mesh: ArmMesh, points: np.ndarray) -> None:
+        """Compute stiffness and mass of cells whose corners are where the mesh has them."""
+        self.mesh, self.points = mesh, points
+        coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
+        alike = single(mesh.comm, coordinates - coordinates.mean(axis=1, keepdims=True))
+        self._coordinates = coordinates if alike is None else alike[None]
+        self.corners = coordinates[:, :, : mesh.dim]
+        n = mesh.dim * self.cells.shape[1]
+        parts = [condensed(k, n) for k in self._tabulated(self._known["stiffness"])]
+        k, self.recovery, self.modal = map(np.concatenate, zip(*parts, strict=True))
+        self.stiffness = self.thickness * k
+        self.mass = self.thickness * np.concatenate([*self._tabulated(self._known["mass"])])
+
+    def _tabulated(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
+        """Yield the tensors of runs of cells, so that not all are in memory at once."""
+        [kernel] = kernels
+        step = max(1, KERNEL_CHUNK_ENTRIES // int(np.prod(kernel.shape)))
+        for first in range(0, max(1, len(self._coordinates)), step):
+            part = self._coordinates[first : first + step]
+            yield kernel(part, geometry(self.cell, part, self.law))
+
+    def _recovered(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
+        """Yield tensors (cells, ..., dn) by displacements, the modes' part included."""
+        first = 0
+        for tensor in self._tabulated(kernels):
+            recovery = self.recovery[first : first + len(tensor)]
+            rows, n = tensor.reshape(len(tensor), -1, tensor.shape[-1]), recovery.shape[2]
+            rows = rows[:, :, :n] + rows[:, :, n:] @ recovery
+            yield rows.reshape(*tensor.shape[:-1], n)
+            first += len(tensor)
+
+    def stress(self, points: np.ndarray) -> np.ndarray:
+        """Return the stresses (1 or n_cells, p, s, dn) by displacements, 1/m, at points (p, d)."""
+        kernels = self.kernels(points.tobytes(), lambda: [forms.stress_at(self.cell, points)])
+        stress = np.concatenate([*self._recovered(kernels)])
+        return stress.reshape(len(stress), len(points), -1, stress.shape[-1])
+
+    @cached_property
+    def geometric(self) -> np.ndarray:
+        """T (1 or n_cells, r (r + 1) / 2, d r), see `assembly.StiffenedModes`, thickness included."""
+        d, n = self.cell.dim, self.cells.shape[1]
+        b, c = np.triu_indices(n - 1)
+        twice = self.thickness * np.where(b == c, 1.0, 2.0)[:, None]
+        tensors = self._recovered(self._known["geometric stiffness"])
+        return np.concatenate([twice * T[:, b + 1, c + 1, d:] for T in tensors])
+
+
+def element_of(mesh: ArmMesh, name: str | None) -> str:
+    """Return the element called `name`, or the default of the mesh's cells where it is None.
+
+    Raises:
+        InputError: there is no such element of these cells; the same on all ranks.
+    """
+    shape = compat.cell_shape(mesh.mesh)
+    name = name or DEFAULT_ELEMENT[shape]
+    if name == "incompatible" and shape in SIMPLICES:
+        cells = {"triangle": "triangles", "tetrahedron": "tetrahedra"}[shape]
+        raise InputError(
+            f'arms.{mesh.name}.element = "incompatible": expected "linear" or "quadratic", the '
+            f"mesh has {cells}"
+        )
+    return name
+
+
+def single(comm: MPI.Comm, arrays: np.ndarray) -> np.ndarray | None:
+    """Return the mean of all ranks' arrays (n_cells, ...) that are the same but for rounding.
+
+    Or None; collective. One of them and the mean difference from it: the rounding of a sum over
+    all cells would resist motions of a rigid cell with up to 1e-11 of its stiffness.
+    """
+    count = comm.allreduce(len(arrays))
+    if count == 0:
+        return None
+    some = comm.allgather(arrays[0].copy() if len(arrays) else None)
+    first = next(one for one in some if one is not None)
+    mean = first + comm.allreduce((arrays - first).sum(axis=0)) / count
+    error = comm.allreduce(np.abs(arrays - mean).max(initial=0.0), op=MPI.MAX)
+    return mean if error <= ALIKE_CELLS_ERROR * np.abs(mean).max() else None
+
+
+def condensed(k: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return k_e (n_cells, n, n) with the modes at rest, their recovery and their own stiffness.
+
+    k_e = k_uu - k_ua k_aa^-1 k_au, made symmetric, of n displacements and the amplitudes behind.
+    """
+    recovery = -np.linalg.solve(k[:, n:, n:], k[:, n:, :n])
+    stiffness = k[:, :n, :n] + k[:, :n, n:] @ recovery
+    return 0.5 * (stiffness + stiffness.swapaxes(1, 2)), recovery, k[:, n:, n:]
+
+
+def geometry(cell: forms.Cell, coordinates: np.ndarray, law: np.ndarray) -> Values:
+    """Return what every kernel takes, of cells with corners (n_cells, c, 3), m."""
+    corners = coordinates[:, :, : cell.dim].reshape(len(coordinates), -1)
+    return {cell.C: law, cell.corners: corners, cell.xi: reference_corners(cell).reshape(1, -1)}
+
+
+def reference_corners(cell: forms.Cell) -> np.ndarray:
+    """Return the corners (c, d) of the reference cell."""
+    return np.asarray(basix.geometry(getattr(basix.CellType, cell.shape)))
+
+
+def element_centre(cell: forms.Cell) -> np.ndarray:
+    """Return the centre (1, d) of the reference cell."""
+    return reference_corners(cell).mean(axis=0, keepdims=True)
+
+
+def stress_points(cell: forms.Cell) -> np.ndarray:
+    """Return centre and 2 x 2 (x 2) Gauss points (p, d) of the reference cell."""
+    gauss, _ = basix.make_quadrature(getattr(basix.CellType, cell.shape), 2)
+    return np.concatenate([element_centre(cell), gauss])
+
+
+def corner_functions(cell: forms.Cell, points: np.ndarray) -> np.ndarray:
+    """Return the linear functions (p, c) of the corners at points (p, d) of the reference cell."""
+    return np.asarray(_lagrange(cell, 1).tabulate(0, points)[0, :, :, 0])
+
+
+def node_places(cell: forms.Cell) -> np.ndarray:
+    """Return the element's nodes (n, d) in the reference cell."""
+    return np.asarray(_lagrange(cell, cell.degree).points)
+
+
+def _lagrange(cell: forms.Cell, degree: int) -> Any:
+    kind = getattr(basix.CellType, cell.shape)
+    variant = basix.LagrangeVariant.gll_warped
+    return basix.create_element(basix.ElementFamily.P, kind, degree, variant)
