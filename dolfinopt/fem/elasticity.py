@@ -321,13 +321,14 @@ class ElasticArm:
         Raises:
             ConvergenceError: K_II is singular but for rounding.
         """
-        loaded = self.comm.allreduce(right.any(axis=0), op=MPI.LOR)
+        loaded = self.comm.allreduce(right.any(axis=0), op=np.logical_or)
+        interior = self.substructure.interior
+        if loaded.all():
+            return interior.solve(self.K, right, tolerance, held)
         out = np.zeros_like(right)
         if loaded.any():
             held = None if held is None else held[loaded]
-            out[:, loaded] = self.substructure.interior.solve(
-                self.K, right[:, loaded], tolerance, held
-            )
+            out[:, loaded] = interior.solve(self.K, right[:, loaded], tolerance, held)
         return out
 
     def precondition(self, right: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_blocks
+from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_entries
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.measured import (
     BAND_WORK_LIMIT,
@@ -107,7 +107,7 @@ def interior_layout(
         T.num_interior,
         T.num_dofs - T.num_coordinates,
         T.bandwidth,
-        lambda: interior_blocks(pattern, T.dim, T.numbers),
+        lambda: interior_entries(pattern, T.dim, T.numbers),
         limit,
         box,
         False,
