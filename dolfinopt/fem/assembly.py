@@ -76,7 +76,7 @@ class CellMatrix:
         size, n = elements.shape[1], pairs.width
         self.block = b = size // n
         blocks = elements.reshape(-1, n, b, n, b).swapaxes(2, 3).reshape(-1, b * b)
-        self._blocks, self._places = blocks.copy(), pairs.place
+        self._blocks, self._places = blocks, pairs.place
         if len(elements) != 1:
             # In the order of the entries that they add to: read from one end to the other.
             self._blocks = blocks[pairs.cell.astype(np.int64) * n * n + pairs.place]

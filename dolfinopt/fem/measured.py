@@ -77,7 +77,7 @@ FACTOR_BYTES, FACTOR_EXPONENT = 3.8e3, 1.12
 # and inertia to it, gradients of frozen loads to five times it, geometric stiffness to ten times.
 ENERGY_TOLERANCE = 1e-8
 # Part of the diagonally scaled matrix' spectrum, up to its end, that Chebyshev's polynomial smooths.
-SMOOTHED_SHARE = 0.09
+SMOOTHED_SHARE = 0.05
 # Boxes: nodal values of so many cells, times right sides, at a time stay in the cache.
 BOX_CHUNK_COLUMNS = 4096
 # Ratio of a cell's edges to the shortest that can be joined up to which they are joined, too.

@@ -352,15 +352,13 @@ class BoxMultigrid:
             if last or self._coarsest.band_work <= COARSEST_BAND_WORK:
                 break
             lines = kept
-        self._band: BandCholesky | None = None
 
     def update(self, young: np.ndarray) -> None:
         """Take Young's modulus (n_cells,) of the cells in the box's order, Pa."""
         for level in self.levels:
             level.update(young)
-        matrix = self._coarsest.assembled()
-        if self._band is None:  # the pattern stays
-            self._band = BandCholesky(matrix.row, matrix.col, matrix.shape[0])
+        matrix = self._coarsest.assembled()  # without zeros: patterns of designs differ
+        self._band = BandCholesky(matrix.row, matrix.col, matrix.shape[0])
         self.works = self._band.factorise(matrix.data[self._band.taken])
 
     def times(self, X: np.ndarray) -> np.ndarray:
@@ -371,7 +369,6 @@ class BoxMultigrid:
         """Return an approximation of K^-1 B, by one V-cycle, symmetric in B."""
         here = self.levels[level]
         if here is self._coarsest:
-            assert self._band is not None
             return self._band.solve(B)
         X, residual = smoothed(here, B, last=False)
         P, R = self.steps[level]
