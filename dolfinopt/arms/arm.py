@@ -50,6 +50,9 @@ THRESHOLD_BOUNDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle ha
 FIELD_ERROR_SHARE, FIELD_ERROR_RATIO = 1e-3, 5.0
 FIELD_TOLERANCES = 1e-10, 1e-6  # bounds
 
+# Tables of a scene that do not change its motion: what was decided about stiffening stays.
+WITHOUT_MOTION = {"name", "reduction", "objective", "constraints", "design", "optimizer", "part"}
+
 # How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
 CLIPPED_DENSITY_LIMIT = 1e-10
 
@@ -361,9 +364,8 @@ class Arm:
         other.scene, other.initial = scene, InitialVectors()
         if self.scene.reduction != scene.reduction:
             other.coordinates = scene.reduction.count or None
-        loads = ("motion", "payload", "forces", "closures")
-        same = all(getattr(self.scene, key) == getattr(scene, key) for key in loads)
-        if not same or self.scene.simulation.stiffening != scene.simulation.stiffening:
+        decides = type(scene).model_fields.keys() - WITHOUT_MOTION
+        if any(getattr(self.scene, key) != getattr(scene, key) for key in decides):
             other.stiffening = None
         if same_basis(self.scene, scene) and self.basis is not None:
             other.initial.basis = self.initial.basis

@@ -459,7 +459,7 @@ def buckling_modes(stress: Prestress, count: int, least: float = 0.0) -> Bucklin
     def softened(rows: np.ndarray) -> np.ndarray:
         """Return -T'K0T times columns."""
         field, outboard = pencil.field(rows), pencil.split(rows)[1]
-        flat = field.reshape(-1, field.shape[2])
+        flat = field.reshape(len(field), -1)  # K0 is the same in all directions
         inner, lower = arm.restrict((K0 @ flat).reshape(field.shape))
         turned = np.zeros((len(D), len(outboard) // len(D), outboard.shape[1]))
         turned[:, dim:] = D @ outboard.reshape(turned.shape)[:, dim:]

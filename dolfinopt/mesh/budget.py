@@ -51,7 +51,6 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
         + RANK_BYTES
     )
     seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
-    partition.comm.Free()
     ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
     needed: dict[str, float] = defaultdict(float)
     free: dict[str, float] = {}

@@ -323,7 +323,8 @@ def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
             if (length * np.abs(y[-1]) <= EIGEN_TOLERANCE * theta).all():
                 pairs = 1.0 / theta, (y.T @ Q[:m]).T
-                return None if _passes_over(pencil, pairs, start) else pairs
+                close = np.diff(pairs[0]) <= EIGENVALUE_GAP * pairs[0][1:]
+                return None if close.any() or _passes_over(pencil, pairs, start) else pairs
         if not length > 0.0:  # neither of zero nor of nan
             return None
         np.divide(w, length, out=Q[m])
@@ -337,7 +338,7 @@ def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
 
 
 def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
-    """Return whether modes are missing: some that were found are nearly equal, or `start` has more.
+    """Return whether the nearby modes hold one more below the highest of those that were found.
 
     What of a vector r is M-orthogonal to all lowest modes has r'M K^-1 M r <= r'M r / lambda. Of
     several modes of one frequency, as of equal windows, a Krylov sequence finds the sum alone.
@@ -345,8 +346,6 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
     values, vectors = pairs
     if len(values) < 2:  # any of several equal modes will do
         return False
-    if (np.diff(values) <= EIGENVALUE_GAP * values[1:]).any():
-        return True
     rest = start - vectors @ pencil.total(pencil.mass(vectors).T @ start)
     both = pencil.mass(np.hstack([rest, start]))
     lengths = pencil.total(np.einsum("nk,nk->k", np.hstack([rest, start]), both))

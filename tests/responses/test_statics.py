@@ -205,32 +205,6 @@ def test_floating_solids_are_judged_by_constraint_modes(width) -> None:
         assert (arm.profile.counts.solves - before > 12) == floating
 
 
-@pytest.mark.serial
-def test_a_solid_link_sets_out_from_the_last_design(monkeypatch) -> None:
-    """In fewer steps; from the same guesses, as when a run is resumed, to the same digits."""
-    monkeypatch.setattr(interior, "WIDEST", 0)
-    arm, other = (static_link(tolerance=1e-5, cells=(40, 4, 3)) for _ in range(2))
-    loads = np.array([ACROSS])
-
-    def tip_of(one: Arm, factor: float) -> np.ndarray:
-        return static_response(one.state(factor * holed(one)).elastic, loads).tip
-
-    tip_of(arm, 1.0)
-    extended = arm.substructure.extended
-    assert extended is not None
-    cold, guesses = extended.iterative.steps, arm.guesses
-    warm = tip_of(arm, 0.95)
-    assert extended.iterative.steps < 0.9 * cold
-    other.guesses = guesses
-    # Products of arrays round otherwise where these lie elsewhere in memory.
-    np.testing.assert_allclose(tip_of(other, 0.95), warm, rtol=1e-10)
-    assert other.substructure.extended is not None
-    assert other.substructure.extended.iterative.steps == extended.iterative.steps
-    # A machine that moves needs the constraint modes, and no more of this.
-    arm.state(holed(arm)).elastic.constraint_modes()
-    assert arm.guesses is None
-
-
 def test_a_solid_link_cut_in_two(width) -> None:
     """The same on the ranks that share it."""
     tips = []
