@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from dolfinopt.density.measured import CELL_SAMPLES, CORNER_LENGTH_RATIO, SAMPLES_LIMIT
-from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 
 EIGHT = np.ones((3, 3), dtype=bool)
 
@@ -223,7 +223,7 @@ def thinnest_solid(corners: np.ndarray, solid: np.ndarray, asked: float) -> Widt
     if not solid.any():
         return None, None
     low, extent = corners.min(axis=(0, 1)), np.ptp(corners, axis=(0, 1))
-    cell = float(np.median(cell_volumes(corners))) ** (1.0 / 3.0)
+    cell = float(np.median(cell_sizes(corners))) ** (1.0 / 3.0)
     h = voxel_size(cell, extent)
     margin = int(np.ceil(WIDE * asked / h)) + 1
     voxels = np.pad(_voxels(corners[solid], low, extent, h), margin)

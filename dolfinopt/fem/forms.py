@@ -16,6 +16,7 @@ the amplitudes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,11 @@ import ufl
 
 from dolfinopt.fem.laws import SHEARS
 from dolfinopt.mesh.compat import lagrange_element, mixed_element
+
+# A form, or an expression and points (p, d) of the reference cell where it is asked for.
+Forms = list[Any]
+Points = tuple[tuple[float, ...], ...]
+Functional = Callable[..., ufl.Form]
 
 ELEMENTS = "incompatible", "linear", "quadratic"
 DIMENSIONS = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 3, "hexahedron": 3}
@@ -156,35 +162,34 @@ def dx_mass(cell: Cell) -> ufl.Measure:
     return cell.dx(2 * cell.degree + 2, 2 * cell.degree)
 
 
-def dx_geometric(cell: Cell) -> ufl.Measure:
-    """Return that of a product of three gradients."""
-    return cell.dx(2 * (3 * cell.degree // 2), 3 * (cell.degree - 1))
+def geometric_degree(cell: Cell) -> int:
+    """Return the degree of a product of three gradients."""
+    return 3 * (cell.degree - 1) if cell.is_simplex else 2 * (3 * cell.degree // 2)
 
 
 # -- tensors of a cell --------------------------------------------------------------------------
 
 
-def stiffness(cell: Cell) -> ufl.Form:
+def stiffness(cell: Cell) -> Forms:
     """Return int sigma(u) : eps(v)."""
     u, v = ufl.TrialFunction(cell.displacement), ufl.TestFunction(cell.displacement)
-    return ufl.inner(cell.stress(u), cell.strain(v)) * dx_stiffness(cell)
+    return [ufl.inner(cell.stress(u), cell.strain(v)) * dx_stiffness(cell)]
 
 
-def mass(cell: Cell) -> ufl.Form:
+def mass(cell: Cell) -> Forms:
     """Return int p w of one component."""
-    return ufl.TrialFunction(cell.scalar) * ufl.TestFunction(cell.scalar) * dx_mass(cell)
+    return [ufl.TrialFunction(cell.scalar) * ufl.TestFunction(cell.scalar) * dx_mass(cell)]
 
 
-def geometric_stiffness(cell: Cell) -> ufl.Form:
-    """Return int sigma(u)_ab d_a p d_b w, trilinear, u last."""
-    spaces = cell.scalar, cell.scalar, cell.displacement
-    p, w, u = (ufl.Argument(space, k) for k, space in enumerate(spaces))
-    return ufl.inner(cell.stress_tensor(u) * ufl.grad(p), ufl.grad(w)) * dx_geometric(cell)
+def stress_at(cell: Cell, points: Points) -> Forms:
+    """Return the stress by displacements at p points."""
+    return [(cell.stress(ufl.TrialFunction(cell.displacement)), np.array(points))]
 
 
-def stress_at(cell: Cell, points: np.ndarray) -> tuple[Any, np.ndarray]:
-    """Return the stress by displacements at points (p, d) of the reference cell."""
-    return cell.stress(ufl.TrialFunction(cell.displacement)), points
+def geometric_factors(cell: Cell, points: Points) -> Forms:
+    """Return sigma(u) |det J| and grad p at points: of int sigma(u)_ab d_a p d_b w."""
+    [(stress, at)] = stress_at(cell, points)
+    return [(abs(ufl.det(cell.J)) * stress, at), (ufl.grad(ufl.TrialFunction(cell.scalar)), at)]
 
 
 # -- functionals of fields, which are differentiated by the corners' places -----------------------
@@ -208,7 +213,8 @@ def mass_product(cell: Cell) -> ufl.Form:
 def geometric_product(cell: Cell) -> ufl.Form:
     """Return the weighted int sigma(u)_ab d_a p . d_b w."""
     both = ufl.dot(ufl.transpose(ufl.grad(cell.p)), ufl.grad(cell.w))
-    return cell.weight * ufl.inner(cell.stress_tensor(cell.u), both) * dx_geometric(cell)
+    dx = ufl.dx(cell.mesh, degree=geometric_degree(cell))
+    return cell.weight * ufl.inner(cell.stress_tensor(cell.u), both) * dx
 
 
 def stress_component(cell: Cell, *point: float) -> ufl.Form:
@@ -218,15 +224,15 @@ def stress_component(cell: Cell, *point: float) -> ufl.Form:
     return ufl.inner(cell.stress(cell.u), cell.tau) / abs(ufl.det(cell.J)) * dx
 
 
-def by_corners(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
+def by_corners(cell: Cell, functional: Functional, *args: float) -> Forms:
     """Return forms whose sum is the derivative by the corners (c d,), fields held in the cell."""
-    forms = [ufl.derivative(functional, cell.x, ufl.TestFunction(cell.linear))]
-    if cell.corners in functional.coefficients():
-        moved = ufl.TestFunction(cell.constants)
-        forms.append(ufl.derivative(functional, cell.corners, moved))
+    form = functional(cell, *args)
+    forms: Forms = [ufl.derivative(form, cell.x, ufl.TestFunction(cell.linear))]
+    if cell.corners in form.coefficients():
+        forms.append(ufl.derivative(form, cell.corners, ufl.TestFunction(cell.constants)))
     return forms
 
 
-def by_displacement(cell: Cell, functional: ufl.Form) -> list[ufl.Form]:
-    """Return the derivative of a functional by u, as a list of one."""
-    return [ufl.derivative(functional, cell.u, ufl.TestFunction(cell.displacement))]
+def by_displacement(cell: Cell, functional: Functional, *args: float) -> Forms:
+    """Return the derivative of a functional by u."""
+    return [ufl.derivative(functional(cell, *args), cell.u, ufl.TestFunction(cell.displacement))]

@@ -99,17 +99,26 @@ def compile_kernels(forms: Sequence[ufl.Form | Expression]) -> list[Kernel]:
 
     One process compiles at a time, others wait for it and then find the forms.
     """
-    with quiet_compilers(), _locked(form_folder()) as folder:
-        signatures = [ffcx.naming.compute_signature([form], "dolfinopt") for form in forms]
-        folders = [folder / f"dolfinopt_{each}" for each in signatures]
-        missing = [each for each in folders if not any(each.glob("*.cached"))]
+    with _locked(form_folder()) as folder:
+        missing = [form for form in forms if not is_compiled(form)]
         if missing:
             log.info("compiling %d forms, once", len(missing))
-        for each in missing:
-            if each.exists():
+        for at in map(_folder, missing):
+            if at.exists():
                 log.info("%s: a compilation was interrupted there and is repeated", folder)
-                shutil.rmtree(each)
-        return [Kernel(form, _compiled(form, at)) for form, at in zip(forms, folders, strict=True)]
+                shutil.rmtree(at)
+        with quiet_compilers():
+            return [Kernel(form, _compiled(form, _folder(form))) for form in forms]
+
+
+def is_compiled(form: ufl.Form | Expression) -> bool:
+    """Return whether a form is compiled, now or by an earlier run."""
+    return any(_folder(form).glob("*.cached"))
+
+
+def _folder(form: ufl.Form | Expression) -> Path:
+    signature = ffcx.naming.compute_signature([form], "")
+    return form_folder() / f"dolfinopt_{signature}"
 
 
 def _compiled(form: ufl.Form | Expression, folder: Path) -> tuple[Any, Any, Any]:

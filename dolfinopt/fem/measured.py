@@ -16,7 +16,7 @@ STRESS_CHUNK_CELLS = 256
 # these: by default 8192, which takes longer than the products.
 BUFFER_ENTRIES = 256
 FIELD_CHUNK_ENTRIES = 4_000_000  # of nodal fields that are copied at a time: 32 MB
-KERNEL_CHUNK_ENTRIES = 8_000_000  # of cells' tensors that are computed at a time: 64 MB
+KERNEL_CHUNK_ENTRIES = 2_000_000  # cells, times cubes of their nodes, computed at a time: 100 MB
 
 # -- interface -------------------------------------------------------------------------------
 

@@ -17,10 +17,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import ufl
 
 from dolfinopt.fem import forms
 from dolfinopt.fem.kernels import Values
@@ -28,8 +28,7 @@ from dolfinopt.fem.laws import VON_MISES
 from dolfinopt.fem.tensors import ElementTensors, corner_functions, geometry, node_places
 from dolfinopt.mesh import compat
 
-Functional = Callable[..., ufl.Form]
-Derivative = Callable[[forms.Cell, ufl.Form], list[ufl.Form]]
+Derivative = Callable[..., forms.Forms]
 
 
 class ShapeDerivative:
@@ -51,9 +50,8 @@ class ShapeDerivative:
         cell, found = self._cell, self._zeros()
         for u, v in zip(self._columns(left), self._columns(right), strict=True):
             values = {cell.u: self._recovered(u), cell.v: self._recovered(v)}
-            found += self._by_corners(
-                forms.stiffness_product, {**values, cell.weight: young[:, None]}
-            )
+            values[cell.weight] = young[:, None]
+            found += self._by_corners(values, forms.stiffness_product)
         return self._operators.thickness * found
 
     def mass(self, left: np.ndarray, right: np.ndarray, density: np.ndarray) -> np.ndarray:
@@ -61,12 +59,12 @@ class ShapeDerivative:
         cell, found = self._cell, self._zeros()
         for p, w in zip(self._columns(left), self._columns(right), strict=True):
             values = {cell.p: p, cell.w: w, cell.weight: density[:, None]}
-            found += self._by_corners(forms.mass_product, values)
+            found += self._by_corners(values, forms.mass_product)
         return self._operators.thickness * found
 
     def volume(self, by_volume: np.ndarray) -> np.ndarray:
         """Differentiate a function of the cells' areas, in space volumes (n_cells,)."""
-        return self._by_corners(forms.volume, {self._cell.weight: by_volume[:, None]})
+        return self._by_corners({self._cell.weight: by_volume[:, None]}, forms.volume)
 
     def geometric_stiffness(
         self, fields: np.ndarray, V: np.ndarray, by_K0: np.ndarray, young: np.ndarray
@@ -85,13 +83,9 @@ class ShapeDerivative:
             # Of a pair of modes the stress of one sum of the fields counts.
             sums = fields @ np.hstack([2.0 * symmetric[:, i, :i], symmetric[:, i, i : i + 1]])
             for u, w in zip(self._columns(sums), modes, strict=False):
-                values = {
-                    cell.u: self._recovered(u),
-                    cell.p: p,
-                    cell.w: w,
-                    cell.weight: young[:, None],
-                }
-                found += self._with_adjoint(forms.geometric_product, values)
+                values = {cell.u: self._recovered(u), cell.p: p, cell.w: w}
+                values[cell.weight] = young[:, None]
+                found += self._with_adjoint(values, forms.geometric_product)
         return self._operators.thickness * found
 
     def stress(self, points: np.ndarray, by_stress: np.ndarray, fields: np.ndarray) -> np.ndarray:
@@ -112,7 +106,7 @@ class ShapeDerivative:
                 # Of a component of the stress the sum of the fields counts.
                 u = (nodal @ weight[:, :, None])[:, :, 0]
                 values = {cell.u: self._recovered(u), cell.tau: tau}
-                found += self._with_adjoint(forms.stress_component, values, *point)
+                found += self._with_adjoint(values, forms.stress_component, *point)
         return found
 
     # -- by the kernels of a functional --------------------------------------------------------
@@ -129,34 +123,29 @@ class ShapeDerivative:
         """Return nodal values with the amplitudes of the modes behind them."""
         return np.hstack([u, (self._operators.recovery @ u[:, :, None])[:, :, 0]])
 
-    def _run(
-        self, derivative: Derivative, functional: Functional, values: Values, *args: float
-    ) -> list[np.ndarray]:
+    def _run(self, derivative: Derivative, values: Values, *functional: Any) -> list[np.ndarray]:
         """Return the tensors of what `forms` makes of a functional."""
-        cell = self._cell
-        kernels = self._operators.kernels(
-            (derivative, functional, *args), lambda: derivative(cell, functional(cell, *args))
-        )
-        known = geometry(cell, self._coordinates, self._operators.law)
-        return [kernel(self._coordinates, {**known, **values}) for kernel in kernels]
+        known = geometry(self._cell, self._coordinates, self._operators.law) | values
+        kernels = self._operators.kernels(derivative, *functional)
+        return [kernel(self._coordinates, known) for kernel in kernels]
 
-    def _by_corners(self, functional: Functional, values: Values, *args: float) -> np.ndarray:
+    def _by_corners(self, values: Values, *functional: Any) -> np.ndarray:
         """Differentiate a functional, the amplitudes of modes held."""
-        parts = self._run(forms.by_corners, functional, values, *args)
+        parts = self._run(forms.by_corners, values, *functional)
         return np.sum(parts, axis=0).reshape(self._operators.corners.shape)
 
-    def _with_adjoint(self, functional: Functional, values: Values, *args: float) -> np.ndarray:
+    def _with_adjoint(self, values: Values, *functional: Any) -> np.ndarray:
         """Differentiate a functional of u whose modes follow the cell's equilibrium."""
-        found = self._by_corners(functional, values, *args)
+        found = self._by_corners(values, *functional)
         if not self._cell.modes:
             return found
         cell, operators = self._cell, self._operators
-        [by_u] = self._run(forms.by_displacement, functional, values, *args)
+        [by_u] = self._run(forms.by_displacement, values, *functional)
         n = operators.recovery.shape[2]
         by_u[:, n:] = -np.linalg.solve(operators.modal, by_u[:, n:, None])[:, :, 0]
         by_u[:, :n] = 0.0
         pair = {cell.u: values[cell.u], cell.v: by_u, cell.weight: np.ones((1, 1))}
-        return found + self._by_corners(forms.stiffness_product, pair)
+        return found + self._by_corners(pair, forms.stiffness_product)
 
     # -- from corners to the nodes of the mesh -----------------------------------------------
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator
 from copy import copy
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import basix
 import numpy as np
-import ufl
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.fem import forms
-from dolfinopt.fem.kernels import Expression, Kernel, Values, compile_kernels
+from dolfinopt.fem.kernels import Kernel, Values, compile_kernels, is_compiled
+from dolfinopt.fem.laws import SHEARS
 from dolfinopt.fem.measured import ALIKE_CELLS_ERROR, KERNEL_CHUNK_ENTRIES
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -57,36 +57,22 @@ class ElementTensors:
             profile: of this rank, which counts the forms.
         """
         self.thickness, self.law, self.profile = thickness, law, profile
-        self.cell = cell = forms.Cell(compat.cell_shape(mesh.mesh), element)
+        self.cell = cell = cell_of(compat.cell_shape(mesh.mesh), element)
         self.space = compat.lagrange_space(mesh.mesh, cell.degree, components=mesh.dim)
         self.cells = compat.cell_nodes(self.space, mesh.num_cells)
         points = self.space.tabulate_dof_coordinates()[:, : mesh.dim].copy()
+        self._used: set[Hashable] = set()
         with together(mesh.comm):
-            self._known = self._compiled()
+            compile_together(cell)
+            self.kernels(forms.stiffness), self.kernels(forms.mass)
         self._place(mesh, points)
 
-    def _compiled(self) -> dict[Hashable, list[Kernel]]:
-        """Return the kernels of every run, which are compiled together."""
-        cell, points = self.cell, stress_points(self.cell)
-        made: dict[Hashable, ufl.Form | Expression] = {
-            "stiffness": forms.stiffness(cell),
-            "mass": forms.mass(cell),
-            "geometric stiffness": forms.geometric_stiffness(cell),
-        }
-        made |= {at.tobytes(): forms.stress_at(cell, at) for at in (points[:1], points)}
-        kernels = self._counted(compile_kernels([*made.values()]))
-        return {key: [kernel] for key, kernel in zip(made, kernels, strict=True)}
-
-    def kernels(
-        self, key: Hashable, make: Callable[[], Sequence[ufl.Form | Expression]]
-    ) -> list[Kernel]:
-        """Return the kernels of forms; they are made and compiled when first asked for."""
-        if key not in self._known:
-            self._known[key] = self._counted(compile_kernels(make()))
-        return self._known[key]
-
-    def _counted(self, kernels: list[Kernel]) -> list[Kernel]:
-        self.profile.counts.forms += len(kernels)
+    def kernels(self, make: Callable[..., Any], *args: Hashable) -> tuple[Kernel, ...]:
+        """Return the kernels of what one of `forms` makes of the cell."""
+        kernels = kernels_of(make, self.cell, *args)
+        if (make, *args) not in self._used:
+            self._used.add((make, *args))
+            self.profile.counts.forms += len(kernels)
         return kernels
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> ElementTensors:
@@ -109,43 +95,88 @@ class ElementTensors:
         self._coordinates = coordinates if alike is None else alike[None]
         self.corners = coordinates[:, :, : mesh.dim]
         n = mesh.dim * self.cells.shape[1]
-        parts = [condensed(k, n) for k in self._tabulated(self._known["stiffness"])]
+        parts = [condensed(k, n) for _, (k,) in self._tabulated(forms.stiffness)]
         k, self.recovery, self.modal = map(np.concatenate, zip(*parts, strict=True))
         self.stiffness = self.thickness * k
-        self.mass = self.thickness * np.concatenate([*self._tabulated(self._known["mass"])])
+        self.mass = self.thickness * np.concatenate([m for _, (m,) in self._tabulated(forms.mass)])
 
-    def _tabulated(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
-        """Yield the tensors of runs of cells, so that not all are in memory at once."""
-        [kernel] = kernels
-        step = max(1, KERNEL_CHUNK_ENTRIES // int(np.prod(kernel.shape)))
+    def _tabulated(
+        self, make: Callable[..., Any], *args: Hashable
+    ) -> Iterator[tuple[slice, list[np.ndarray]]]:
+        """Yield runs of cells and their tensors, so that not all are in memory at once."""
+        kernels = self.kernels(make, *args)
+        step = max(1, KERNEL_CHUNK_ENTRIES // self.cells.shape[1] ** 3)
         for first in range(0, max(1, len(self._coordinates)), step):
-            part = self._coordinates[first : first + step]
-            yield kernel(part, geometry(self.cell, part, self.law))
+            part = slice(first, first + step)
+            at = self._coordinates[part]
+            values = geometry(self.cell, at, self.law)
+            yield part, [kernel(at, values) for kernel in kernels]
 
-    def _recovered(self, kernels: list[Kernel]) -> Iterator[np.ndarray]:
-        """Yield tensors (cells, ..., dn) by displacements, the modes' part included."""
-        first = 0
-        for tensor in self._tabulated(kernels):
-            recovery = self.recovery[first : first + len(tensor)]
-            rows, n = tensor.reshape(len(tensor), -1, tensor.shape[-1]), recovery.shape[2]
-            rows = rows[:, :, :n] + rows[:, :, n:] @ recovery
-            yield rows.reshape(*tensor.shape[:-1], n)
-            first += len(tensor)
+    def _recovered(self, stress: np.ndarray, part: slice) -> np.ndarray:
+        """Return stresses (cells, p, s, dn) by displacements, those of the modes included."""
+        recovery = self.recovery[part, None]
+        n = recovery.shape[3]
+        return stress[..., :n] + stress[..., n:] @ recovery
 
     def stress(self, points: np.ndarray) -> np.ndarray:
         """Return the stresses (1 or n_cells, p, s, dn) by displacements, 1/m, at points (p, d)."""
-        kernels = self.kernels(points.tobytes(), lambda: [forms.stress_at(self.cell, points)])
-        stress = np.concatenate([*self._recovered(kernels)])
-        return stress.reshape(len(stress), len(points), -1, stress.shape[-1])
+        runs = self._tabulated(forms.stress_at, places(points))
+        return np.concatenate([self._recovered(stress, part) for part, (stress,) in runs])
 
     @cached_property
     def geometric(self) -> np.ndarray:
-        """T (1 or n_cells, r (r + 1) / 2, d r), see `assembly.StiffenedModes`, thickness included."""
-        d, n = self.cell.dim, self.cells.shape[1]
-        b, c = np.triu_indices(n - 1)
-        twice = self.thickness * np.where(b == c, 1.0, 2.0)[:, None]
-        tensors = self._recovered(self._known["geometric stiffness"])
-        return np.concatenate([twice * T[:, b + 1, c + 1, d:] for T in tensors])
+        """T (1 or n_cells, r (r + 1) / 2, d r), see `assembly.StiffenedModes`, times t.
+
+        Products of gradients at Gauss points times the stresses there: a form of three arguments
+        takes two to four times as long.
+        """
+        points, weights = gauss_points(self.cell, forms.geometric_degree(self.cell))
+        b, c = np.triu_indices(self.cells.shape[1] - 1)
+        weights = weights[:, None] * self.thickness * np.where(b == c, 1.0, 2.0)
+        found = []
+        for part, (stress, gradients) in self._tabulated(forms.geometric_factors, places(points)):
+            left, right = (np.moveaxis(gradients[..., 1 + at], 2, 0) for at in (b, c))
+            products = [*(left * right)]
+            products += [left[i] * right[j] + left[j] * right[i] for i, j in SHEARS[self.cell.dim]]
+            rows = (weights * np.stack(products)).transpose(1, 3, 2, 0)
+            S = self._recovered(stress, part)[..., self.cell.dim :]
+            found.append(rows.reshape(*rows.shape[:2], -1) @ S.reshape(len(S), -1, S.shape[3]))
+        return np.concatenate(found)
+
+
+@cache
+def cell_of(shape: str, element: str) -> forms.Cell:
+    """Return the same cell for the same names: kernels know its coefficients."""
+    return forms.Cell(shape, element)
+
+
+@cache
+def kernels_of(make: Callable[..., Any], cell: forms.Cell, *args: Hashable) -> tuple[Kernel, ...]:
+    """Return the kernels of what `make` makes of a cell, which this process loads once."""
+    return tuple(compile_kernels(make(cell, *args)))
+
+
+@cache
+def compile_together(cell: forms.Cell) -> None:
+    """Compile the forms of every run if no run has: one line tells of them."""
+    if not is_compiled(forms.stiffness(cell)[0]):
+        centre, points = element_centre(cell), stress_points(cell)
+        gauss, _ = gauss_points(cell, forms.geometric_degree(cell))
+        made = [forms.stiffness(cell), forms.mass(cell)]
+        made += [forms.stress_at(cell, places(at)) for at in (centre, points)]
+        made += [forms.geometric_factors(cell, places(gauss))]
+        compile_kernels([form for part in made for form in part])
+
+
+def places(points: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    """Return points (p, d) as what can be a key."""
+    return tuple(map(tuple, points.tolist()))
+
+
+def gauss_points(cell: forms.Cell, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (p, d) and weights of the reference cell, exact to a degree."""
+    points, weights = basix.make_quadrature(getattr(basix.CellType, cell.shape), degree)
+    return points, weights
 
 
 def element_of(mesh: ArmMesh, name: str | None) -> str:
@@ -209,8 +240,7 @@ def element_centre(cell: forms.Cell) -> np.ndarray:
 
 def stress_points(cell: forms.Cell) -> np.ndarray:
     """Return centre and 2 x 2 (x 2) Gauss points (p, d) of the reference cell."""
-    gauss, _ = basix.make_quadrature(getattr(basix.CellType, cell.shape), 2)
-    return np.concatenate([element_centre(cell), gauss])
+    return np.concatenate([element_centre(cell), gauss_points(cell, 2)[0]])
 
 
 def corner_functions(cell: forms.Cell, points: np.ndarray) -> np.ndarray:

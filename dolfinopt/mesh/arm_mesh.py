@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.checks import cell_areas, cell_volumes, edge_lengths, facet_areas, facet_corners
+from dolfinopt.mesh.checks import cell_sizes, edge_lengths, facet_areas, facet_corners
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import (
     FURTHER,
@@ -88,7 +88,7 @@ class ArmMesh:
         """
         mesh = compat.MovedMesh(self.mesh, points)
         corners = compat.cell_coordinates(mesh, self.num_cells)
-        middle, volume = corners.mean(axis=1), cell_volumes(corners)
+        middle, volume = corners.mean(axis=1), cell_sizes(corners)
         return replace(self, mesh=mesh, centroid=middle, area=volume)
 
     @property
@@ -222,7 +222,7 @@ def _arm_mesh(
         comm=comm,
         mesh=mesh,
         centroid=corners.mean(axis=1),
-        area=cell_areas(corners) if dim == 2 else cell_volumes(corners),
+        area=cell_sizes(corners),
         passive=solid,
         void=void,
         inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
@@ -349,7 +349,7 @@ def box_arm(
             comm=comm,
             mesh=mesh,
             centroid=centroid,
-            area=cell_areas(corners) if len(size) == 2 else cell_volumes(corners),
+            area=cell_sizes(corners),
             passive=(layer < layers) | (layer >= cells[0] - layers),
             void=np.zeros(owned, dtype=bool),
             inboard_facets=ends[0],

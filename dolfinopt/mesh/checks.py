@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
+import basix
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
@@ -228,7 +229,7 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     corners = points[cells]
     _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
     longest = np.ptp(corners, axis=1).max(axis=1)
-    _refuse(cell_volumes(corners) < FLAT_VOLUME_SHARE * longest**3, corners, "are flat")
+    _refuse(cell_sizes(corners) < FLAT_VOLUME_SHARE * longest**3, corners, "are flat")
     if cells.shape[1] == 8:
         _refuse(_folded(corners, FLAT_VOLUME_SHARE * longest**3), corners, "are folded")
     _refuse(
@@ -307,21 +308,21 @@ def _check_parts(cells: np.ndarray) -> None:
 
 # -- cells with straight edges: which corners their facets have, areas and volumes ---------------
 
-GAUSS = 0.5 + 0.5 / np.sqrt(3.0) * np.array([-1.0, 1.0])  # of two points on [0, 1], weights 1/2
+KINDS = {
+    (2, 3): basix.CellType.triangle,
+    (2, 4): basix.CellType.quadrilateral,
+    (3, 4): basix.CellType.tetrahedron,
+    (3, 8): basix.CellType.hexahedron,
+}  # by dimension and number of corners
 
 
-def facet_corners(dim: int, corners: int) -> tuple[tuple[int, ...], ...]:
+def facet_corners(dim: int, corners: int) -> list[list[int]]:
     """Return the corners of every facet of a cell with so many corners, in DOLFINx's order.
 
     Corners of quadrilaterals and hexahedra are numbered as a tensor product, x fastest.
     """
-    if dim == 2:
-        return ((0, 1), (0, 2), (1, 2)) if corners == 3 else ((0, 1), (0, 2), (1, 3), (2, 3))
-    if corners == 4:
-        return (1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)
-    return (
-        (0, 1, 2, 3), (0, 1, 4, 5), (0, 2, 4, 6), (1, 3, 5, 7), (2, 3, 6, 7), (4, 5, 6, 7),
-    )  # fmt: skip
+    facets: list[list[int]] = basix.topology(KINDS[dim, corners])[dim - 1]
+    return facets
 
 
 def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
@@ -339,35 +340,14 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
     return np.linalg.norm(corners[:, first] - corners[:, second], axis=2).ravel()
 
 
-def cell_areas(corners: np.ndarray) -> np.ndarray:
-    """Return the area (n,) of straight triangles or quadrilaterals in DOLFINx's corner order."""
-    if corners.shape[1] == 3:
-        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    else:  # tensor-product order: 0-3 and 1-2 are the diagonals
-        first, second = corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1]
-    return 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-
-
-def cell_volumes(corners: np.ndarray) -> np.ndarray:
-    """Return the volume (n,) of tetrahedra or trilinear hexahedra in DOLFINx's corner order."""
-    if corners.shape[1] == 4:
-        return np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
-    grid = corners.reshape(-1, 2, 2, 2, 3)  # z, y, x
-    edges = [np.diff(grid, axis=axis).squeeze(axis) for axis in (3, 2, 1)]
-    volume = np.zeros(len(corners))
-    for x in GAUSS:  # exact: the Jacobian is of second degree in each direction
-        for y in GAUSS:
-            for z in GAUSS:
-                places = (z, y), (z, x), (y, x)
-                J = np.stack([_bilinear(e, *at) for e, at in zip(edges, places, strict=True)], 1)
-                volume += np.abs(np.linalg.det(J)) / 8.0
-    return volume
-
-
-def _bilinear(values: np.ndarray, first: float, second: float) -> np.ndarray:
-    """Interpolate values (n, 2, 2, 3) at a place of the unit square."""
-    rows = (1.0 - first) * values[:, 0] + first * values[:, 1]
-    return np.asarray((1.0 - second) * rows[:, 0] + second * rows[:, 1])
+def cell_sizes(corners: np.ndarray) -> np.ndarray:
+    """Return areas or volumes (n,) of cells with corners (n, c, d) in DOLFINx's order."""
+    kind = KINDS[corners.shape[2], corners.shape[1]]
+    # Exact: the Jacobian is of second degree in each direction.
+    points, weights = basix.make_quadrature(kind, 2)
+    functions = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)
+    J = np.einsum("eni,kpn->epik", corners, functions[1:, :, :, 0])
+    return np.asarray(np.abs(np.linalg.det(J)) @ weights)
 
 
 def facet_areas(corners: np.ndarray) -> np.ndarray:

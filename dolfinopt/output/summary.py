@@ -24,6 +24,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
+from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
     drive_units,
     free_drives,
@@ -312,6 +313,7 @@ def _all_warnings(run: Simulated, traits: Mapping[int, _Traits]) -> list[str]:
         *_warnings(run.scene, run.evaluation),
         *_too_few(run.scene, run.choice),
         *_unstiffened(stiffening_of(run.arms)),
+        *torsion_warnings(run.trajectory),
         *_limits_exceeded(run.trajectory),
         *_on_closures(run.scene, run.trajectory),
         *([] if (rest := forced_rest(run.scene)) is None else [rest]),

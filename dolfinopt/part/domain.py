@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
-from dolfinopt.mesh.checks import cell_volumes, facet_corners
+from dolfinopt.mesh.checks import cell_sizes, facet_corners
 from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, sampled
 from dolfinopt.scene.load import Arm, Scene
 
@@ -623,7 +623,7 @@ class SolidDomain(Filled):
     @cached_property
     def sizes(self) -> np.ndarray:
         """(n_cells,) of the cells, m3."""
-        return cell_volumes(self.corners)
+        return cell_sizes(self.corners)
 
     @property
     def total(self) -> float:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.hollow import Hull, Member
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
@@ -43,7 +43,7 @@ class WallMesh(Member):
 
     def figures(self) -> dict[str, Any]:
         """Return its entry of part.json."""
-        volume = cell_volumes(self.points[self.cells[:, TENSOR[8]]]).sum()
+        volume = cell_sizes(self.points[self.cells[:, TENSOR[8]]]).sum()
         return {self.kind: len(self.cells), "volume": float(volume)}
 
     def write(self, path: Path) -> None:

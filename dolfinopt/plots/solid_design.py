@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyvista
 
-from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.output.design import AROUND, ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
 from dolfinopt.plots.design import (
@@ -305,7 +305,7 @@ def solid_parts_figure(
 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
-    volumes = cell_volumes(view.corners[:, AROUND[view.corners.shape[1:]]])
+    volumes = cell_sizes(view.corners[:, AROUND[view.corners.shape[1:]]])
     volume = float(volumes @ view.solid)
     filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
     if view.wall is not None:

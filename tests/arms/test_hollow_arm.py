@@ -115,11 +115,11 @@ def box_of_solids(size: tuple[float, float, float], along: int) -> np.ndarray:
     [((0.6, 0.16, 0.08), (20, 6, 4), 0.012), ((0.5, 0.2, 0.05), (20, 8, 4), 0.045)],
 )
 def test_short_wide_boxes(size, cells, lag):
-    """Solids are met to 0.3 % where wide sides lag behind the theory of beams (shear lag)."""
-    # With cells half as large the solids are 0.3 % softer, and within 0.13 % of these boxes.
+    """Solids are met to 0.5 % where wide sides lag behind the theory of beams (shear lag)."""
+    # With cells half as large the solids are 0.3 % softer in torsion, where they differ most.
     solids = box_of_solids(size, 20)
     assert np.abs(solids / box(size) - 1.0).max() > lag
-    assert flexibility("box", size, cells) == pytest.approx(solids, rel=3e-3)
+    assert flexibility("box", size, cells) == pytest.approx(solids, rel=5e-3)
 
 
 KEYS = ("wall=0.002", "min_wall=0.001", "max_wall=0.005", "hollow=true")

@@ -175,7 +175,7 @@ def test_gradient_of_a_body(cells, stiffening, interfaces):
     weights = {name: rng.normal(size=part.shape) / scale[name] for name, part in parts.items()}
     weights["outboard_point"] *= 0.0
     by = ShapeIntegrals(**weights)
-    assert remainders(arm, response(by), by) == pytest.approx(2.0, abs=0.06)
+    assert remainders(arm, response(by), by)[-1] == pytest.approx(2.0, abs=0.06)
 
 
 @pytest.mark.parametrize(

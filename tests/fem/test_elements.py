@@ -291,7 +291,7 @@ def test_clamped_link():
     """
     errors = frequencies("incompatible", "hexahedron", (60, 6, 4)) / CALCULIX - 1.0
     assert (errors > 0.0).all()
-    assert errors[:4].max() < 0.0023 and errors[4] < 0.0037
+    assert errors[:4].max() < 0.0023 and errors[4] < 0.0038
     assert errors[5] == pytest.approx(0.0157, abs=2e-4)
     errors = frequencies("quadratic", "tetrahedron", (25, 2, 2)) / CALCULIX - 1.0
     assert 0.0 < errors.min() and errors[:5].max() < 0.005 and errors[5] < 0.025

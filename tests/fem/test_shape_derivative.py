@@ -16,7 +16,7 @@ from dolfinopt.fem.stress import stress_operator
 from dolfinopt.fem.tensors import stress_points
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
-from dolfinopt.mesh.checks import cell_areas
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.reduction import by_frame_fields
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
@@ -39,7 +39,7 @@ def even_mesh(shape: str) -> ArmMesh:
         ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, 0.2)]
         places = compat.cell_coordinates(mesh, count)[:, :, :2]
         none = np.zeros(count, dtype=bool)
-        parts = places.mean(axis=1), cell_areas(places), none, none
+        parts = places.mean(axis=1), cell_sizes(places), none, none
         return ArmMesh("a", MPI.COMM_SELF, mesh, *parts, *ends, np.array([0.2, 0.0]))
     return link_mesh(shape, (3, 2, 1))
 

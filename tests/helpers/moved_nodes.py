@@ -14,7 +14,7 @@ from solids import tetrahedra
 from dolfinopt.dynamics.radau import AIM
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
-from dolfinopt.mesh.checks import cell_areas, cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.optimization.gradient_check import _at, _with
 from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.evaluation import analysis_of, evaluate
@@ -31,7 +31,7 @@ def with_moves(mesh: ArmMesh, moves: np.ndarray) -> ArmMesh:
     """Move the nodes of a mesh by (n, d), m."""
     mesh.mesh.geometry.x[:, : mesh.dim] += moves
     corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
-    area = cell_areas(corners) if mesh.dim == 2 else cell_volumes(corners)
+    area = cell_sizes(corners)
     return replace(mesh, centroid=corners.mean(axis=1), area=area)
 
 

@@ -15,7 +15,7 @@ from dolfinopt.fem.laws import isotropic
 from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
-from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.part.solid.surface import Surface
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, load_scene
@@ -78,7 +78,7 @@ def tetrahedra(comm: MPI.Comm, name: str, size: Sequence[float], cells: Sequence
     owned, _ = compat.local_cell_counts(mesh)
     corners, none = compat.cell_coordinates(mesh, owned), np.zeros(owned, dtype=bool)
     ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, size[0])]
-    volume, centroid = cell_volumes(corners), corners.mean(axis=1)
+    volume, centroid = cell_sizes(corners), corners.mean(axis=1)
     point = np.array([size[0], 0.0, 0.0])
     return ArmMesh(name, comm, mesh, centroid, volume, none, none.copy(), *ends, point)
 

@@ -18,7 +18,7 @@ from dolfinopt.arms.arm import Arm as ScenesArm
 from dolfinopt.data import mesh_folder
 from dolfinopt.mesh import compat, hollow
 from dolfinopt.mesh.arm_mesh import box_arm, interior_facets
-from dolfinopt.mesh.checks import cell_areas, cell_volumes, check_cells, facet_areas
+from dolfinopt.mesh.checks import cell_sizes, check_cells, facet_areas
 from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.mesh.hollow import FLAT_BAR, SOLID_BAR, member
 from dolfinopt.mesh.solid_cells import TENSOR
@@ -150,7 +150,7 @@ def test_area_of_distorted_cells():
         cells = corners + 0.2 * rng.uniform(-1.0, 1.0, (30, len(corners), 2))
         x, y = cells[:, around, 0], cells[:, around, 1]
         twice = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
-        assert np.allclose(cell_areas(cells), 0.5 * twice, rtol=1e-14)
+        assert np.allclose(cell_sizes(cells), 0.5 * twice, rtol=1e-14)
 
 
 # In a process of its own: Gmsh keeps parameters as long as the process lives.
@@ -304,7 +304,7 @@ def test_volume(kind, share):
     check_cells(found.points, cells)
     area = section.area(HEIGHT, THICKNESS, share)
     assert area == pytest.approx(moments(kind, share)[0], rel=1e-12)
-    assert cell_volumes(found.points[cells]).sum() == pytest.approx(area * LENGTH, rel=1e-9)
+    assert cell_sizes(found.points[cells]).sum() == pytest.approx(area * LENGTH, rel=1e-9)
     for facets, x in ((found.inboard, 0.0), (found.outboard, LENGTH)):
         assert (found.points[facets][:, :, 0] == x).all()
 
@@ -336,7 +336,9 @@ def test_cantilever(kind, share, tmp_path):
                 for second, a in ((I_z, along_y), (I_y, along_z))]  # fmt: skip
     assert flexibility[1:3] == pytest.approx(expected, rel=0.01)
     if share < 0.1 or kind in ("round tube", "solid bar"):
-        assert flexibility[3] == pytest.approx(twist, rel=0.01)
+        # 6 x 4 cells over the bar's section: tests/fem/test_elements.py.
+        error = 0.035 if kind == "solid bar" else 0.01
+        assert flexibility[3] == pytest.approx(twist, rel=error)
 
 
 # -- solid arms: boxes of hexahedra, volumes and facets of cells in space, what cannot be a solid
@@ -376,11 +378,11 @@ def test_volumes_of_skew_cells():
     corners = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     F = np.array([[1.0, 0.3, -0.2], [0.1, 0.7, 0.4], [-0.3, 0.2, 1.1]])
     volume = np.linalg.det(F)
-    assert cell_volumes((corners @ F.T)[None])[0] == pytest.approx(volume)
-    assert cell_volumes((corners[[0, 1, 2, 4]] @ F.T)[None])[0] == pytest.approx(volume / 6.0)
+    assert cell_sizes((corners @ F.T)[None])[0] == pytest.approx(volume)
+    assert cell_sizes((corners[[0, 1, 2, 4]] @ F.T)[None])[0] == pytest.approx(volume / 6.0)
     frustum = corners.copy()
     frustum[4:, :2] *= 0.5
-    assert cell_volumes(frustum[None])[0] == pytest.approx((1.0 + 0.5 + 0.25) / 3.0)
+    assert cell_sizes(frustum[None])[0] == pytest.approx((1.0 + 0.5 + 0.25) / 3.0)
     assert np.allclose(np.abs(facet_areas(frustum[None, 4:])), [[0.0, 0.0, 0.25]])
 
 

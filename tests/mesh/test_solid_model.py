@@ -15,7 +15,7 @@ from dolfinopt.arms.arm import Arm as Flexible
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
-from dolfinopt.mesh.checks import cell_volumes, check_cells, facet_corners
+from dolfinopt.mesh.checks import cell_sizes, check_cells, facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.mesh.hollow import Member, Wall, box_hull, hull_of, stations, tube_hull
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
@@ -209,7 +209,7 @@ def test_the_wall_has_the_volume_of_its_section(hull, area):
     """To rounding: mitred corners of a box, and a circle's area of a polygon."""
     mesh = hull.member(WALL)
     check_cells(mesh.points, mesh.cells[:, TENSOR[8]])
-    assert cell_volumes(mesh.points[mesh.cells[:, TENSOR[8]]]).sum() == pytest.approx(area * 0.5)
+    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[8]]]).sum() == pytest.approx(area * 0.5)
     assert len(mesh.inboard) == len(mesh.outboard) == hull.shape[1]
 
 

@@ -11,7 +11,7 @@ from solids import solid_arm
 
 import dolfinopt as do
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import cell_volumes, check_cells
+from dolfinopt.mesh.checks import cell_sizes, check_cells
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.part.hollow import make_hollow_part
 from dolfinopt.part.part import Curves
@@ -46,7 +46,7 @@ def test_meshes_have_the_same_surfaces():
     for mesh, share in ((found.mesh(found.COARSER), 1), (found.mesh(), 4)):
         cells = mesh.cells[:, TENSOR[8]]
         check_cells(mesh.points, cells)
-        assert cell_volumes(mesh.points[cells]).sum() == pytest.approx(volume, rel=1e-12)
+        assert cell_sizes(mesh.points[cells]).sum() == pytest.approx(volume, rel=1e-12)
         assert len(cells) == share * len(found.mesh(found.COARSER).cells)
 
 

@@ -9,7 +9,7 @@ from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.output.design import AROUND, ArmView, designed
 from dolfinopt.part.solid.surface import surface_at
@@ -84,7 +84,7 @@ def test_surface_carries_fields_and_cells():
     assert away.max() <= 0.5 + 1e-5
     corners = view.corners[:, AROUND[8, 3]]
     volume = surface_at(corners, view.density, 0.5).volume
-    assert volume == pytest.approx(cell_volumes(corners).sum() * (1.0 - 0.5 / 1.2), rel=1e-3)
+    assert volume == pytest.approx(cell_sizes(corners).sum() * (1.0 - 0.5 / 1.2), rel=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -88,7 +88,7 @@ def geometric_matrix(arm, c):
     Q1 = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 1)
     local = np.moveaxis(Q1.tabulate(1, points)[1:, :, :, 0], 0, 2)
     J = np.einsum("eni,pnk->epik", corners, local)
-    xx, yy, xy = np.moveaxis(stress, 2, 0) * weights * np.linalg.det(J) * operators.thickness
+    xx, yy, xy = np.moveaxis(stress, 2, 0) * weights * abs(np.linalg.det(J)) * operators.thickness
     D = (local @ np.linalg.inv(J)).swapaxes(2, 3)
     tensor = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
     blocks = np.einsum("epai,epab,epbj->eij", D, tensor, D)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import cell_volumes
+from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.part.domain import SolidDomain
 
 BELOW = 0.98  # the highest level, over the highest density
@@ -99,7 +99,7 @@ def nodal_densities(
     """
     points, nodes = _numbers(corners)
     nodes = _right_handed(corners, nodes)
-    sizes = cell_volumes(corners)
+    sizes = cell_sizes(corners)
     weight, total = np.zeros((2, len(points)))
     for node in nodes.T:
         np.add.at(weight, node, sizes)
@@ -128,7 +128,7 @@ def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.nda
         _centre_faces(grid, corners, axis)
     points, nodes = _numbers(grid.reshape(-1, 27, 3))
     nodes = np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[27]], nodes)
-    sizes = cell_volumes(corners)
+    sizes = cell_sizes(corners)
     weight, total = (
         np.bincount(nodes.ravel(), np.repeat(one, 27), len(points))
         for one in (sizes, sizes * density)
