@@ -125,7 +125,7 @@ class PetscFactor:
         self.failed = False
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return the solution (n, k) of the owned rows, for right sides of that shape (collective)."""
+        """Return the solution (n, k) of the owned rows for such right sides (collective)."""
         if right.shape[1] > 1 and self._takes_blocks:
             return self._solved_together(right)
         out = np.empty_like(right)
@@ -169,18 +169,18 @@ def obeying_options(prefix: str) -> Iterator[None]:
     try:
         yield
     except PETSc.Error as error:
-        given = PETSc.Options(prefix).getAll()
-        if not given:
+        options = user_options(prefix)
+        if not options:
             raise
-        options = " ".join(f"-{prefix}{key} {value}".strip() for key, value in given.items())
         raise InputError(
             f"PETSc options {options}: PETSc refuses them or fails with them (error {error.ierr})"
         ) from None
 
 
-def has_options(prefix: str) -> bool:
-    """Return whether the user gave PETSc options of this prefix."""
-    return bool(PETSc.Options(prefix).getAll())
+def user_options(prefix: str = "dolfinopt_") -> str:
+    """Return the user's PETSc and SLEPc options of this prefix as they are written."""
+    given = PETSc.Options(prefix).getAll().items()
+    return " ".join(f"-{prefix}{key} {value}".strip() for key, value in sorted(given))
 
 
 def direct_solver(mat: PETSc.Mat, prefix: str, own: bool = False) -> PETSc.KSP:

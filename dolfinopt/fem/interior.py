@@ -35,8 +35,8 @@ from dolfinopt.solver import (
     BandCholesky,
     PetscFactor,
     direct_solver,
-    has_options,
     obeying_options,
+    user_options,
 )
 
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
@@ -240,7 +240,7 @@ def choose_solver(layout: Layout, tolerance: float) -> Solver:
     Raises:
         InputError: MUMPS' factor needs more memory than is free.
     """
-    if has_options(OPTIONS):
+    if user_options(OPTIONS):
         return PetscSolver(layout)
     widest = WIDEST_OF_STATICS if layout.has_interfaces else WIDEST
     if layout.box is not None and layout.bandwidth > widest:
@@ -261,9 +261,9 @@ def _check_factor(layout: Layout) -> None:
     free = free_memory() * local / ranks_here()
     if comm.allreduce(needed * local / comm.size > free, op=MPI.LOR):
         raise InputError(
-            f"arm {layout.name!r}: the factor of {rows} unknowns takes about {needed / 1e9:.2g} GB, "
-            "more than is free; take a coarser mesh, more ranks on other machines, or multigrid by "
-            f'PETSC_OPTIONS="-{OPTIONS}ksp_type cg -{OPTIONS}pc_type gamg -{OPTIONS}ksp_rtol 1e-10"'
+            f"arm {layout.name!r}: the factor of {rows} unknowns takes about {needed / 1e9:.2g} "
+            "GB, more than is free; take a coarser mesh, or multigrid by PETSC_OPTIONS="
+            f'"-{OPTIONS}ksp_type cg -{OPTIONS}pc_type gamg -{OPTIONS}ksp_rtol 1e-10"'
         )
 
 

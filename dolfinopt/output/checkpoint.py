@@ -23,6 +23,7 @@ from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, to
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, program, with_digests
+from dolfinopt.solver import user_options
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -51,7 +52,11 @@ def begin(folder: Path, scene: Scene) -> None:
 
 def _stamp(scene: Scene) -> dict[str, np.ndarray]:
     """Return what a run must share with a checkpoint to go on from it."""
-    return {"scene": np.array(_scene_text(scene)), "program": np.array(json.dumps(program()))}
+    return {
+        "scene": np.array(_scene_text(scene)),
+        "program": np.array(json.dumps(program())),
+        "options": np.array(user_options()),
+    }
 
 
 def reopen(folder: Path) -> None:
@@ -194,6 +199,11 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
         raise InputError(
             f"{path}: --resume: another version of dolfinopt wrote this checkpoint and would go on "
             "to another design; start without --resume"
+        )
+    if str(arrays["options"]) != user_options():
+        raise InputError(
+            f"{path}: --resume: PETSc options were {str(arrays['options'])!r} there, and are "
+            f"{user_options()!r} here; set PETSC_OPTIONS as it was, or start without --resume"
         )
     difference = _difference(theirs, json.loads(_scene_text(scene)))
     if difference:

@@ -27,7 +27,7 @@ from dolfinopt.reduction.measured import (
     RAMP_SHARE,
     WARM_STEPS,
 )
-from dolfinopt.solver import has_options, obeying_options
+from dolfinopt.solver import obeying_options, user_options
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
 
@@ -196,7 +196,7 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
     arm = pencil.arm
     with arm.profile.phase("eigenproblem"):
         pairs = None
-        if not has_options(OPTIONS):
+        if not user_options(OPTIONS):
             if arm.is_iterative:
                 pairs = lobpcg(pencil, count, start, LOBPCG_TOLERANCE)
             elif start is not None and start.shape[1] > 0:

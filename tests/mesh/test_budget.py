@@ -9,6 +9,7 @@ from runs import TWO_ARM, overrides, refusal, run
 from solids import solid_scene
 
 from dolfinopt.arms.arm import build_arms
+from dolfinopt.errors import InputError
 from dolfinopt.fem import interior
 from dolfinopt.mesh import budget
 from dolfinopt.mesh.budget import check_budget, free_memory
