@@ -31,7 +31,7 @@ from dolfinopt.fem.tensors import ElementTensors, element_of
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.multibody.build import RIGID_ARMS
+from dolfinopt.multibody.build import rigid_link
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
@@ -541,7 +541,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
         from dolfinopt.exchange.standard_input import without_stiffening
 
         return without_stiffening(body, arm.sid)
-    return RIGID_ARMS[scene.dimension](arm, scene.material_of(index).density)
+    return rigid_link(arm, scene.material_of(index).density, scene.dimension)
 
 
 # -- arms that repeat another's design: densities travel from cell to cell, gradients back -------

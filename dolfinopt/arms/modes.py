@@ -310,7 +310,7 @@ class FrozenTree:
         none, units = np.zeros((1, 0)), np.eye(6)[:, :, None]
         found = []
         for link in outward_pass(self.mechanism, self.motion, (none, none, none)):
-            found.append(link.joint.at_interface(units)[:, :, 0].T)
+            found.append(link.joint.load_on_carrier(units)[:, :, 0].T)
         return found
 
     def _shift(self, body: int, interface: int) -> np.ndarray:

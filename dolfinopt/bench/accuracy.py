@@ -18,8 +18,8 @@ from dolfinopt.bench.panel import Diagram, Row, Rows, Steps
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.elastic_system import ElasticSystem
-from dolfinopt.dynamics.system import relative_error
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.system import System, relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.output.run_folder import optimize
@@ -91,18 +91,16 @@ CURVES = SECONDS, ERROR, "method"
 USUAL, USUAL_TOLERANCE = "Radau, 4 stages", 1e-4  # a simulation as scenes have it by default
 
 
-def problem_of(scene: Scene, arms: Arms, x_phys: Densities) -> ElasticSystem:
+def problem_of(scene: Scene, arms: Arms, x_phys: Densities) -> MachineSystem:
     """Return the elastic rows of a scene's motion with these densities."""
     bodies = {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()}
-    found = build_system(scene, chain_of(scene, bodies))
-    assert isinstance(found, ElasticSystem)
-    return found
+    return build_system(scene, chain_of(scene, bodies))
 
 
 class Reference:
     """A problem, instants t (n,) s, and q (n, N) that solutions are measured against."""
 
-    def __init__(self, problem: ElasticSystem) -> None:
+    def __init__(self, problem: MachineSystem) -> None:
         """Solve by Radau of six stages."""
         self.problem, self.t = problem, np.linspace(0.0, problem.breakpoints[-1], SAMPLES)
         self.q = radau_motion(REFERENCE_STAGES, REFERENCE_TOLERANCE, self)
@@ -113,14 +111,14 @@ def radau_motion(stages: int, tolerance: float, to: Reference) -> np.ndarray:
     return radau.integrate(to.problem, tolerance, stages, Profile()).sample(to.t)
 
 
-def accelerations(problem: ElasticSystem, t: float, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+def accelerations(problem: System, t: float, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return qdd (N,) from M(q, t) qdd = -residual(q, qd, 0), t in s; q and qd are (N,)."""
     now, state = problem.at(np.array([t])), (q[None], qd[None], np.zeros((1, len(q))))
     mass = now.linearise(*state).dense()[0, :, 2 * len(q) :]
     return np.linalg.solve(mass, -now.residual(*state)[0])
 
 
-def jacobian(problem: ElasticSystem, t: float, y: np.ndarray) -> np.ndarray:
+def jacobian(problem: System, t: float, y: np.ndarray) -> np.ndarray:
     """Return the derivative (2N, 2N) of [qd, qdd] by y = [q, qd], exact."""
     size = len(y) // 2
     q, qd = y[:size], y[size:]
@@ -231,7 +229,7 @@ WAVES = 64  # random waves that make a smooth design
 LEAST_SWING = 10.0
 
 
-def random_case(scene: Scene, arms: Arms, number: int) -> tuple[Row, ElasticSystem]:
+def random_case(scene: Scene, arms: Arms, number: int) -> tuple[Row, MachineSystem]:
     """Draw a design and a motion; return the cells that its rows begin with, and its equations.
 
     All is drawn anew until the path is within reach and the arms are stiff, see `LEAST_SWING`.
@@ -291,7 +289,7 @@ def random_design(kind: str, arm: Arm, rng: np.random.Generator) -> np.ndarray:
     return x
 
 
-def reference(problem: ElasticSystem, start: Solution) -> Solution:
+def reference(problem: MachineSystem, start: Solution) -> Solution:
     """Return the motion to a hundredth of the finest tolerance, by its own steps and order.
 
     Steps are doubled, not chosen by the expected order, from one more than the solution has, so
@@ -306,7 +304,7 @@ def reference(problem: ElasticSystem, start: Solution) -> Solution:
     raise ConvergenceError(f"an error of {start.error:.2g} with {len(start.a)} steps")
 
 
-def compared(cells: Row, problem: ElasticSystem) -> Rows:
+def compared(cells: Row, problem: MachineSystem) -> Rows:
     """Yield a row for every tolerance: the case's estimated and true error, inf where it failed."""
     t = np.linspace(0.0, problem.breakpoints[-1], INSTANTS)
     runs = {tolerance: _solved(problem, tolerance) for tolerance in CASE_TOLERANCES}
@@ -320,7 +318,7 @@ def compared(cells: Row, problem: ElasticSystem) -> Rows:
             yield *cells, tol, np.inf, np.inf, 0
 
 
-def _solved(problem: ElasticSystem, tolerance: float) -> Solution | None:
+def _solved(problem: MachineSystem, tolerance: float) -> Solution | None:
     """Return the solution from cold, or None."""
     try:
         return radau.integrate(problem, tolerance, STAGES, Profile())

@@ -10,11 +10,14 @@ from scipy.signal import butter, filtfilt
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.machine_system import MachineModes, MachineSystem
+from dolfinopt.dynamics.drives import Drives
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.modes import Modes
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.newton_euler import inverse_dynamics
@@ -27,11 +30,8 @@ from dolfinopt.multibody.shape_integrals import (
 )
 from dolfinopt.multibody.tree import (
     GROUND,
-    Drives,
     Joint,
     Mechanism,
-    plane_chain,
-    spatial_mechanism,
 )
 
 # -- the flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices
@@ -99,11 +99,11 @@ class Crank(MachineSystem):
         """Return it."""
         return self.start
 
-    def preconditioner(self) -> MachineModes | Unchanged:
+    def preconditioner(self) -> Modes | Unchanged:
         """Return the rod's vibrations, the start in their coordinates."""
         modes = super().preconditioner()
         q, qd = (modes.to_modes(x) for x in self.start)
-        assert isinstance(modes, MachineModes) and isinstance(modes.system, Crank)
+        assert isinstance(modes, Modes) and isinstance(modes.system, Crank)
         return replace(modes, system=replace(modes.system, start=(q, qd)))
 
 
@@ -117,8 +117,18 @@ def crank(body: ShapeIntegrals) -> Crank:
     drives = Drives(np.array([2]), none, none, np.full(1, np.inf), np.array([False]))
     across = np.array([[0.0, 1.0]])
     loops = Loops((Tie("slider", (1, 0), None, np.zeros(2), np.eye(2), tuple(map(Along, across))),))
+    flat = np.ones(1), np.zeros(2), np.eye(2)
+    mechanism = Mechanism(
+        bodies=arms,
+        joints=tuple(Joint(f"joint {k}", "revolute", k - 1, k + 1, *flat) for k in range(2)),
+        loads={(1, 0): Constants.of_point(SLIDER_MASS, 0.0)},
+        gravity=np.zeros((2, 1)),
+        end=(1, 0),
+        origin=np.zeros(2),
+        cart=0.0,
+    )
     return Crank(
-        plane_chain(arms, SLIDER_MASS, 0.0, (0.0, 0.0), 0.0),
+        mechanism,
         desired,
         (0.0, END),
         drives,
@@ -143,8 +153,8 @@ def crank_values(steps: int = STEPS) -> dict[str, float]:
     system = crank(rod())
     solution = solved(system, steps, STAGES)
     y, yd, ydd = unknowns(system, solution)
-    instants = system.at(np.array([END]))
-    motion = instants.motion(y, yd, ydd)
+    state = system.at(np.array([END])).state(y, yd, ydd)
+    motion = state.motion
     place = end_effector(system.mechanism, motion, y[:, 1:5])[0]
     t = np.linspace(0.0, END, 4001)
     bending = np.abs(solution.sample(t)[:, 1])
@@ -153,7 +163,7 @@ def crank_values(steps: int = STEPS) -> dict[str, float]:
         "slider": float(place[0]),
         **{f"q{k + 1}": float(y[0, 1 + k]) for k in range(4)},
         "force across the line": float(-ydd[0, 5]),
-        "moment of the crank": float(-instants.forces(y, yd, ydd)[0, 1]),
+        "moment of the crank": float(-state.forces()[0, 1]),
         "largest bending": float(bending.max()),
         "its instant": float(t[bending.argmax()]),
     }
@@ -239,7 +249,8 @@ def machine(file: Path) -> Mechanism:
             )
         )
     bodies = [rigid_spatial_body(1.0, np.zeros(3), np.zeros(6)) for _ in found]
-    return spatial_mechanism(bodies, tuple(joints), {}, GRAVITY, (len(found) - 1, 0))
+    down, end = np.array(GRAVITY)[:, None], (len(found) - 1, 0)
+    return Mechanism(tuple(bodies), tuple(joints), {}, down, end, np.zeros(3))
 
 
 def regressor(mechanism: Mechanism, motion: RigidMotion) -> np.ndarray:

@@ -13,8 +13,6 @@ doi:10.1137/151002769.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from dolfinopt.dynamics.collocation import (
@@ -27,7 +25,6 @@ from dolfinopt.dynamics.collocation import (
     tangent_at,
     vector_jacobian_product,
 )
-from dolfinopt.dynamics.elastic_system import ElasticSystem
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
     ADJOINT_CORRECTIONS_LIMIT,
@@ -47,7 +44,7 @@ class Adjoint:
         system, solution: as solved by `radau.integrate`.
     """
 
-    def __init__(self, system: ElasticSystem | MachineSystem, solution: Solution) -> None:
+    def __init__(self, system: MachineSystem, solution: Solution) -> None:
         """Evaluate the trajectory at all stages."""
         self.system, self.solution = system, solution
         method, self._modes = radau_iia(len(solution.nodes)), system.preconditioner()
@@ -55,7 +52,7 @@ class Adjoint:
         z, zd, a = (self._modes.to_modes(x) for x in (solution.q, solution.qd, solution.a))
         self._at = *stage_values(self._stages, z, zd, a), a
         q, qd = stage_values(self._stages, solution.q, solution.qd, solution.a)
-        self._instants: Any = system.at_stages(solution.time_grid, method.c)
+        self._instants = system.at_stages(solution.time_grid, method.c)
         self._rates = tuple(x.reshape(-1, q.shape[2]) for x in (q, qd, solution.a))
         self._kept: dict[bytes, _Factors] = {}
 
@@ -71,8 +68,7 @@ class Adjoint:
         multipliers, first = self._backwards(by_a, by_y)
         # Rows in z are T' times those in q: their multipliers turn like coordinates.
         turned = self._modes.from_modes(multipliers).reshape(self._rates[0].shape)
-        q, qd, a = self._rates
-        gradient = self.system.body_gradient(self._instants, q, qd, a, turned)
+        gradient = self._instants.state(*self._rates).body_gradient(turned)
         by_start = self._modes.gradient_from_modes(first)
         through_start = self.system.start_gradient(self.solution.q[0], by_start)
         return add_gradients(gradient, through_start) if through_start else gradient

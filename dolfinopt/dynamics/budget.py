@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.multibody.kinematics import end_effector_gradient
-from dolfinopt.multibody.ranks import least_norm
 
 # Kinds of parts, and the words for all of a kind.
 KINDS = {
@@ -96,13 +94,11 @@ def _derivatives(seen: Trajectory, direction: np.ndarray) -> tuple[np.ndarray, n
     mechanism, problem, desired = seen.mechanism, seen.problem, seen.desired
     none = np.zeros((1, mechanism.num_coordinates))
     by_q, by_rigid, _ = end_effector_gradient(mechanism, desired, none, direction)
-    every = np.concatenate([by_rigid[0], by_q[0]])
-    if isinstance(problem, MachineSystem) and problem.loops is not None:
-        G = problem.loops.at(mechanism, desired.q, none).jacobian
-        dependent = problem.drives.dependent
-        weights = least_norm(G[:, :, dependent].swapaxes(1, 2), every[None, dependent])
-        every -= (weights @ G[0])[0]
-    return every[: by_rigid.shape[1]], every[by_rigid.shape[1] :]
+    every = np.hstack([by_rigid, by_q])
+    if problem.loops is not None:
+        closed = problem.loops.at(mechanism, desired.q, none)
+        every -= closed.generalised_force(closed.closing(every, problem.drives.dependent))
+    return every[0, : mechanism.num_rigid], every[0, mechanism.num_rigid :]
 
 
 def _elastic(seen: Trajectory, by_q: np.ndarray) -> Iterator[tuple[str, str, float]]:
@@ -118,12 +114,10 @@ def _elastic(seen: Trajectory, by_q: np.ndarray) -> Iterator[tuple[str, str, flo
 def _rigid(seen: Trajectory, by_rigid: np.ndarray) -> Iterator[tuple[str, str, float]]:
     """Yield what gears, rods and errors of the control contribute."""
     problem, scene, names = seen.problem, seen.scene, list(seen.scene.rigid_units)
-    if not isinstance(problem, MachineSystem):
-        return
     error, gives_way = (seen.q_r - seen.desired.q)[0], _gives_way(seen)
     rods = {one.name for one in scene.rods}
     for k in map(int, problem.drives.free[problem.drives.driven]):
-        if scene.control is None or k in seen.motor_columns:
+        if scene.control is None or k in problem.motor_joints:
             kind = "rod" if names[k] in rods else "gear"
             yield kind, names[k], float(by_rigid[k] * gives_way[k])
         if scene.control is not None:
@@ -132,8 +126,7 @@ def _rigid(seen: Trajectory, by_rigid: np.ndarray) -> Iterator[tuple[str, str, f
 
 def _gives_way(seen: Trajectory) -> np.ndarray:
     """Return by how much every gear and rod gives way (R,), rad or m."""
-    problem, columns = seen.problem, list(seen.motor_columns)
-    assert isinstance(problem, MachineSystem)
+    problem, columns = seen.problem, seen.problem.motor_joints
     if seen.scene.control is None:  # motors are where they are asked to be
         return np.asarray((seen.q_r - seen.desired.q)[0])
     found = np.zeros(seen.q_r.shape[1])

@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.drives import Drives, Springs
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
     FILE_ROUNDING,
@@ -28,11 +28,11 @@ from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, so
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tree import AppliedForce, Drives, Springs
-from dolfinopt.paths import TIME, read_table
+from dolfinopt.multibody.tree import AppliedForce
+from dolfinopt.scene.csv_table import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import interface_number, joint_parts
+from dolfinopt.scene.tables.joints import interface_number
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
 
 
@@ -83,7 +83,7 @@ def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
     return rigid_motion(np.frombuffer(instants), scene)
 
 
-def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> ElasticSystem | MachineSystem:
+def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
     """Return the equations of a scene and its bodies, from the base outwards."""
     motion = desired_motion(scene)
     mechanism, instants = build_mechanism(scene, bodies), breakpoints(scene)
@@ -94,7 +94,7 @@ def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> ElasticSystem | 
         tables = [load.table for load in loads if load.table is not None]
         instants = with_ends(instants, tables, scene.motion.horizon)
     if not is_machine(scene):
-        return ElasticSystem(mechanism, motion, instants)
+        return MachineSystem(mechanism, motion, instants)
     drives = _drives(scene)
     if drives.table is not None:
         instants = with_ends(instants, [drives.table], scene.motion.horizon)
@@ -138,7 +138,7 @@ def _drives(scene: Scene) -> Drives:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
     motors = list(soft) if control else []
-    friction = friction_of(scene, [one if one.stiffness else None for one in joint_parts(scene)])
+    friction = friction_of(scene, soft=True)
     springs = Springs(
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
         stiffness=np.array([soft[k].stiffness for k in motors]),

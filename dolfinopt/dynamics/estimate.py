@@ -24,12 +24,7 @@ from dolfinopt.dynamics.collocation import (
     step_beginnings,
     step_ends,
 )
-from dolfinopt.dynamics.measured import (
-    COMPARED_STEP_COUNTS,
-    EXACT,
-    KEPT_CONTRACTION,
-    SLOW_ANGLES,
-)
+from dolfinopt.dynamics.measured import KEPT_CONTRACTION, SLOW_ANGLES
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, matrix_of, up_to_angle
 from dolfinopt.dynamics.system import State, inverse_size
 
@@ -74,9 +69,12 @@ def estimate(
     slow, b = up_to_angle(richer, SLOW_ANGLES[0]), values @ a
     corrections = None
     if matrix is not None:
+        # One tangent a step mostly does: their mean, instead of one at each of its stages.
         keep = np.searchsorted(matrix.slow, slow)
-        nearby = matrix_of(richer, matrix.tangent.interpolated(values, keep), slow)
-        corrections = _corrected(nearby, begin, b)
+        for weights in (np.full_like(values[:1], 1.0 / values.shape[1]), values):
+            if corrections is None:
+                nearby = matrix_of(richer, matrix.tangent.interpolated(weights, keep), slow)
+                corrections = _corrected(nearby, begin, b)
     every, alone = corrections or _corrections(richer, begin, b, slow)
     q, _ = stage_values(richer, *begin, b)
     reached = system.norm(q.reshape(-1, q.shape[2]))
@@ -130,16 +128,55 @@ def _corrections(
 # asymptotically for fast vibrations, times what the method with s + 1 stages makes of a free one.
 
 
-def unresolved(stages: Stages, time_grid: np.ndarray, state: State, a: np.ndarray) -> float:
-    """Return the relative error of free vibrations that the steps do not resolve."""
-    preconditioner = stages.preconditioner
+def unresolved(
+    stages: Stages, time_grid: np.ndarray, state: State, a: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return the relative error of free vibrations that the steps do not resolve, and each's (n,).
+
+    The second is what every step adds of it.
+    """
+    preconditioner, count = stages.preconditioner, len(stages.h)
     vibrates = preconditioner.frequencies > 0.0
     if not vibrates.any():
-        return 0.0  # nothing is known of single coordinates
+        return 0.0, np.zeros(count)  # nothing is known of single coordinates
     q, qd = stage_values(stages, *step_beginnings(stages, state, a), a)
-    steps = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
-    missed = _free_vibrations(stages, (q, qd, a), state[0][0], steps)
-    return stages.relative(np.where(vibrates, missed, 0.0)[None, None], q)
+    breaks = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
+    amplitudes, rate = _free_vibrations(stages, (q, qd, a), state[0][0], breaks)
+    method, z = radau_iia(len(stages.method.c) + 1), rate * stages.h[:, None]
+    error, steps = (np.where(vibrates, x, 0.0) for x in _lost(method, z, amplitudes, breaks))
+    system = preconditioner.system
+    scale = inverse_size(system.norm(q.reshape(-1, q.shape[2])))
+    largest = (system.norm(error[None]) * scale).max()
+    return float(largest), (system.norm(steps[:, None]) * scale).max(axis=-1)
+
+
+@np.errstate(all="ignore")  # of what has no mass or does not vibrate
+def _lost(
+    method: Collocation, z: np.ndarray, amplitudes: np.ndarray, breakpoint_steps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest error (N,) of free vibrations over all steps, and each step's own (n, N).
+
+    Of exp(z_1 + .. + z_j) the method makes R(z_1) .. R(z_j) with its stability function
+    R(z) = 1 + z b' (1 - z A)^-1 1.
+
+    Args:
+        method: collocation.
+        z: (n, N) eigenvalues times steps.
+        amplitudes: (P, N) of the vibrations that each breakpoint excites.
+        breakpoint_steps: (P,) steps that they begin with.
+    """
+    values, X = np.linalg.eig(method.A)
+    weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
+    parts = (w / (1.0 - z * x) for w, x in zip(weights, values, strict=True))
+    exact, found = np.exp(z), 1.0 + z * sum(parts)
+    largest, steps = np.zeros(z.shape[1]), np.zeros(z.shape)
+    for first, amplitude in zip(breakpoint_steps, amplitudes, strict=True):
+        true = np.cumprod(exact[first:], axis=0)
+        apart = np.abs(true - np.cumprod(found[first:], axis=0)).max(axis=0)
+        largest += np.square(amplitude * apart)
+        begins = np.concatenate([np.ones_like(true[:1]), true[:-1]])
+        steps[first:] += np.square(amplitude * np.abs(begins * (exact - found)[first:]))
+    return np.sqrt(largest), np.sqrt(steps)
 
 
 @np.errstate(all="ignore")  # of what has no mass or does not vibrate
@@ -148,8 +185,8 @@ def _free_vibrations(
     states: tuple[np.ndarray, np.ndarray, np.ndarray],
     rest: np.ndarray,
     breakpoint_steps: np.ndarray,
-) -> np.ndarray:
-    """Return the error of every coordinate's free vibrations (N,), in its units.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the amplitudes (P, N) of free vibrations, and their eigenvalues (N,), 1/s.
 
     With the load F = m a + d qd + k q that a coordinate feels, and w^2 = k / m, a jump of F, F',
     F'' excites (F - F'' / w^2) / k and F' / (k w) of cosine and sine.
@@ -165,13 +202,11 @@ def _free_vibrations(
     jumps[0, 0] -= k * rest
     fastest = 1e30  # rad/s: beyond, squares overflow
     square = np.minimum(k / m, fastest**2)
-    amplitude = np.hypot(jumps[0] - jumps[2] / square, jumps[1] / np.sqrt(square)) / k
+    # Asymptotic for fast ones: of slower ones that the steps resolve, what changes within a step.
+    fast = np.maximum(square, stages.h[breakpoint_steps, None] ** -2.0)
+    amplitude = np.hypot(jumps[0] - jumps[2] / fast, jumps[1] / np.sqrt(fast)) / k
     decay = np.minimum(0.5 * (d / m), fastest)
-    rate = -decay + np.sqrt((decay * decay - square).astype(complex))
-    h = stages.h[breakpoint_steps, None]
-    richer = radau_iia(len(stages.method.c) + 1)
-    lost = _lost(richer, rate * h, len(stages.h) - breakpoint_steps)
-    return np.sqrt(np.square(amplitude * lost).sum(axis=0))
+    return amplitude, -decay + np.sqrt((decay * decay - square).astype(complex))
 
 
 def _jumps(
@@ -193,16 +228,3 @@ def _jumps(
     after, before = sides
     after[:, 1:] -= before
     return after
-
-
-def _lost(method: Collocation, z: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return the largest |exp(j z) - R(z)^j| of free vibrations, j steps on."""
-    # R(z) = 1 + z b' (1 - z A)^-1 1 is the method's stability function, z (P, N) are eigenvalues
-    # times step.
-    values, X = np.linalg.eig(method.A)
-    weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
-    R = 1.0 + z * (weights / (1.0 - z[..., None] * values)).sum(axis=-1)
-    j = np.unique(np.geomspace(1.0, steps.max(), COMPARED_STEP_COUNTS).round())
-    apart = np.abs(np.exp(z[..., None] * j) - R[..., None] ** j)
-    seen = (j <= steps[:, None, None]) & (apart > EXACT * j)
-    return np.where(seen, apart, 0.0).max(axis=-1)

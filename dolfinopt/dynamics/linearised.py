@@ -17,17 +17,19 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import qr
 
+from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import POLE_STEP
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.closures import ClosedLoops
+from dolfinopt.multibody.ranks import rank
 
 # Differences of sixth order: a function's value and first two derivatives from those at OFFSETS.
 OFFSETS = np.arange(-3.0, 4.0)
 POWERS = np.vander(OFFSETS, 3, increasing=True) / [1.0, 1.0, 2.0]
 DIFFERENCES = np.linalg.inv(np.vander(OFFSETS, increasing=True))[:3] * [[1.0], [1.0], [2.0]]
-ROUNDING = np.sqrt(np.finfo(float).eps)  # of singular values, of which a rank is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +51,16 @@ class Linearised:
     M: np.ndarray
 
     @cached_property
+    def state(self) -> MachineState:
+        """The machine there."""
+        return self.system.at(self.t).state(*self.rates[:, None])
+
+    @cached_property
     def motion(self) -> np.ndarray:
         """All coordinates of the mechanism, their rates and accelerations (3, C)."""
-        instants, parts = self.system.at(self.t), self.rates[:, None]
-        rigid = instants.motion(*parts)
-        elastic = [instants.split(x)[1] for x in parts]
-        return np.hstack([np.concatenate([rigid.q, rigid.qd, rigid.qdd]), np.concatenate(elastic)])
+        motion = self.state.motion
+        rigid = np.concatenate([motion.q, motion.qd, motion.qdd])
+        return np.hstack([rigid, np.concatenate(self.state.elastic)])
 
     def loops(self, poses: np.ndarray) -> ClosedLoops:
         """Return the closed loops at poses (n, C)."""
@@ -63,16 +69,12 @@ class Linearised:
         return self.system.loops.at(self.system.mechanism, poses[:, :rigid], poses[:, rigid:])
 
     @cached_property
-    def time_step(self) -> float:
-        """Time in which the motion goes as far as differences need, s."""
-        rigid = self.system.mechanism.num_rigid
-        speed, rate = self._size(self.motion[1:, :rigid].T, self.motion[1:, rigid:].T)
-        return float(POLE_STEP / max(speed + np.sqrt(rate), POLE_STEP))
-
-    @cached_property
     def to_rates(self) -> tuple[np.ndarray, np.ndarray]:
         """Weights (7, 3) that move coordinates by rates, (3, 7) that differentiate, in time."""
-        powers = self.time_step ** np.arange(3.0)
+        rigid = self.system.mechanism.num_rigid
+        speed, rate = self._size(self.motion[1:, :rigid].T, self.motion[1:, rigid:].T)
+        step = POLE_STEP / max(speed + np.sqrt(rate), POLE_STEP)  # s
+        powers = step ** np.arange(3.0)
         return POWERS * powers, DIFFERENCES / powers[:, None]
 
     @cached_property
@@ -90,18 +92,16 @@ class Linearised:
     def dependent(self) -> np.ndarray:
         """As many unknowns as G has independent rows, which follow from the others."""
         # Joints without a drive first; loops that rigid arms would lock take elastic coordinates.
-        from scipy.linalg import qr
-
-        R, moving, _ = self.system.ends
-        joints, G = np.flatnonzero(~self.system.drives.driven), self.constraints[0, :, :moving]
-        scale = np.abs(G[:, R:]).max(initial=0.0) or 1.0
-        sizes = np.linalg.svd(np.hstack([G[:, :R], G[:, R:] / scale]), compute_uv=False)
-        rank = int((sizes > ROUNDING * sizes.max(initial=0.0)).sum())
-        if rank <= len(joints):
+        R, joints = self.system.ends[0], np.flatnonzero(~self.system.drives.driven)
+        G = self.constraints[0]
+        elastic = G[:, self.system.elastic_columns]
+        scale = np.abs(elastic).max(initial=0.0) or 1.0
+        missing = rank(np.hstack([G[:, :R], elastic / scale])) - len(joints)
+        if missing <= 0:
             return joints
         left = np.linalg.qr(G[:, joints], mode="complete")[0][:, len(joints) :]
-        order = qr(left.T @ G[:, R:], mode="r", pivoting=True)[1]
-        return np.concatenate([joints, R + order[: rank - len(joints)]])
+        order = qr(left.T @ elastic, mode="r", pivoting=True)[1]
+        return np.concatenate([joints, R + order[:missing]])
 
     @cached_property
     def independent(self) -> np.ndarray:

@@ -16,14 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.machine_system import Problem
-from dolfinopt.multibody.dimension import SPACE
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
-from dolfinopt.multibody.tree import Mechanism
 
 
 @dataclass(frozen=True)
@@ -52,25 +50,9 @@ def load_counts(body: ShapeIntegrals) -> LoadCounts:
     return LoadCounts(d + g, len(body.outboard), g * body.num_modes)
 
 
-@dataclass(frozen=True, eq=False)
-class LoadGradient:
-    """Derivatives of a function of the load coefficients.
-
-    Attributes:
-        by_rates: (3, n, S) by the system's unknowns and their derivatives.
-        by_bodies: by the shape integrals of every body, unknowns held.
-    """
-
-    by_rates: np.ndarray
-    by_bodies: list[ShapeIntegrals]
-
-
 def load_gradient(
-    system: Problem,
-    t: np.ndarray,
-    rates: Rates,
-    by_coefficients: Sequence[np.ndarray],
-) -> LoadGradient:
+    system: MachineSystem, t: np.ndarray, rates: Rates, by_coefficients: Sequence[np.ndarray]
+) -> tuple[np.ndarray, list[ShapeIntegrals]]:
     """Differentiate a function of `load_coefficients`, given its derivatives by them.
 
     Args:
@@ -78,84 +60,69 @@ def load_gradient(
         t: (n,) instants, s.
         rates: its unknowns and their derivatives there, each (n, S).
         by_coefficients: (n, 7 + 2 q or 18 + 9 q) of every body.
+
+    Returns:
+        By the unknowns and their derivatives (3, n, S); by every body's integrals, unknowns held.
     """
-    probe = _Probe(system)
-    at = tuple(probe.spread(x) for x in rates)
-    multipliers = np.zeros((len(t), probe.system.num_coordinates))
-    for part, by in zip(probe.places, by_coefficients, strict=True):
+    probed = ProbedSystem(system)
+    multipliers = np.zeros((len(t), probed.system.num_coordinates))
+    for part, by in zip(probed.places, by_coefficients, strict=True):
         multipliers[:, part] = -by
-    instants = probe.system.at(t)
-    tangent = instants.linearise(*at)
-    by_rates = np.stack(tangent.transposed(multipliers))[:, :, probe.own]
-    y, yd, ydd = at
-    wide = probe.system.body_gradient(instants, y, yd, ydd, multipliers)
-    parts = [
+    y, yd, ydd = (probed.spread(x) for x in rates)
+    instants = probed.system.at(t)
+    by_rates = np.stack(instants.linearise(y, yd, ydd).transposed(multipliers))
+    wide = instants.state(y, yd, ydd).body_gradient(multipliers)
+    by_bodies = [
         by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)
     ]
-    return LoadGradient(by_rates, parts)
+    return by_rates[:, :, probed.own], by_bodies
 
 
-class _Probe:
-    """A system whose bodies have a coordinate more for every load, which stays at zero."""
+class ProbedSystem:
+    """A system whose bodies have a coordinate more for every load, which stays at zero.
 
-    def __init__(self, system: Problem):
-        mechanism: Mechanism = system.mechanism
-        first = system.elastic_columns.start or 0
-        own = list(range(first))
-        self.places: list[slice] = []
-        end = first
-        for body in mechanism.bodies:
-            q, more = body.num_modes, load_counts(body).total
-            own += range(end, end + q)
-            self.places.append(slice(end + q, end + q + more))
-            end += q + more
-        rest = system.num_coordinates - first - mechanism.num_coordinates
-        # (S,) places of the system's unknowns among its; `places` are the added ones of every body.
-        self.own = np.array([*own, *range(end, end + rest)], dtype=int)
-        self._size = end + rest
-        bodies = tuple(map(_with_probes, mechanism.bodies))
-        change: dict[str, Any] = {"mechanism": replace(mechanism, bodies=bodies)}
-        self.system: Any = replace(system, **change)
+    Attributes:
+        system: with these coordinates.
+        places: of the added ones of every body among all.
+        own: (S,) places of the coordinates that it had.
+    """
+
+    def __init__(self, system: MachineSystem) -> None:
+        """Add them behind every body's own."""
+        bodies = tuple(map(_with_probes, system.mechanism.bodies))
+        self.system = replace(system, mechanism=replace(system.mechanism, bodies=bodies))
+        pairs = zip(self.system.body_columns, system.mechanism.bodies, strict=True)
+        self.places = [slice(part.start + body.num_modes, part.stop) for part, body in pairs]
+        added = np.zeros(self.system.num_coordinates, dtype=bool)
+        for part in self.places:
+            added[part] = True
+        self.own = np.flatnonzero(~added)
 
     def spread(self, x: np.ndarray) -> np.ndarray:
         """Return the larger system's unknowns (n, S + ...) of the system's (n, S)."""
-        out = np.zeros((len(x), self._size))
+        out = np.zeros((len(x), self.system.num_coordinates))
         out[:, self.own] = x
         return out
 
 
 def _with_probes(body: ShapeIntegrals) -> ShapeIntegrals:
     """Return the body with one coordinate more for every entry of c, which alone loads it."""
-    q, more = body.num_modes, load_counts(body).total
-    wide = body.in_basis(np.eye(q, q + more))
+    q, counts, (d, _) = body.num_modes, load_counts(body), body.w.shape
+    dim, b = DIMENSIONS[d], counts.outboard
+    wide = body.in_basis(np.eye(q, q + counts.total))
     w, W, outboard, K = wide.w.copy(), wide.W.copy(), wide.outboard.copy(), wide.K.copy()
-    k = 1 + q + np.arange(more)  # beside the reference position and the modes
-    if len(body.W) == SPACE.g:
-        _probe_space(w, W, outboard, k)
-        K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
-        return replace(wide, w=w, W=W, outboard=outboard, K=K)
-    w[0, k[0]] = w[1, k[1]] = 1.0  # C
-    W[1, k[2], 0], W[1, 0, k[2]] = 1.0, -1.0  # r
-    W[0, k[3], 0] = W[0, 0, k[3]] = 1.0  # j
-    outboard[[0, 1, 2], q + np.array([4, 5, 6])] = 1.0
-    modes, radial, around = 1 + np.arange(q), k[7 : 7 + q], k[7 + q :]
-    W[0, radial, modes] = W[0, modes, radial] = 1.0  # M
-    W[1, around, modes], W[1, modes, around] = 1.0, -1.0  # G
+    k = 1 + q + np.arange(counts.total)  # beside the reference position and the modes
+    frame, on_interfaces, elastic = np.split(k, [counts.frame, counts.frame + b])
+    by_component = np.empty_like(frame)
+    by_component[dim.loads] = frame
+    w[np.arange(d), by_component[:d]] = 1.0
+    # W_c of a coordinate and the rest is that of the rest and the coordinate, transposed.
+    transposed, columns = dim.transposed(np.eye(dim.g)), np.arange(1 + q)
+    for c, own in enumerate(elastic.reshape(dim.g, q)):
+        rows = np.append(by_component[d + c], own)
+        W[c, rows, columns] = 1.0
+        W[:, columns, rows] += transposed[:, c, None]
+    outboard[np.arange(b), on_interfaces - 1] = 1.0
     K[k - 1, k - 1] = 1.0  # nothing moves them, but K is to be regular
     return replace(wide, w=w, W=W, outboard=outboard, K=K)
-
-
-def _probe_space(w: np.ndarray, W: np.ndarray, outboard: np.ndarray, k: np.ndarray) -> None:
-    """Give the coordinates k of a spatial body one load each, in the order of c."""
-    b = len(outboard)
-    q = (len(k) - 12 - b) // 9
-    partners = np.arange(9).reshape(3, 3).T.ravel()  # W_ba = W_ab'
-    w[np.arange(3), k[:3]] = 1.0
-    for ab in range(9):
-        at = k[3 + ab]
-        W[ab, at, 0] = W[partners[ab], 0, at] = 1.0
-        first = 12 + b + ab * q
-        own, modes = k[first : first + q], 1 + np.arange(q)
-        W[ab, own, modes] = W[partners[ab], modes, own] = 1.0
-    outboard[np.arange(b), k[12 : 12 + b] - 1] = 1.0

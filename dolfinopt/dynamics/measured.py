@@ -12,7 +12,7 @@ USUAL_TOLERANCE = 2.8e-4  # that such steps with four stages meet: paper's examp
 # some ten percent from design to design, and a grid that is refined costs more than one too fine.
 ACCEPTED_SHARE = 0.6
 AIM = 0.4
-# Growth of the number of steps: least, least while vibrations are not resolved, and most.
+# Growth of the number of steps: least, least where the last one did not help, and most.
 FINER_GRID_RATIOS = (1.15, 2.5, 6.0)
 NEIGHBOURS_RATIO = 3.0  # of the lengths of two steps in succession, at most
 GRIDS_LIMIT = 12
@@ -45,7 +45,6 @@ DEFLECTION_LIMIT = 0.5
 # Share of the largest group against which one that nearly rests beside the others is measured:
 # rounding and Newton's leftover of the large ones is no error of the small one.
 RESTING_GROUP_SHARE = 1e-3
-COMPARED_STEP_COUNTS = 16  # numbers of steps, about, after which a free vibration is compared
 
 # -- adjoint ---------------------------------------------------------------------------------
 
@@ -80,3 +79,7 @@ KEPT_INSTANTS_LIMIT = 20_000
 # Largest displacement, m or rad, along a vibration or the motion over which sixth-order differences
 # are taken: what they leave out and rounding are both below 1e-10 of a first derivative.
 POLE_STEP = 3e-3
+
+# -- drives ----------------------------------------------------------------------------------
+
+LINEAR_DRIVE_SHARE = 0.95  # of its limit, up to which a drive gives what is wanted of it

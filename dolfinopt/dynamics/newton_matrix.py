@@ -13,6 +13,7 @@ Without J_fs, which costs a tenth of an iteration, it takes two to three times a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -205,15 +206,23 @@ def factorise(
 
 
 def matrix_of(stages: Stages, tangent: Linearisation, slow: np.ndarray) -> NewtonMatrix:
-    """Return Newton's matrix of a tangent by the slow coordinates at the n s stages."""
+    """Return Newton's matrix of a tangent by the slow coordinates at the n s stages.
+
+    Of a tangent at n instants, each of them stands for all stages of its step.
+    """
     fast = np.setdiff1d(np.arange(stages.preconditioner.system.num_coordinates), slow)
-    block, beginning = _blocks(stages, tangent.dense())
+    count, s, size = len(stages.h), len(stages.method.c), len(slow)
+    by_rates = tangent.dense().reshape(count, -1, size, 3, size)
     try:
-        inverse = np.linalg.inv(block)
+        inverse = _inverse(stages, by_rates)
     except np.linalg.LinAlgError:
-        inverse = np.full_like(block, np.nan)  # refused by whoever asked
-    size = len(slow)
-    answer = -(inverse @ beginning).reshape(len(block), -1, size, 2 * size)
+        inverse = np.full((count, s * size, s * size), np.nan)  # refused by whoever asked
+    # q, qd and qdd of stage i by q and qd at the step's beginning: 1, 0, 0 and c_i h, 1, 0.
+    by_first = np.zeros((count, s, 1, 2, 3))
+    by_first[..., 0, 0] = by_first[..., 1, 1] = 1.0
+    by_first[..., 1, 0] = (stages.h[:, None] * stages.method.c)[..., None]
+    answer = -(inverse @ (by_first @ by_rates).reshape(count, s * size, -1))
+    answer = answer.reshape(count, s, size, 2 * size)
     transfer = end_gain(stages, answer) + np.eye(2 * size)
     diagonal = np.arange(size)
     transfer[:, diagonal, size + diagonal] += stages.h[:, None]
@@ -222,22 +231,46 @@ def matrix_of(stages: Stages, tangent: Linearisation, slow: np.ndarray) -> Newto
     return NewtonMatrix(stages, tangent, slow, fast, *dense, *single)
 
 
-def _blocks(stages: Stages, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steps' residuals by accelerations (n, s S, s S) and first state (n, s S, 2 S)."""
-    method, (count, s) = stages.method, (len(stages.h), len(stages.method.c))
-    h, size = stages.h[:, None, None], jacobian.shape[1]
-    by_rates = jacobian.reshape(count, s, size, 3, size)
-    # q, qd and qdd of stage i by the accelerations of stage j: h^2 (A A)_ij, h A_ij, 1_ij; and by
-    # q and qd of the beginning: 1, 0, 0 and c_i h, 1, 0.
+def _inverse(stages: Stages, by_rates: np.ndarray) -> np.ndarray:
+    """Return the inverse (n, s S, s S) of the steps' residuals by their accelerations.
+
+    Args:
+        stages: n steps.
+        by_rates: (n, s, S, 3, S) derivative of the stages' rows by q, qd, qdd; or (n, 1, S, 3, S).
+    """
+    method, h, (count, tangents, size, _, _) = stages.method, stages.h, by_rates.shape
+    s = len(method.c)
+    if tangents == 1 < s:
+        k, d, m = np.moveaxis(by_rates[:, 0], 2, 0)
+        inverse = by_eigenvalues(stages, k, d, m, np.linalg.inv)
+        return inverse.transpose(2, 0, 3, 1, 4).reshape(count, s * size, s * size)
+    # q, qd and qdd of stage i by the accelerations of stage j: h^2 (A A)_ij, h A_ij, 1_ij.
+    h = h[:, None, None]
     mean = np.broadcast_to(np.eye(s), (count, s, s))
     by_stage = np.stack([h * h * method.A2, h * method.A, mean], axis=3)
-    by_first = np.zeros((count, s, 2, 3))
-    by_first[:, :, 0, 0] = by_first[:, :, 1, 1] = 1.0
-    by_first[:, :, 1, 0] = stages.h[:, None] * method.c
-    shape = (count, s * size, -1)
-    return (by_stage[:, :, None] @ by_rates).reshape(shape), (
-        by_first[:, :, None] @ by_rates
-    ).reshape(shape)
+    return np.linalg.inv((by_stage[:, :, None] @ by_rates).reshape(count, s * size, s * size))
+
+
+def by_eigenvalues(
+    stages: Stages,
+    k: np.ndarray,
+    d: np.ndarray,
+    m: np.ndarray,
+    invert: Callable[[np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Return the inverse (s, s, n, ...) of m + h A d + h^2 A^2 k in the eigenvectors of A.
+
+    Args:
+        stages: n steps.
+        k, d, m: (n, ...) or (...) of all stages.
+        invert: what takes the inverse (s, n, ...) of each eigenvalue.
+    """
+    values, X = np.linalg.eig(stages.method.A)
+    s, h = len(values), stages.h.reshape(-1, *[1] * (k.ndim - (k.ndim > 1)))
+    ha = np.multiply.outer(values, h)
+    each = invert(m + ha * (d + ha * k))
+    parts = (X[:, None] * np.linalg.inv(X).T).reshape(s * s, s)
+    return (parts @ each.reshape(s, -1)).real.reshape(s, s, *each.shape[1:])
 
 
 def _diagonal_matrix(
@@ -245,20 +278,15 @@ def _diagonal_matrix(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return inverse, loads, transfer and its band of the fast coordinates, one by one.
 
-    The rows m a + d qd + k q of all stages, m + h A d + h^2 A^2 k, are diagonal in the
-    eigenvectors of A: no matrix is inverted.
+    Their rows are m a + d qd + k q at all stages.
 
     Args:
         stages: n steps.
         k, d, m: (F,).
     """
     method, h = stages.method, stages.h[:, None]
-    values, X = np.linalg.eig(method.A)
-    s, count = len(values), len(h)
-    ha = h * values[:, None, None]  # (s, n, 1)
-    parts = (X[:, None] * np.linalg.inv(X).T).reshape(s * s, s)
-    each = 1.0 / (m + ha * (d + ha * k))
-    inverse = (parts @ each.reshape(s, -1)).real.reshape(s, s, count, -1)
+    s, count = len(method.c), len(h)
+    inverse = by_eigenvalues(stages, k, d, m, np.reciprocal)
     loads = np.empty((2, count, s, len(k)))
     loads[0] = k
     loads[1] = d + h[:, :, None] * method.c[:, None] * k

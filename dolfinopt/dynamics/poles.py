@@ -70,7 +70,7 @@ class Poles:
         instants = system.at(np.repeat(self.one.t, len(rows)))
         tangent = instants.linearise(*rates)
         by_rates = np.stack([x.sum(axis=0) for x in tangent.transposed(rows)])
-        by_bodies = system.body_gradient(instants, rates[0], rates[1], rates[2], rows)
+        by_bodies = instants.state(*rates).body_gradient(rows)
         if system.loops is not None:
             held = (held[:, :, None, :] * shares).reshape(*held.shape[:2], -1)
             own, parts = self._by_constraints(change, held.transpose(0, 2, 1))

@@ -130,7 +130,7 @@ class _Integration:
         self.strategy = Strategy.HORIZON if preconditioner.guided else Strategy.FREE
         self._step_error = MARCH_ERROR_SHARE * tolerance
         self._state = self._system.initial_state()
-        self._iterations, self._stalled, self._unresolved = 0, 0, 0.0
+        self._iterations, self._stalled = 0, 0
         self._progress = SlowWork("simulation")
         self._kept: tuple[np.ndarray, Stages] | None = None
         self._matrix: NewtonMatrix | None = None
@@ -174,8 +174,7 @@ class _Integration:
         # Vibrations that are not resolved hardly get smaller with more steps, until they are.
         stalls = before is not None and error > 0.9 * before.error
         self._stalled += stalls
-        unresolved = stalls or self._unresolved > 0.5 * error
-        least = FINER_GRID_RATIOS[1] if unresolved else FINER_GRID_RATIOS[0]
+        least = FINER_GRID_RATIOS[1] if stalls else FINER_GRID_RATIOS[0]
         return finer(self._system, self.time_grid, errors, 1.0 / over, self._stages, least)
 
     def _best(self) -> Solution:
@@ -236,11 +235,11 @@ class _Integration:
         """Return the solution with its estimated error, and the errors (n,) that steps add."""
         stages = self._steps()
         found = estimate(stages, self.time_grid, self._state, a, self._matrix)
-        self._unresolved = unresolved(stages, self.time_grid, self._state, a)
-        error = found.error + self._unresolved
+        vibrations, lost = unresolved(stages, self.time_grid, self._state, a)
         begin, c = step_beginnings(stages, self._state, a), stages.method.c
         spent, how = self._iterations, self.strategy
-        return Solution(self.time_grid, c, *begin, a, error, spent, how), found.steps
+        error = found.error + vibrations
+        return Solution(self.time_grid, c, *begin, a, error, spent, how), found.steps + lost
 
     def _steps(self) -> Stages:
         """Return the stages of the present steps."""

@@ -9,7 +9,7 @@ import numpy as np
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.machine_system import Problem
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.march import BEYOND, REMEDY
 from dolfinopt.dynamics.measured import DEFLECTION_LIMIT
 from dolfinopt.dynamics.response_instants import response_instants
@@ -86,7 +86,7 @@ def _check_deflections(trajectory: Trajectory) -> None:
     )
 
 
-def _trajectory(problem: Problem, scene: Scene, solution: Solution) -> Trajectory:
+def _trajectory(problem: MachineSystem, scene: Scene, solution: Solution) -> Trajectory:
     """Return a solution with the instants at which responses look at it."""
     t = response_instants(
         solution,

@@ -15,7 +15,8 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.poles import damping_ratios
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.kinematics import end_effector_gradient
+from dolfinopt.multibody.kinematics import Posed, SiteMotion
+from dolfinopt.multibody.shape_integrals import Rates
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.machine import Control
 
@@ -74,34 +75,26 @@ def check_instant(scene: Scene, t: float) -> None:
         )
 
 
-def free_machine(trajectory: Trajectory, t: float) -> Linearised:
-    """Return the machine at an instant of its motion, all its drives free where none controls it.
+def free_machine(scene: Scene, known: MachineSystem, t: float, rates: Rates) -> Linearised:
+    """Return a scene's machine at an instant t, s, all its drives free where none controls it.
 
-    Raises:
-        InputError: the instant is not within the motion.
+    `rates` (1, S) are unknowns of the scene's system, `known`, and their derivatives.
     """
-    scene, problem = trajectory.scene, trajectory.problem
-    check_instant(scene, t)
-    seen = trajectory.at(np.array([t]))
-    if isinstance(problem, MachineSystem) and scene.control is not None:
-        return linearised(problem, t, seen.unknowns)
-    bodies = list(problem.mechanism.bodies[: len(scene.arms)])  # bearings follow from the scene
+    if scene.control is not None:
+        return linearised(known, t, rates)
+    bodies = list(known.mechanism.arms)  # bearings follow from the scene
     # Drives on all driven coordinates, whose forces nothing asks for.
     none = (0.0,) * len(scene.driven)
     control = Control(feed_forward="none", stiffness=none, damping=none)
     system = build_system(scene.model_copy(update={"control": control}), bodies)
-    assert isinstance(system, MachineSystem)
     # Drives that nothing controls are where the motion has them; so are motors before springs.
-    rates = np.zeros((3, 1, system.num_coordinates))
-    R, moving, last = system.ends
-    motion, desired = seen.motion, seen.desired
-    pairs = ((motion.q, desired.q), (motion.qd, desired.qd), (motion.qdd, desired.qdd))
-    for k, (actual, wanted) in enumerate(pairs):
-        rates[k, :, :R] = (actual - wanted)[:, system.drives.free]
-        rates[k, :, R:moving] = seen.unknowns[k][:, problem.elastic_columns]
-    if isinstance(problem, MachineSystem):
-        rates[2, :, moving:last] = problem.at(seen.t).split(seen.unknowns[2])[2]
-    return linearised(system, t, tuple(rates))
+    every = np.zeros((3, 1, system.num_coordinates))
+    free = np.searchsorted(system.drives.free, known.drives.free)
+    for new, old in zip(every, rates, strict=True):
+        new[:, free] = old[:, : len(free)]
+        new[:, system.elastic_columns] = old[:, known.elastic_columns]
+        new[:, system.constraint_columns] = old[:, known.constraint_columns]
+    return linearised(system, t, (every[0], every[1], every[2]))
 
 
 def state_space(trajectory: Trajectory, t: float) -> StateSpace:
@@ -119,9 +112,17 @@ def state_space(trajectory: Trajectory, t: float) -> StateSpace:
     Raises:
         InputError: the instant is not within the motion, or a coordinate has no mass.
     """
-    one, scene = free_machine(trajectory, t), trajectory.scene
+    check_instant(trajectory.scene, t)
+    rates = trajectory.at(np.array([t])).unknowns
+    return linear_model(trajectory.scene, trajectory.problem, t, rates)
+
+
+def linear_model(scene: Scene, known: MachineSystem, t: float, rates: Rates) -> StateSpace:
+    """Return what `state_space` does, of the unknowns of a scene's system, see `free_machine`."""
+    one = free_machine(scene, known, t, rates)
     system, N = one.system, one.directions[0]
-    drives, wrench = _driven(system), _wrench(one)
+    driven = system.drive_columns[system.drives.driven]
+    drives, wrench = np.eye(system.num_coordinates)[:, driven], _wrench(one)
     b = N.T @ np.hstack([drives, wrench])
     place = wrench[:, : scene.dimension].T
     bent = np.zeros_like(place)
@@ -161,19 +162,11 @@ def coordinate_names(system: MachineSystem, scene: Scene) -> list[str]:
     return names + [f"motor of {rigid[int(k)]}" for k in joints]
 
 
-def _driven(system: MachineSystem) -> np.ndarray:
-    """Return what a unit force of every drive is on every unknown (S, drives)."""
-    return np.eye(system.num_coordinates)[:, system.drive_columns[system.drives.driven]]
-
-
 def _wrench(one: Linearised) -> np.ndarray:
     """Return what unit forces and moments on the end-effector are on every unknown (S, d + r)."""
-    system, instants = one.system, one.system.at(one.t)
-    motion, q = instants.motion(*one.rates[:, None]), instants.split(one.rates[:1])[1]
-    d, r = system.mechanism.dim.d, system.mechanism.dim.r
-    found = np.zeros((system.num_coordinates, d + r))
-    for k, unit in enumerate(np.eye(d + r)):
-        parts = unit[None, :d], unit[None, d:]
-        by_q, by_rigid, _ = end_effector_gradient(system.mechanism, motion, q, *parts)
-        found[: system.ends[1], k] = np.hstack([by_rigid[:, system.drives.free], by_q])[0]
+    system, dim, state = one.system, one.system.mechanism.dim, one.state
+    posed = Posed(system.mechanism, state.motion.q, state.elastic[0])
+    site = SiteMotion(posed, system.mechanism.end, np.zeros(dim.d), np.eye(dim.d))
+    found = np.zeros((system.num_coordinates, dim.b))
+    found[: system.ends[1]] = site.by[:, system.columns, 0].T
     return found

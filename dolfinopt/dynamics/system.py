@@ -1,8 +1,8 @@
 """Interface between mechanics and integrators: what is solved, and by what it is measured.
 
 An integrator sees a system of N coordinates through its residual r(t, q, q', q'') = 0 alone. What
-a mechanism of elastic bodies makes of it stands in `elastic_system`; another system is another
-file with another implementation.
+a machine of elastic bodies makes of it stands in `machine_system`; another system is another file
+with another implementation.
 
 Coordinates may be free rigid ones (m, rad) beside elastic ones: control forces that depend on them
 are part of the residual. A constraint g(q, t) = 0 is a row of the residual, its multiplier the
@@ -30,9 +30,6 @@ class Linearisation(Protocol):
 
     Of m rows or changes, a multiple of n, each instant stands for as many in turn.
     """
-
-    def window(self, first: int, last: int) -> Linearisation:
-        """Return it at the instants first..last - 1."""
 
     def interpolated(self, weights: np.ndarray, keep: np.ndarray) -> Linearisation:
         """Return it by coordinates `keep` of the S, at m instants between every s by (m, s)."""

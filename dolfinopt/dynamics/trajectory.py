@@ -5,29 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.drive_forces import DriveForces
-from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import FILE_ROUNDING
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import (
-    deviation,
     end_effector,
     end_effector_gradient,
     end_rotation,
     lengths,
 )
 from dolfinopt.multibody.loads import load_coefficients
-from dolfinopt.multibody.newton_euler import inverse_dynamics
-from dolfinopt.multibody.ranks import least_norm
 from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import Rates
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ class Trajectory:
         scenarios: the same design under the scene's scenarios.
     """
 
-    problem: ElasticSystem | MachineSystem
+    problem: MachineSystem
     scene: Scene
     solution: Solution
     t: np.ndarray
@@ -94,7 +93,7 @@ class Trajectory:
         return (self.solution, *(one.solution for one in self.scenarios))
 
     @property
-    def mechanism(self) -> Any:
+    def mechanism(self) -> Mechanism:
         """What moved."""
         return self.problem.mechanism
 
@@ -109,10 +108,15 @@ class Trajectory:
         return DriveForces(self.problem, self.t, self.unknowns)
 
     @cached_property
-    def unknowns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def unknowns(self) -> Rates:
         """The system's coordinates and their rates, each (n, S)."""
         y, yd, ydd = (self.solution.sample(self.t, k) for k in range(3))
         return y, yd, ydd
+
+    @cached_property
+    def state(self) -> MachineState:
+        """The system at the instants."""
+        return self.problem.at(self.t).state(*self.unknowns)
 
     @cached_property
     def q_e(self) -> np.ndarray:
@@ -128,11 +132,10 @@ class Trajectory:
     def deviation(self) -> np.ndarray:
         """Flexible minus rigid end-effector (n, 2), m.
 
-        Of free rigid coordinates the end-effector as it moves, less that of the desired motion: of
-        a slider along its line; of a pinned end none but the integrator's error.
+        The end-effector as it moves, less that of the desired motion: of a slider along its line;
+        of a pinned end none but the integrator's error.
+        Source: Seifried, Moghadasi & Held (2015), eq. (6), doi:10.1016/j.piutam.2015.01.018.
         """
-        if isinstance(self.problem, ElasticSystem):
-            return deviation(self.mechanism, self.motion, self.q_e)
         none = np.zeros_like(self.q_e)
         return self.end - end_effector(self.mechanism, self.desired, none)
 
@@ -157,12 +160,12 @@ class Trajectory:
     @cached_property
     def deflections(self) -> np.ndarray:
         """Largest deflection of every arm's end in its own frame, over its length (arms,)."""
-        return self.mechanism.deflections(self.q_e)
+        return self.mechanism.deflections(self.q_e)[0]
 
     @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
-        return self.mechanism.rotations(self.q_e)
+        return self.mechanism.deflections(self.q_e)[1]
 
     @cached_property
     def joint_forces(self) -> np.ndarray:
@@ -171,35 +174,25 @@ class Trajectory:
         With control they are the control's. A fixed base bears the cart's as the horizontal force
         on the first joint; a joint that follows from the others in a closed loop has none.
         """
-        if isinstance(self.problem, MachineSystem):
-            return self.problem.at(self.t).forces(*self.unknowns)
-        qd, qdd = self.unknowns[1:]
-        return inverse_dynamics(self.mechanism, self.motion, self.q_e, qd, qdd)[1]
+        return self.state.forces()
 
     @cached_property
     def load_coefficients(self) -> list[np.ndarray]:
         """What loads every body (n, 7 + 2 q), in space (n, 18 + 9 q), see the function."""
-        pull = {}
-        if self.loops is not None:
-            here = self.loops.at(self.mechanism, self.motion.q, self.q_e)
-            pull = here.interface_loads(self._multipliers)
-        q, qd, qdd = (x[:, self.problem.elastic_columns] for x in self.unknowns)
-        return load_coefficients(self.mechanism, self.motion, (q, qd, qdd), pull)
-
-    @property
-    def _multipliers(self) -> np.ndarray:
-        assert isinstance(self.problem, MachineSystem)
-        return self.unknowns[2][:, slice(*self.problem.ends[1:])]
+        state, pull = self.state, {}
+        if state.closed is not None:
+            pull = state.closed.interface_loads(state.multipliers)
+        return load_coefficients(self.mechanism, self.motion, state.elastic, pull)
 
     @property
     def is_machine(self) -> bool:
         """Whether rigid coordinates are unknown: they may differ from the desired ones."""
-        return isinstance(self.problem, MachineSystem)
+        return not self.problem.is_prescribed
 
     @property
     def loops(self) -> Loops | None:
         """What closes loops, in the plane and in space, or None."""
-        return self.problem.loops if isinstance(self.problem, MachineSystem) else None
+        return self.problem.loops
 
     @property
     def closure(self) -> Tie | None:
@@ -214,9 +207,7 @@ class Trajectory:
         by +90 degrees, without the given constant force; of a pin along x and y. In space those of
         every closure on its first interface, in the joint's frame, see `Closures.parts`.
         """
-        if not isinstance(self.problem, MachineSystem) or self.loops is None:
-            return None
-        return self.loops.reactions(self._multipliers)
+        return None if self.loops is None else self.loops.reactions(self.state.multipliers)
 
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
@@ -251,28 +242,21 @@ class Trajectory:
         out: np.ndarray = (self.end - closure.point) @ [across.e[1], -across.e[0]]
         return out
 
-    @property
-    def motor_columns(self) -> tuple[int, ...]:
-        """Rigid coordinates whose motors move by themselves, behind springs and under control."""
-        if not isinstance(self.problem, MachineSystem):
-            return ()
-        drives = self.problem.drives
-        return tuple(map(int, drives.free[drives.springs.joints]))
-
     @cached_property
     def motors(self) -> np.ndarray | None:
-        """Angles of these motors as their joints would have them (n, M), rad, m; None without."""
-        if not isinstance(self.problem, MachineSystem) or not self.motor_columns:
+        """Angles of motors behind springs under control, as their joints would have them (n, M).
+
+        rad, m; None without.
+        """
+        joints = self.problem.motor_joints
+        if not len(joints):
             return None
-        columns = list(self.motor_columns)
-        return self.desired.q[:, columns] + self.problem.at(self.t).motors(self.unknowns[0])
+        return self.desired.q[:, joints] + self.unknowns[0][:, self.problem.motor_columns]
 
     @cached_property
     def motion(self) -> RigidMotion:
         """Rigid coordinates at the instants, as they move."""
-        if isinstance(self.problem, ElasticSystem):
-            return self.desired
-        return self.problem.at(self.t).motion(*self.unknowns)
+        return self.state.motion if self.is_machine else self.desired
 
     @cached_property
     def desired(self) -> RigidMotion:
@@ -301,10 +285,8 @@ class Trajectory:
         motion, q = self.motion[indices], self.q_e[indices]
         every = end_effector_gradient(self.mechanism, motion, q, weights, moments)
         by_q, by_rigid, by_bodies = every
-        by = self.by_unknowns(by_q)
-        if isinstance(self.problem, MachineSystem):
-            free = self.problem.drives.free
-            by[:, : len(free)] = by_rigid[:, free]
+        by, free = self.by_unknowns(by_q), self.problem.drives.free
+        by[:, : len(free)] = by_rigid[:, free]
         return by, by_bodies
 
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
@@ -317,16 +299,13 @@ class Trajectory:
             indices: (n,) of the instants.
             by: (n, S) derivatives by the system's coordinates, each held.
         """
-        problem = self.problem
-        by_q = by[:, problem.elastic_columns]
-        if not isinstance(problem, MachineSystem) or problem.loops is None:
-            return by_q
-        q_r, q = self.motion.q[indices], self.q_e[indices]
-        here = problem.loops.at(self.mechanism, q_r, q)
-        J = here.jacobian[:, :, problem.columns]
-        dependent = np.flatnonzero(~problem.drives.driven)
-        by_g = least_norm(J[:, :, dependent].swapaxes(1, 2), by[:, dependent])
-        return by_q - np.einsum("nm,nmk->nk", by_g, J[:, :, problem.elastic_columns])
+        problem, rigid = self.problem, self.mechanism.num_rigid
+        every = np.zeros((len(by), rigid + self.mechanism.num_coordinates))
+        every[:, problem.columns] = by[:, : problem.ends[1]]
+        if problem.loops is not None:
+            closed = problem.loops.at(self.mechanism, self.motion.q[indices], self.q_e[indices])
+            every -= closed.generalised_force(closed.closing(every, problem.drives.dependent))
+        return every[:, rigid:]
 
     @property
     def joint_limits(self) -> tuple[JointLimit, ...]:
@@ -335,29 +314,34 @@ class Trajectory:
 
     def _joint_limits(self) -> Iterator[JointLimit]:
         for k, joint in enumerate(self.scene.movable):
-            slides = joint.type == "prismatic"
-            length, force = ("m", "N") if slides else ("rad", "N m")
+            unit, force = ("m", "N") if joint.type == "prismatic" else ("rad", "N m")
             if joint.position_limits is not None:
-                q = self.motion.q[:, k]
-                width = joint.position_limits[1] - joint.position_limits[0]
-                ends = zip(joint.position_limits, (-1.0, 1.0), strict=True)
-                beyond = [(sign * (q - limit), limit) for limit, sign in ends]
-                over, limit = max(beyond, key=lambda one: float(one[0].max()))
-                at = int(np.argmax(over))
-                met = bool(over[at] <= FILE_ROUNDING * max(width, abs(limit)))
-                value, instant = float(q[at]), float(self.t[at])
-                yield JointLimit(joint.name, "position", limit, value, instant, length, met)
-            for quantity, limit, values, unit in (
-                ("velocity", joint.velocity_limit, self.motion.qd, f"{length}/s"),
+                (lower, upper), q = joint.position_limits, self.motion.q[:, k]
+                sides = (lower - q, lower), (q - upper, upper)
+                over, limit = max(sides, key=lambda side: float(side[0].max()))
+                size = max(upper - lower, abs(limit)) or 1.0
+                yield self._nearest(joint.name, "position", limit, q, over / size, unit)
+            for quantity, bound, values, of in (
+                ("velocity", joint.velocity_limit, self.motion.qd, f"{unit}/s"),
                 ("effort", joint.effort_limit, self.joint_forces, force),
             ):
-                if limit is None:
-                    continue
-                size = np.abs(values[:, k])
-                at = int(np.argmax(size))
-                value, met = float(size[at]), bool(size[at] <= (1.0 + FILE_ROUNDING) * limit)
-                instant = float(self.t[at])
-                yield JointLimit(joint.name, quantity, limit, value, instant, unit, met)
+                if bound is not None:
+                    size = np.abs(values[:, k])
+                    yield self._nearest(joint.name, quantity, bound, size, size / bound - 1.0, of)
+
+    def _nearest(
+        self,
+        joint: str,
+        quantity: str,
+        limit: float,
+        values: np.ndarray,
+        over: np.ndarray,
+        unit: str,
+    ) -> JointLimit:
+        """Return where values (n,) are nearest to a limit; `over` is relative, above 0 beyond."""
+        k = int(np.argmax(over))
+        met = bool(over[k] <= FILE_ROUNDING)
+        return JointLimit(joint, quantity, limit, float(values[k]), float(self.t[k]), unit, met)
 
     @property
     def settling(self) -> float:

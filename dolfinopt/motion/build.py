@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial, wraps
+from functools import lru_cache, wraps
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.motion import plane
 from dolfinopt.motion.constraints import Constraints, Target
-from dolfinopt.motion.measured import (
-    DENSE_INSTANTS,
-    TABLE_CORNERS_LIMIT,
+from dolfinopt.motion.measured import DENSE_INSTANTS, TABLE_CORNERS_LIMIT
+from dolfinopt.motion.paths import (
+    Curve,
+    along,
+    arc,
+    curve_by_chord,
+    curve_by_laws,
+    curve_in_time,
+    inverse,
+    moves,
+    rotation,
 )
+from dolfinopt.motion.plane import Chain
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
-from dolfinopt.motion.task import Words
 from dolfinopt.multibody.build import loops_of, skeleton
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.rotations import roll_pitch_yaw
-from dolfinopt.multibody.tree import repeated
-from dolfinopt.paths import (
-    TIME,
-    Curve,
-    Limits,
-    Table,
-    Values,
-    along,
-    column_names,
-    curve_by_chord,
-    curve_by_laws,
-    curve_in_time,
-    moves,
-    read_table,
-)
+from dolfinopt.scene.csv_table import TIME, Table, column_names, read_table
 from dolfinopt.scene.duration import (
     POINT,
     SAME_TIME,
@@ -47,12 +40,14 @@ from dolfinopt.scene.duration import (
     time_law,
     too_short,
 )
+from dolfinopt.scene.laws import Limits, Values
 from dolfinopt.scene.load import Motion, Scene
 
 if TYPE_CHECKING:
     from dolfinopt.motion.follower import Follower
 
 CART = "cart"  # first column of a table of joints
+TABLES = "points", "joints"  # paths that are tables
 Result = TypeVar("Result")
 
 
@@ -78,15 +73,15 @@ def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
         InputError: the motion cannot be followed or passes a singular position, names the instant;
             or the table cannot be used.
     """
-    if (every := repeated(len(t))) is not None:
-        return rigid_motion(t[every], scene)[: len(t)]
-    if len(t) == 0:
-        return rigid_motion(np.zeros(1), scene)[:0]
     if follows(scene):
         return RigidMotion(*follower(scene).at(t))
     if scene.motion.path in ("joints", "rotation"):
-        return RigidMotion(*_prescribed(t, scene))
-    return RigidMotion(*_chain(t, scene))
+        return RigidMotion(*target_of(t, scene).joints)
+    q, qd, qdd = _chain(scene).on(t, desired_path(t, scene))
+    # Angles whole turns apart are all right; the dense motion tells which.
+    turns = np.round((np.interp(t, *_continuous_shoulder(scene)) - q[:, 1]) / (2.0 * np.pi))
+    q[:, 1] += 2.0 * np.pi * turns
+    return RigidMotion(q, qd, qdd)
 
 
 def follows(scene: Scene) -> bool:
@@ -96,12 +91,15 @@ def follows(scene: Scene) -> bool:
 
 def check_path(scene: Scene) -> None:
     """Raise `InputError` when the scene's motion is impossible at any instant."""
+    # What follows is looked at along the whole motion, whichever instants are asked for.
+    count = 1 if follows(scene) else DENSE_INSTANTS
+    rigid_motion(np.linspace(0.0, _end(scene), count), scene)
+
+
+def _end(scene: Scene) -> float:
+    """Return when the motion ends, s; a rotation goes on."""
     motion = scene.motion
-    if follows(scene):
-        rigid_motion(np.zeros(1), scene)
-        return
-    end = motion.horizon if motion.path == "rotation" else motion.duration
-    rigid_motion(np.linspace(0.0, end, DENSE_INSTANTS), scene)
+    return motion.horizon if motion.path == "rotation" else motion.duration
 
 
 # -- instants --------------------------------------------------------------------------------
@@ -115,9 +113,9 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     """
     motion = scene.motion
     corners, timed = np.zeros(0), False
-    if motion.path in ("points", "joints"):
+    if motion.path in TABLES:
         curve, timed = curve_of(scene)
-        corners = np.array(curve.kinks)
+        corners = curve.kinks
     if not timed:
         few = corners if len(corners) <= TABLE_CORNERS_LIMIT else corners[:0]
         knots = time_law(motion).knots * motion.duration
@@ -130,11 +128,10 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
 
 def table_rows(scene: Scene) -> np.ndarray:
     """Return the instants (m,) of the rows of the motion's table, s."""
-    motion = scene.motion
-    if motion.path not in ("points", "joints"):
+    if scene.motion.path not in TABLES:
         return np.zeros(0)
     curve, timed = curve_of(scene)
-    return curve.u if timed else _when(curve.u[1:-1], motion)
+    return curve.u if timed else _when(curve.u[1:-1], scene.motion)
 
 
 def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
@@ -148,14 +145,14 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
     """
     motion, delay = scene.motion, scene.constraints.settling_after
     dwells = motion.stated_dwells
-    if motion.dwells is True and motion.path in ("points", "joints"):
+    if motion.dwells is True and motion.path in TABLES:
         dwells = curve_of(scene)[0].stops
-    joined: list[tuple[float, float]] = []
+    joined: list[list[float]] = []
     for begin, end in sorted([*dwells, (motion.duration, motion.horizon)]):
         if joined and begin <= joined[-1][1] + SAME_TIME * motion.duration:
-            begin, last = joined.pop()
-            end = max(last, end)
-        joined.append((begin, end))
+            joined[-1][1] = max(joined[-1][1], end)
+        else:
+            joined.append([begin, end])
     for begin, end in joined[:-1]:
         if end - begin <= delay:
             raise InputError(
@@ -170,7 +167,7 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
 def _when(s: np.ndarray, motion: Motion) -> np.ndarray:
     """Return the instants at which the time law reaches s, in (0, 1)."""
     law, last = time_law(motion), motion.duration
-    return plane.inverse(lambda t: law(t, last)[:2], s, s * last, (0.0, last), 0.0)
+    return inverse(lambda t: law(t, last)[0], s, 0.0, last)
 
 
 # -- tables ----------------------------------------------------------------------------------
@@ -245,31 +242,23 @@ def rows_of(scene: Scene) -> Rows:
     """Return the rows of the scene's table; of a line its two ends."""
     motion = scene.motion
     if motion.path == "line":
-        ends = np.array([motion.start, motion.end], dtype=float)
-        start = None if motion.rpy is None else roll_pitch_yaw(motion.rpy)
-        if start is not None:
-            ends = np.hstack([ends, np.zeros((2, 3))])
+        ends, start = np.array([motion.start, motion.end], dtype=float), None
+        if motion.rpy is not None:
+            ends, start = np.pad(ends, ((0, 0), (0, 3))), roll_pitch_yaw(motion.rpy)
         return Rows(Table(scene.source, (1, 2), None, ends), start, 3)
     assert motion.file is not None
     if motion.path == "joints":
-        return Rows(read_table(motion.file, columns_of(scene)))
+        return Rows(read_table(motion.file, _columns_of_joints(scene)))
     if not scene.is_spatial:
         return Rows(read_table(motion.file, POINT))
-    kind, joints = _orientation(scene), prescribed_joints(scene)
-    known = {TIME, *SPACE_POINT, *kind, *joints}
-    for name in column_names(motion.file):
-        if name not in known:
-            raise InputError(
-                f"{motion.file}: unknown column {name!r}; expected {','.join(SPACE_POINT)}, with "
-                f"{TIME}, {','.join(RPY)} or {','.join(VECTOR)}, and joints that the table "
-                f"prescribes ({', '.join(scene.driven)})"
-            )
-    table = read_table(motion.file, (*SPACE_POINT, *kind, *joints))
+    kind = _orientation(scene)
+    further = f", with {','.join(RPY)} or {','.join(VECTOR)}, and joints that it prescribes"
+    table = read_table(motion.file, (*SPACE_POINT, *kind, *prescribed_joints(scene)), further)
     if not kind:
         return Rows(table, None, 3)
-    place, angles, others = np.split(table.rows, [3, 6], axis=1)
+    place, angles, joints = np.split(table.rows, [3, 6], axis=1)
     R = orientations(kind, angles)
-    rows = np.hstack([place, relative_vectors(R), others])
+    rows = np.hstack([place, relative_vectors(R), joints])
     return Rows(replace(table, rows=rows), R[0], 3)
 
 
@@ -281,7 +270,7 @@ def _orientation(scene: Scene) -> tuple[str, ...]:
     return next(kinds, ())
 
 
-def columns_of(scene: Scene) -> tuple[str, ...]:
+def _columns_of_joints(scene: Scene) -> tuple[str, ...]:
     """Return the columns of the scene's table of joints."""
     for reserved in (TIME, CART):
         if not scene.is_spatial and (TIME, *scene.driven).count(reserved) > 1:
@@ -292,6 +281,7 @@ def columns_of(scene: Scene) -> tuple[str, ...]:
     return scene.driven
 
 
+@_kept
 def prescribed_joints(scene: Scene) -> tuple[str, ...]:
     """Return the names of the joints that are columns of the scene's table, or that rotate."""
     motion = scene.motion
@@ -301,232 +291,10 @@ def prescribed_joints(scene: Scene) -> tuple[str, ...]:
     return tuple(name for name in scene.driven if name in names)
 
 
-# -- what the scene prescribes: paths, joints ------------------------------------------------
-
-
-def desired_path(t: np.ndarray, scene: Scene) -> Values:
-    """Return what path or table prescribe and two derivatives: the end-effector's place, joints."""
-    motion = scene.motion
-    if motion.path == "arc":
-        path = partial(plane.arc, radius=motion.radius, flattening=motion.flattening)
-        return along(path, time_law(motion), t, motion.duration)
-    curve, timed = curve_of(scene)
-    return curve(t) if timed else along(curve, time_law(motion), t, motion.duration)
-
-
-def target_of(t: np.ndarray, scene: Scene) -> Target:
-    """Return what the scene prescribes of joints that others follow, and of the end-effector."""
-    springs = [one.length or 0.0 for one in scene.rods if not one.driven]
-    if scene.motion.path in ("joints", "rotation"):
-        free = (np.zeros((len(t), 0)),) * 3
-        return Target(_with_fixed(_prescribed(t, scene), [], springs), free)
-    values, start = desired_path(t, scene), rows_of(scene).start
-    split = [3, 3 if start is None else 6]
-    parts = (np.split(x, split, axis=1) for x in values)
-    place, vectors, joints = zip(*parts, strict=True)
-    turned = None if start is None else turning(start, vectors)
-    return Target(_with_fixed(joints, [], springs), place, turned)
-
-
-def _prescribed(t: np.ndarray, scene: Scene) -> Values:
-    """Return the coordinates that a table or a rotation prescribes, and two derivatives.
-
-    In the plane on a fixed base its constant place before them.
-    """
-    motion = scene.motion
-    if motion.path == "joints":
-        joints = desired_path(t, scene)
-    else:
-        law = time_law(motion)
-        joints = plane.rotation(t, law, motion.speed, motion.start_angle, motion.duration)
-    if scene.is_spatial or motion.base == "cart":
-        return joints
-    return _with_fixed(joints, [motion.base_position], [])
-
-
-def _with_fixed(joints: Values, before: Sequence[float], behind: Sequence[float]) -> Values:
-    """Return coordinates with others before and behind them that stay where they are."""
-    q, qd, qdd = joints
-    places = [np.tile(x, (len(q), 1)) for x in (before, behind)]
-    rest = [np.zeros_like(x) for x in places]
-    around = (places, q), (rest, qd), (rest, qdd)
-    q, qd, qdd = (np.hstack([first, x, last]) for (first, last), x in around)
-    return q, qd, qdd
-
-
-# -- chains of the plane ---------------------------------------------------------------------
-
-
-def _chain(t: np.ndarray, scene: Scene) -> Values:
-    """Return cart and joints (n, 1 + arms) of a chain in the plane on its path."""
-    motion, path = scene.motion, desired_path(t, scene)
-    if len(scene.arms) == 1:
-        length, height = scene.arms[0].length, motion.joint_height
-        return plane.one_arm_on(
-            t, path, length, height, motion.elbow, Words(scene.source, _keys(scene))
-        )
-    found = _bare_chain(t, path, scene)
-    # Both angles of a direction, whole turns apart, are right; the dense motion tells which.
-    times, reference = _continuous_shoulder(scene)
-    turns = np.round((np.interp(t, times, reference) - found[0][:, 1]) / (2.0 * np.pi))
-    found[0][:, 1] += 2.0 * np.pi * turns
-    return found
-
-
-def _bare_chain(t: np.ndarray, path: Values, scene: Scene) -> Values:
-    """Return cart and joints of two and more arms, the first angle up to whole turns."""
-    motion, bend = scene.motion, plane.bend_of(tuple(arm.length for arm in scene.arms))
-    p, v, a = (motion.cart_follow * np.array([1.0, 0.0]) * x for x in path)
-    if motion.base == "fixed":
-        p, v, a = np.tile([motion.base_position, 0.0], (len(t), 1)), 0.0 * v, 0.0 * a
-    base = p + np.array([0.0, motion.joint_height]), v, a
-    return plane.chain_on(t, path, base, bend, motion.elbow, Words(scene.source, _keys(scene)))
-
-
-@_kept
-def _continuous_shoulder(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return dense instants and the first arm's angle there without jumps, rad."""
-    t = np.linspace(0.0, scene.motion.duration, DENSE_INSTANTS)
-    alpha = _bare_chain(t, desired_path(t, scene), scene)[0][:, 1]
-    return t, np.unwrap(alpha)
-
-
-def _keys(scene: Scene) -> str:
-    """Return the keys that move the path, or the shoulder of a chain."""
-    motion = scene.motion
-    keys = {
-        "arc": "motion.radius, motion.flattening",
-        "line": "motion.start, motion.end",
-        "rotation": "motion.start_angle",
-    }.get(motion.path, "the table motion.file")
-    if follows(scene):
-        return keys
-    if motion.base == "fixed":
-        keys += ", motion.base_position"
-    elif len(scene.arms) > 1:
-        keys += ", motion.cart_follow"
-    return f"{keys}, motion.joint_height or the arms' length"
-
-
-# -- joints that follow ----------------------------------------------------------------------
-
-
-@_kept
-def follower(scene: Scene) -> Follower:
-    """Return what follows the scene's path or closes its loops.
-
-    Raises:
-        InputError: the path does not determine the joints; names them and the remedy.
-    """
-    from dolfinopt.motion.follower import Follower
-    from dolfinopt.motion.task import Task
-
-    motion, names = scene.motion, tuple(scene.rigid_units)
-    springs = [one.name for one in scene.rods if not one.driven]
-    base = [CART] if motion.base == "fixed" and not scene.is_spatial else []
-    given = [names.index(one) for one in (*base, *prescribed_joints(scene), *springs)]
-    unknown = [k for k in range(len(names)) if k not in given]
-    slides = np.array([unit == "m" for unit in scene.rigid_units.values()])
-    has_path = motion.path not in ("joints", "rotation")
-    turned = has_path and rows_of(scene).start is not None
-    constraints = Constraints(skeleton(scene), loops_of(scene) or Loops(), slides, has_path, turned)
-    if not constraints.loops.ties:
-        _check_joints(scene, constraints, unknown)
-    guess, width = _guess(scene)
-    num_rows = 0 if motion.path == "rotation" else len(rows_of(scene).table.rows)
-    return Follower(
-        Task(
-            constraints=constraints,
-            names=names,
-            unknown=np.array(unknown, dtype=int),
-            given=np.array(given, dtype=int),
-            passive=np.array(passive_coordinates(scene), dtype=int),
-            target=lambda t: target_of(t, scene),
-            guess=guess,
-            width=width,
-            end=motion.horizon if motion.path == "rotation" else motion.duration,
-            resolution=max(DENSE_INSTANTS, 2 * num_rows),
-            words=Words(
-                scene.source,
-                _keys(scene),
-            ),
-        )
-    )
-
-
-def passive_coordinates(scene: Scene) -> list[int]:
-    """Return the rigid coordinates without a drive, which follow from the others in loops."""
-    if scene.joints:
-        return [k for k, joint in enumerate(scene.movable) if joint.passive]
-    return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
-
-
-def _guess(scene: Scene) -> tuple[np.ndarray, float]:
-    """Return coordinates (R,) near the start, and the width of random starts around them."""
-    found, stated = np.zeros(scene.num_rigid), scene.motion.initial_joints
-    first = 0 if scene.is_spatial else 1
-    if stated is not None:
-        found[first : first + len(stated)] = stated
-        return found, 0.1
-    if scene.closures and not scene.is_spatial:
-        (closure,) = scene.closures
-        base = complex(scene.motion.base_position, scene.motion.joint_height)
-        direction = complex(*(closure.axis or ())[:2])
-        away = complex(*closure.point[:2]) - base
-        joints = _prescribed(np.zeros(1), scene)[0][0, 1:]
-        lengths = np.array([arm.length for arm in scene.arms])
-        found[1:] = plane.branch_guess(joints, lengths, away, direction, closure.side)
-        return found, 0.1
-    return found, 1.5
-
-
-def _check_joints(scene: Scene, constraints: Constraints, unknown: list[int]) -> None:
-    """Raise where a path in space without closures does not determine the joints."""
-    names, where = tuple(scene.rigid_units), f'{scene.source}: motion.path = "{scene.motion.path}"'
-    column = 'columns of joints in the table of motion.path = "points"'
-    tables = 'joint tables, motion.path = "joints"'
-    mechanism = constraints.mechanism
-    moving = {mechanism.joints[i].coordinate for i, _ in mechanism.way}
-    if idle := ", ".join(names[k] for k in unknown if k not in moving):
-        raise InputError(
-            f"{where}: joints that do not move the end-effector ({idle}) have no motion; give them "
-            f"{column}, or {tables}"
-        )
-    if not unknown:
-        raise InputError(f"{where}: its table prescribes all joints; give {tables}, instead")
-    rows = 6 if constraints.turned else 3
-    if len(unknown) > rows:
-        what, more = "a pose determines", ""
-        if not constraints.turned:
-            turn = "motion.rpy" if scene.motion.path == "line" else "roll, pitch, yaw or rx, ry, rz"
-            what, more = "x, y and z determine", f"the orientation ({turn}), "
-        followed = ", ".join(names[k] for k in unknown)
-        raise InputError(
-            f"{where}: expected at most {rows} joints, which {what}, found {len(unknown)} "
-            f"({followed}); give {more}{column}, or {tables}"
-        )
-
-
-# -- what is told ----------------------------------------------------------------------------
-
-
-def loop_start(scene: Scene) -> dict[str, float]:
-    """Return the joints that follow in closed loops at t = 0, rad, m: the branch."""
-    if not scene.closures:
-        return {}
-    task, q = follower(scene).task, follower(scene).start.q
-    return {task.names[k]: float(q[k]) for k in task.unknown}
-
-
-def misfit(scene: Scene) -> float:
-    """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
-    return follower(scene).start.misfit if scene.closures else 0.0
-
-
 def forced_rest(scene: Scene) -> str | None:
     """Return that a table which moves at its ends is forced to rest, where that dominates."""
     motion = scene.motion
-    if motion.path not in ("points", "joints") or motion.table_ends == "moving":
+    if motion.path not in TABLES or motion.table_ends == "moving":
         return None
     table = rows_of(scene).table
     # Fewer than six rows do not tell their own acceleration: the spline's degree is 5.
@@ -543,3 +311,150 @@ def forced_rest(scene: Scene) -> str | None:
         f"an acceleration of {forced[worst]:.3g} where its rows have {own[worst]:.3g}: let it rest "
         'there, or take its own rates, motion.table_ends = "moving"'
     )
+
+
+# -- what the scene prescribes: paths, joints ------------------------------------------------
+
+
+def desired_path(t: np.ndarray, scene: Scene) -> Values:
+    """Return what path or table prescribe and two derivatives: the end-effector's place, joints."""
+    motion = scene.motion
+    if motion.path == "rotation":
+        return rotation(t, time_law(motion), motion.speed, motion.start_angle, motion.duration)
+    if motion.path == "arc":
+        return along(
+            lambda s: arc(s, motion.radius, motion.flattening),
+            time_law(motion),
+            t,
+            motion.duration,
+        )
+    curve, timed = curve_of(scene)
+    return curve(t) if timed else along(curve, time_law(motion), t, motion.duration)
+
+
+def target_of(t: np.ndarray, scene: Scene) -> Target:
+    """Return what the scene prescribes of all coordinates, and of the end-effector in space.
+
+    A fixed base in the plane and the lengths of rods that are springs stay as they are.
+    """
+    values, names = desired_path(t, scene), list(scene.rigid_units)
+    columns = [names.index(name) for name in prescribed_joints(scene)]
+    joints = np.zeros((3, len(t), len(names)))
+    for name, value in _constants(scene).items():
+        joints[0, :, names.index(name)] = value
+    of_path = values[0].shape[1] - len(columns)
+    joints[:, :, columns] = [x[:, of_path:] for x in values]
+    start = rows_of(scene).start if of_path > 3 else None
+    turned = None if start is None else turning(start, [x[:, 3:6] for x in values])
+    return Target([*joints], [x[:, : min(of_path, 3)] for x in values], turned)
+
+
+def _constants(scene: Scene) -> dict[str, float]:
+    """Return coordinates that stay where they are: a fixed base, m, lengths of springs, m."""
+    found = {one.name: one.length or 0.0 for one in scene.rods if not one.driven}
+    if not scene.is_spatial and scene.motion.base == "fixed":
+        found[CART] = scene.motion.base_position
+    return found
+
+
+# -- chains of the plane ---------------------------------------------------------------------
+
+
+def _chain(scene: Scene) -> Chain:
+    """Return the scene's chain in the plane."""
+    motion, fixed = scene.motion, scene.motion.base == "fixed"
+    return Chain(
+        lengths=tuple(arm.length for arm in scene.arms),
+        shoulder=(motion.base_position if fixed else 0.0, motion.joint_height),
+        follow=0.0 if fixed else motion.cart_follow,
+        elbow=motion.elbow,
+        source=scene.source,
+        keys=_keys(scene),
+    )
+
+
+@_kept
+def _continuous_shoulder(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return dense instants and the first arm's angle there without jumps, rad."""
+    t = np.linspace(0.0, scene.motion.duration, DENSE_INSTANTS)
+    return t, np.unwrap(_chain(scene).on(t, desired_path(t, scene))[0][:, 1])
+
+
+def _keys(scene: Scene) -> str:
+    """Return the keys that move the path, or the shoulder of a chain."""
+    motion = scene.motion
+    keys = {
+        "arc": "motion.radius, motion.flattening",
+        "line": "motion.start, motion.end",
+        "rotation": "motion.start_angle",
+    }.get(motion.path, "the table motion.file")
+    if follows(scene):
+        return keys
+    shoulder = "base_position" if motion.base == "fixed" else "cart_follow"
+    return f"{keys}, motion.{shoulder}, motion.joint_height or the arms' length"
+
+
+# -- joints that follow ----------------------------------------------------------------------
+
+
+@_kept
+def follower(scene: Scene) -> Follower:
+    """Return what follows the scene's path or closes its loops.
+
+    Raises:
+        InputError: the path does not determine the joints; names them and the remedy.
+    """
+    from dolfinopt.motion.follower import Follower
+    from dolfinopt.motion.task import Task
+
+    units, first = scene.rigid_units, target_of(np.zeros(1), scene)
+    given = {*prescribed_joints(scene), *_constants(scene)}
+    constraints = Constraints(
+        mechanism=skeleton(scene),
+        loops=loops_of(scene) or Loops(),
+        slides=np.array([unit == "m" for unit in units.values()]),
+        has_path=first.place[0].shape[1] > 0,
+        turned=first.turning is not None,
+    )
+    stated, side = scene.motion.initial_joints, 0
+    guess, joints = np.zeros(len(units)), 0 if scene.is_spatial else 1
+    if stated is not None:
+        guess[joints : joints + len(stated)] = stated
+    elif scene.closures and not scene.is_spatial:
+        side = scene.closures[0].side
+    return Follower(
+        Task(
+            constraints=constraints,
+            names=tuple(units),
+            unknown=np.array([k for k, one in enumerate(units) if one not in given], dtype=int),
+            passive=np.array(passive_coordinates(scene), dtype=int),
+            target=lambda t: target_of(t, scene),
+            guess=guess,
+            width=1.5 if stated is None else 0.1,
+            side=side,
+            end=_end(scene),
+            resolution=max(DENSE_INSTANTS, 2 * len(table_rows(scene))),
+            source=scene.source,
+            keys=_keys(scene),
+        )
+    )
+
+
+def passive_coordinates(scene: Scene) -> list[int]:
+    """Return the rigid coordinates without a drive, which follow from the others in loops."""
+    if scene.joints:
+        return [k for k, joint in enumerate(scene.movable) if joint.passive]
+    return list(range(scene.num_rigid - scene.dependent_joints, scene.num_rigid))
+
+
+def loop_start(scene: Scene) -> dict[str, float]:
+    """Return the joints that follow in closed loops at t = 0, rad, m: the branch."""
+    if not scene.closures:
+        return {}
+    task, q = follower(scene).task, follower(scene).start.q
+    return {task.names[k]: float(q[k]) for k in task.unknown}
+
+
+def misfit(scene: Scene) -> float:
+    """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
+    return follower(scene).start.misfit if scene.closures else 0.0

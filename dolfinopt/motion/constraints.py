@@ -9,6 +9,7 @@ doi:10.1007/978-1-84628-642-1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +20,7 @@ from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.tree import Mechanism
-from dolfinopt.paths import Values
+from dolfinopt.scene.laws import Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +28,14 @@ class Target:
     """What is prescribed at n instants.
 
     Attributes:
-        joints: (n, g) given coordinates and two derivatives; rad, m.
+        joints: (n, R) coordinates and two derivatives, of which the given ones count; rad, m.
         place: of the end-effector (n, d), velocity, acceleration; m. (n, 0) where it is free.
         turning: its orientation (n, 3, 3), angular velocity and acceleration (n, 3) in the
             ground's frame; None where it is free.
     """
 
-    joints: Values
-    place: Values
+    joints: Sequence[np.ndarray]
+    place: Sequence[np.ndarray]
     turning: Values | None = None
 
 

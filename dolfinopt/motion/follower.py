@@ -19,7 +19,7 @@ from dolfinopt.motion.measured import SAMPLES, TURNS_LIMIT
 from dolfinopt.motion.singular import Regularity, Samples
 from dolfinopt.motion.start import Start, nearest, start_of, unreached
 from dolfinopt.motion.task import Task
-from dolfinopt.paths import Values
+from dolfinopt.scene.laws import Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +100,12 @@ class Follower:
         task = self.task
         t = np.linspace(0.0, task.end, task.resolution)
         target, units = task.target(t), task.constraints.units
-        parts = [target.joints[0] / units[task.given], target.place[0] / task.constraints.reach]
+        parts = [target.joints[0] / units, target.place[0] / task.constraints.reach]
         moved = np.abs(np.diff(np.hstack(parts), axis=0)).max(axis=1, initial=0.0)
         turns = float(moved.sum() / (2.0 * np.pi))
         if turns > TURNS_LIMIT:
             raise InputError(
-                f"{task.words.source}: motion: what is prescribed of the closed loops moves by "
+                f"{task.source}: motion: what is prescribed of the closed loops moves by "
                 f"{turns:.3g} turns: expected at most {TURNS_LIMIT}; slow it or shorten "
                 "motion.horizon"
             )

@@ -17,6 +17,7 @@ TABLE_CORNERS_LIMIT = 20
 # -- constraints, start ----------------------------------------------------------------------
 
 REACHED_SHARE = 1e-9  # above which a pose is not reached; Newton's method leaves 1e-15
+STARTS = 10  # around the guess from which the start is looked for
 # By which links that are held more often than needed may leave a loop open: it is told.
 FITS_SHARE = 1e-4
 # Times the misfit of such links: singular values, and gaps along the motion, that it makes.

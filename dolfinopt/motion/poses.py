@@ -6,11 +6,13 @@ R = R_0 exp(theta~), whose angular velocity and acceleration `SpaceTurning` know
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.multibody.dimension import SpaceTurning
-from dolfinopt.paths import SAME, Values
+from dolfinopt.scene.laws import SAME, Values
 
 RPY = ("roll", "pitch", "yaw")
 VECTOR = ("rx", "ry", "rz")
@@ -39,7 +41,7 @@ def relative_vectors(R: np.ndarray) -> np.ndarray:
     return vectors
 
 
-def turning(start: np.ndarray, vectors: Values) -> Values:
+def turning(start: np.ndarray, vectors: Sequence[np.ndarray]) -> Values:
     """Return R (n, 3, 3), angular velocity and acceleration (n, 3) in the ground's frame.
 
     Args:

@@ -10,7 +10,6 @@ it. Poses that only touch one are minima of the singular value.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -58,15 +57,10 @@ class Regularity:
 
     def sizes(self, q: np.ndarray) -> np.ndarray:
         """Return smallest singular values at poses (n, R) over those of a usual pose (n, m)."""
-        return self._sizes(q) / self._usual
-
-    @cached_property
-    def _usual(self) -> np.ndarray:
-        return self._sizes(self.start.usual[None])[0]
-
-    def _sizes(self, q: np.ndarray) -> np.ndarray:
-        matrices = self._matrices(self.task.constraints.at(q).rows())
-        return np.stack([np.linalg.svd(G, compute_uv=False)[:, -1] for G, _ in matrices], axis=1)
+        every = np.concatenate([self.start.usual[None], q])
+        matrices = self._matrices(self.task.constraints.at(every).rows())
+        least = [np.linalg.svd(G, compute_uv=False)[:, -1] for G, _ in matrices]
+        return (np.stack(least, axis=1) / np.array(least)[:, 0])[1:]
 
     def _matrices(self, G: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the m parts (n, k, u) of G that must stay regular, with their columns."""
@@ -89,27 +83,20 @@ class Regularity:
 
     def refusal(self, q: np.ndarray, t: float) -> InputError:
         """Return which closure leaves which joints undetermined at a pose (R,), and when."""
-        task, words = self.task, self.task.words
+        task = self.task
         matrices = self._matrices(task.constraints.at(q[None]).rows())
         G, columns = matrices[int(np.argmin(self.sizes(q[None])[0]))]
         null = np.abs(np.linalg.svd(G[0])[2][-1])
         joints = task.called(columns[null > 0.1 * null.max()])
         loops = task.constraints.loops
         acting = np.array(loops.by_tie(np.abs(G[0, : loops.count] * null).max(axis=1, initial=0.0)))
-        by_path = task.constraints.has_path and not (acting > SINGULAR_SHARE).any()
-        if by_path or not loops.ties:
-            return InputError(
-                f"{words.source}: motion: at t = {t:.4g} s the machine is in a singular position, "
-                f"where rates of joints ({joints}) have no bounds; change {words.motion}, or "
-                'prescribe the joints, motion.path = "joints"'
-            )
-        ties = ", ".join(
-            tie.name
-            for tie, size in zip(loops.ties, acting, strict=True)
-            if size >= SINGULAR_SHARE * acting.max()
-        )
+        what, remedy = "motion: the machine", 'prescribe the joints, motion.path = "joints"'
+        if loops.ties and ((acting > SINGULAR_SHARE).any() or not task.constraints.has_path):
+            names = [tie.name for tie in loops.ties]
+            those = np.flatnonzero(acting >= SINGULAR_SHARE * acting.max())
+            what = f"closures: the loop of {', '.join(names[k] for k in those)}"
+            remedy = "drive one of them, or change the arms' lengths"
         return InputError(
-            f"{words.source}: closures: at t = {t:.4g} s the loop of {ties} is at a dead centre, a "
-            f"singular position: joints {joints} are undetermined there; drive one of them, or "
-            f"change {words.motion} or the arms' lengths"
+            f"{task.source}: {what} is at a dead centre, a singular position, at t = {t:.4g} s: "
+            f"joints {joints} are undetermined there; {remedy}, or change {task.keys}"
         )

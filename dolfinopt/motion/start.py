@@ -19,9 +19,9 @@ from dolfinopt.motion.measured import (
     MISFIT_FACTOR,
     REACHED_SHARE,
     SINGULAR_SHARE,
+    STARTS,
 )
 from dolfinopt.motion.task import Task
-from dolfinopt.multibody.closures import Distance
 from dolfinopt.multibody.measured import RANK_SHARE
 from dolfinopt.multibody.ranks import rank
 
@@ -77,15 +77,12 @@ def nearest(
     if len(free) == 0:
         off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
         return q, float(off)
-    accuracy = np.finfo(float).eps
     found = least_squares(
         error,
         np.zeros(len(free)),
         jacobian,
         method="lm",
-        xtol=accuracy,
-        ftol=accuracy,
-        gtol=accuracy,
+        **dict.fromkeys(("xtol", "ftol", "gtol"), np.finfo(float).eps),
     )
     return pose(found.x)[0], float(np.linalg.norm(found.fun)) * constraints.reach
 
@@ -99,14 +96,15 @@ def start_of(task: Task) -> Start:
     target, constraints = task.target(np.zeros(1)), task.constraints
     reach, count = constraints.reach, constraints.loops.count
     q, off = _nearest_of_many(task, target)
-    pose, misfit = nearest(task, q, target, task.moving, slice(count))
+    every = np.arange(len(q))
+    pose, misfit = nearest(task, q, target, every, slice(count))
     if misfit > FITS_SHARE * reach:
         raise unreached(task, 0.0, pose, target)
     share = max(RANK_SHARE, MISFIT_FACTOR * misfit / reach)
     usual = _usual(task, pose, target, misfit, share)
     G = constraints.at(usual[None]).rows()[0]
     _check(task, G[:count], share)
-    redundant = count - rank(G[:count, task.moving], share)
+    redundant = count - rank(G[:count], share)
     tolerance = REACHED_SHARE * reach
     if not redundant or misfit <= tolerance:
         misfit = 0.0
@@ -114,41 +112,42 @@ def start_of(task: Task) -> Start:
     if off > tolerance:
         raise unreached(task, 0.0, q, target)
     if len(null := _null_vectors(G[:, task.unknown])):
-        idle = _called(task, task.unknown, null)
+        turned = ", or the orientation (motion.rpy; roll, pitch, yaw or rx, ry, rz)"
         raise InputError(
-            f"{task.words.source}: motion: path and closures leave {len(null)} of the joints "
-            f"undetermined ({idle}); prescribe one of them by a column of the table"
+            f"{task.source}: motion: path and closures leave {len(null)} of the joints "
+            f"undetermined ({_called(task, task.unknown, null)}); prescribe {len(null)} of them by "
+            f"columns of the table{'' if constraints.turned else turned}, or all of them, "
+            'motion.path = "joints"'
         )
     return Start(q, usual, redundant, misfit, tolerance)
 
 
 def _nearest_of_many(task: Task, target: Target) -> tuple[np.ndarray, float]:
     """Return the pose near the guess that is reached first, and how far off it is, m."""
-    guess = task.with_given(_with_lengths(task)[None], target)[0]
-    random, best, least = np.random.default_rng(0), guess, np.inf
-    units = task.constraints.units[task.unknown]
-    for k in range(10):  # the first as stated, the others around it at random
+    guess = task.with_given(task.guess[None], target)[0]
+    random, enough = np.random.default_rng(0), REACHED_SHARE * task.constraints.reach
+    turning = task.unknown[~task.constraints.slides[task.unknown]]
+    best, least = guess, (np.inf, 0.0, np.inf)
+    for k in range(STARTS):  # the first as stated, the others around it at random
         shifted = guess.copy()
         away = random.uniform(-task.width, task.width, len(task.unknown))
-        shifted[task.unknown] += (k > 0) * away * units
+        shifted[task.unknown] += (k > 0) * away * task.constraints.units[task.unknown]
+        if task.side:
+            shifted[-1] = 2.0 * np.pi * (k + 0.5) / STARTS
         q, off = nearest(task, shifted, target, task.unknown)
-        if off < least:
-            best, least = q, off
-        if least <= REACHED_SHARE * task.constraints.reach:
+        q[turning] -= 2.0 * np.pi * np.round((q[turning] - guess[turning]) / (2.0 * np.pi))
+        if (size := (max(off, enough), _off_branch(task, q), off)) < least:
+            best, least = q, size
+        if least[:2] == (enough, 0.0):
             break
-    turning = task.unknown[~task.constraints.slides[task.unknown]]
-    best[turning] -= 2.0 * np.pi * np.round((best[turning] - guess[turning]) / (2.0 * np.pi))
-    return best, least
+    return best, least[2]
 
 
-def _with_lengths(task: Task) -> np.ndarray:
-    """Return the guess with rods as long as its joints have them."""
-    guess, loops = task.guess.copy(), task.constraints.loops
-    gaps = task.constraints.at(guess[None]).closed.gap[0]
-    for gap, one in zip(gaps, loops.equations, strict=True):
-        if isinstance(one, Distance) and one.coordinate is not None:
-            guess[one.coordinate] += gap
-    return guess
+def _off_branch(task: Task, q: np.ndarray) -> float:
+    """Return how far a pose (R,) is from the asked for branch: the stretched one of its side."""
+    angle = float(np.angle(np.exp(1j * q[-1])))
+    wrong = angle * task.side < -1e-9
+    return np.round(abs(angle) + 2.0 * np.pi * wrong, 9) if task.side else 0.0
 
 
 def _usual(task: Task, pose: np.ndarray, target: Target, misfit: float, share: float) -> np.ndarray:
@@ -157,13 +156,13 @@ def _usual(task: Task, pose: np.ndarray, target: Target, misfit: float, share: f
     A special pose would miscount, and so would an open one: the start is moved along the closures,
     with all coordinates free, whatever drives ask for.
     """
-    constraints, free, closing = task.constraints, task.moving, slice(task.constraints.loops.count)
-    G = constraints.at(pose[None]).rows()[0]
-    moves = _null_vectors(G[closing, free], max(share, SINGULAR_SHARE))
+    constraints, free = task.constraints, np.arange(len(pose))
+    closing = slice(constraints.loops.count)
+    G = constraints.at(pose[None]).rows()[0, closing]
+    moves = _null_vectors(G, max(share, SINGULAR_SHARE))
     random, usual, largest = np.random.default_rng(1), pose, -1.0
     for size in 0.5 ** np.arange(1, 5):
-        moved = pose.copy()
-        moved[free] += size * constraints.units[free] * (random.uniform(-1, 1, len(moves)) @ moves)
+        moved = pose + size * constraints.units * (random.uniform(-1, 1, len(moves)) @ moves)
         other, off = nearest(task, moved, target, free, closing)
         at = constraints.at(other[None]).rows()[0]
         least = min(_least(at[closing][:, task.passive]), _least(at[:, task.unknown]))
@@ -193,9 +192,9 @@ def _called(task: Task, places: np.ndarray, vectors: np.ndarray) -> str:
 def _check(task: Task, G: np.ndarray, share: float) -> None:
     """Raise where the number of passive joints is wrong; the one check of all paths."""
     ties = ", ".join(tie.name for tie in task.constraints.loops.ties)
-    where = f"{task.words.source}: closures ({ties})"
-    own, driven = G[:, task.passive], np.setdiff1d(task.moving, task.passive)
-    if missing := rank(G[:, task.moving], share) - rank(own, share):
+    where = f"{task.source}: closures ({ties})"
+    own, driven = G[:, task.passive], np.setdiff1d(np.arange(G.shape[1]), task.passive)
+    if missing := rank(G, share) - rank(own, share):
         held = _called(task, driven, _null_vectors(own.T, share) @ G[:, driven])
         raise InputError(
             f"{where}: they hold {missing} of the driven coordinates: give {missing} more of the "
@@ -211,27 +210,21 @@ def _check(task: Task, G: np.ndarray, share: float) -> None:
 
 def unreached(task: Task, t: float, q: np.ndarray, target: Target) -> InputError:
     """Return which closure stays open, or how far the end-effector is off, at pose q (R,)."""
-    error, words = task.constraints.error(q[None], target)[0], task.words
-    reach, k = task.constraints.reach, task.constraints.loops.count
-    joints, start = task.called(task.unknown), "motion.initial_joints, " if t == 0.0 else ""
-    if k and np.abs(error[:k]).max() > 0.1 * np.abs(error).max():
-        gaps = task.constraints.loops.by_tie(error[:k])
+    error, loops = task.constraints.error(q[None], target)[0], task.constraints.loops
+    gaps, (place, turn) = loops.by_tie(error[: loops.count]), np.split(error[loops.count :], [3])
+    if max(gaps, default=0.0) > 0.1 * np.abs(error).max():
         worst = int(np.argmax(gaps))
-        name = task.constraints.loops.ties[worst].name
-        return InputError(
-            f"{words.source}: closures: at t = {t:.4g} s the loop of {name} cannot be closed: the "
-            f"joints that follow ({joints}) leave it open by {gaps[worst]:.4g} m at best; change "
-            f"{start}its point, the arms' lengths, or {words.motion}"
-        )
-    own = error[k:]
-    d = target.place[0].shape[1]
-    place = ", ".join(f"{x:.6g}" for x in target.place[0][0])
-    off, turned = f"{np.linalg.norm(own[:d]):.4g} m", ""
-    if len(own) > d:
-        turned = " turned as it is to be"
-        off += f" and {np.linalg.norm(own[d:]) / reach:.4g} rad"
+        what = f"closures: at t = {t:.4g} s the loop of {loops.ties[worst].name} cannot be closed"
+        off, remedy = f"{gaps[worst]:.4g} m", "its point, the arms' lengths, or "
+    else:
+        where = ", ".join(f"{x:.6g}" for x in target.place[0][0])
+        what = f"motion: at t = {t:.4g} s the end-effector cannot be at ({where}) m"
+        off, remedy = f"{np.linalg.norm(place):.4g} m", ""
+        if len(turn):
+            what += " turned as it is to be"
+            off += f" and {np.linalg.norm(turn) / task.constraints.reach:.4g} rad"
+    start = "motion.initial_joints, " if t == 0.0 else ""
     return InputError(
-        f"{words.source}: motion: at t = {t:.4g} s the end-effector cannot be at ({place}) m"
-        f"{turned}: the joints that follow the path ({joints}) leave it {off} off at best; change "
-        f"{start}{words.motion}"
+        f"{task.source}: {what}: the joints that follow ({task.called(task.unknown)}) leave it "
+        f"{off} off at best; change {start}{remedy}{task.keys}"
     )

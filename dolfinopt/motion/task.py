@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,47 +12,43 @@ from dolfinopt.motion.constraints import Constraints, Target
 from dolfinopt.multibody.ranks import least_norm
 
 
-@dataclass(frozen=True)
-class Words:
-    """What messages name: where the motion is stated, and the keys that change it."""
-
-    source: str
-    motion: str
-
-
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Coordinates `unknown` that keep constraints while `given` ones move as prescribed.
+    """Coordinates `unknown` that keep constraints while the others, `given`, are prescribed.
 
     Attributes:
         constraints: equations.
         names: of all R coordinates.
-        unknown, given: their places.
+        unknown: their places.
         passive: those without a drive: the closures alone must determine them.
         target: of instants (n,), s, what is prescribed.
         guess: (R,) near the start.
         width: of random starts around it, rad or the reach.
+        side: sign of the last joint's angle at the start, which tells branches apart; 0: the guess
+            does.
         end: of the motion, s.
         resolution: number of instants that resolve what is prescribed.
-        words: for messages.
+        source: of the scene, for messages.
+        keys: that change what is prescribed, for messages.
     """
 
     constraints: Constraints
     names: tuple[str, ...]
     unknown: np.ndarray
-    given: np.ndarray
     passive: np.ndarray
     target: Callable[[np.ndarray], Target]
     guess: np.ndarray
     width: float
+    side: int
     end: float
     resolution: int
-    words: Words
+    source: str
+    keys: str
 
-    @property
-    def moving(self) -> np.ndarray:
-        """Places of the coordinates that are unknown, given or passive."""
-        return np.unique([*self.unknown, *self.given, *self.passive]).astype(int)
+    @cached_property
+    def given(self) -> np.ndarray:
+        """Places of the prescribed coordinates."""
+        return np.setdiff1d(np.arange(len(self.names)), self.unknown)
 
     def called(self, places: Iterable[int]) -> str:
         """Return names of coordinates."""
@@ -60,7 +57,7 @@ class Task:
     def with_given(self, q: np.ndarray, target: Target) -> np.ndarray:
         """Return poses (n, R) whose given coordinates are as prescribed."""
         out = q.copy()
-        out[:, self.given] = target.joints[0]
+        out[:, self.given] = target.joints[0][:, self.given]
         return out
 
     def newton(
@@ -91,8 +88,7 @@ class Task:
         G, units = here.rows(), self.constraints.units
 
         def solved(order: int, right: np.ndarray) -> np.ndarray:  # G x = right with x as given
-            x = np.zeros_like(q)
-            x[:, self.given] = target.joints[order]
+            x = target.joints[order].copy()
             left = right / self.constraints.reach - np.einsum("nkr,nr->nk", G, x / units)
             x[:, self.unknown] = least_norm(G[:, :, self.unknown], left) * units[self.unknown]
             return x

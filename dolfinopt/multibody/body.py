@@ -33,11 +33,12 @@ doi:10.1002/nme.1620320818; Featherstone, Rigid Body Dynamics Algorithms (2008),
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.multibody.dimension import DIMENSIONS, product
+from dolfinopt.multibody.dimension import DIMENSIONS, compose, product
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -51,8 +52,9 @@ class Constants:
         dim: what differs between the plane and space.
         mass: kg.
         T: (P, q) conjugates of the pushes by the coordinates.
-        K0: (P, q, q) geometric stiffness by every push, None of a linear body.
-        L: (q, q, q) of the displacement along the modes, or None.
+        by_e: (P + q, q) the same, and behind it those of z.
+        bent: (P + q, q, q) geometric stiffness K0 by every push, and L; None of a linear body.
+        inertial: places among them of what inertia displaces: conjugates of a, of alpha, and z.
         c, W_rest: (d, 1), (g, 1) of the undeformed body.
         is_point: whether it is rigid with its centre at the origin.
         W: (g q, q) of the modes.
@@ -67,10 +69,12 @@ class Constants:
         self.dim = DIMENSIONS[len(body.w)]
         self.num_modes = q
         self.T = np.concatenate([body.w[:, 1:], body.W[:, 1:, 0], body.outboard])
-        self.K0 = self.L = None
+        self.by_e = np.concatenate([self.T, np.eye(q)])
+        self.bent: np.ndarray | None = None
         if body.is_stiffened:
-            self.K0 = np.concatenate([body.K0[self.dim.loads], body.K0_outboard])
-            self.L = body.along_modes if len(body.along_modes) else None
+            L = body.along_modes if len(body.along_modes) else np.zeros((q, q, q))
+            self.bent = np.concatenate([body.K0[self.dim.loads], body.K0_outboard, L])
+        self.inertial = np.r_[: self.dim.d + self.dim.g, len(self.T) : len(self.by_e)]
         self.mass = body.mass
         self.c, self.W_rest = body.w[:, :1], body.W[:, :1, 0]
         self.is_point = q == 0 and not self.c.any()
@@ -84,13 +88,6 @@ class Constants:
     def of_point(cls, mass: float, inertia: float) -> Constants:
         """Return those of a mass (kg) with rotary inertia (kg m2) at the origin, in the plane."""
         return cls(rigid_body(mass, np.zeros(2), inertia, np.zeros(2)))
-
-    @cached_property
-    def bent(self) -> np.ndarray:
-        """K0, and L behind it where there is one ((P + q) q, q)."""
-        assert self.K0 is not None
-        every = self.K0 if self.L is None else np.concatenate([self.K0, self.L])
-        return every.reshape(-1, self.num_modes)
 
     def outboard(self, number: int) -> slice:
         """Return an interface's place among the pushes."""
@@ -131,12 +128,18 @@ class BodyMotion:
         """Entries of 2 Omega (g, n)."""
         return self.dim.beta(self.w)
 
+    @cached_property
+    def alpha_by_spin(self) -> np.ndarray:
+        """Derivative of the entries of A by w (g, r, n)."""
+        return self.dim.alpha_by_spin(self.w)
+
     # -- conjugates of the pushes, displacement along the modes -------------------------------
 
     def _bent_by(self, rate: int) -> np.ndarray:
         """Return K0 and L times e, e' or e'' (P + q, q, n)."""
-        q, _, count = self.rates.shape
-        return (self.constants.bent @ self.rates[:, rate]).reshape(-1, q, count)
+        bent, (q, _, count) = self.constants.bent, self.rates.shape
+        assert bent is not None
+        return (bent.reshape(-1, q) @ self.rates[:, rate]).reshape(-1, q, count)
 
     @cached_property
     def _bent(self) -> np.ndarray:
@@ -148,14 +151,13 @@ class BodyMotion:
 
     @cached_property
     def _every(self) -> np.ndarray:
-        """Conjugates of all pushes and z, with their rates (P + q, 3, n)."""
-        constants, (q, _, count) = self.constants, self.rates.shape
-        linear = (constants.T @ self.rates.reshape(q, -1)).reshape(-1, 3, count)
-        if constants.K0 is None:
+        """Conjugates of all pushes and, if it is not e, z, with their rates (P + q, 3, n)."""
+        q, _, count = self.rates.shape
+        linear = (self.constants.T @ self.rates.reshape(q, 3 * count)).reshape(-1, 3, count)
+        if self.constants.bent is None:
             return linear
-        if constants.L is not None:
-            linear = np.concatenate([linear, self.rates])
-        e, ed, edd = (self.rates[:, i] for i in range(3))
+        linear = np.concatenate([linear, self.rates])
+        e, ed, edd = self.rates.swapaxes(0, 1)
         bent = np.empty(linear.shape, dtype=self._bent.dtype)
         bent[:, 0] = 0.5 * np.einsum("pkn,kn->pn", self._bent, e)
         bent[:, 1] = np.einsum("pkn,kn->pn", self._bent, ed)
@@ -163,50 +165,57 @@ class BodyMotion:
         bent[:, 2] += np.einsum("pkn,kn->pn", self._bent_rate, ed)
         return np.asarray(linear - bent)
 
-    @cached_property
+    @property
     def conjugates(self) -> np.ndarray:
         """Conjugates of the pushes and their rates (P, 3, n)."""
         return self._every[: len(self.constants.T)]
 
-    @cached_property
+    @property
     def z(self) -> np.ndarray:
         """Displacement along the modes and its rates (q, 3, n)."""
-        return self.rates if self.constants.L is None else self._every[len(self.constants.T) :]
+        return self.rates if self.constants.bent is None else self._every[len(self.constants.T) :]
 
     @cached_property
     def _by_e(self) -> np.ndarray:
-        """V, and J behind it where z is not e (P + q, q, n)."""
-        constants = self.constants
-        if constants.K0 is None:
-            return np.broadcast_to(constants.T[..., None], (*constants.T.shape, self.w.shape[1]))
-        T = constants.T
-        if constants.L is not None:
-            T = np.concatenate([T, np.eye(constants.num_modes)])
-        return T[..., None] - self._bent
+        """V, and J = dz/de behind it (P + q, q, n)."""
+        by_e = self.constants.by_e[..., None]
+        if self.constants.bent is None:
+            return np.broadcast_to(by_e, (*by_e.shape[:2], self.w.shape[1]))
+        return by_e - self._bent
 
-    @cached_property
+    @property
     def V(self) -> np.ndarray:
         """Derivative of the conjugates by e (P, q, n)."""
         return self._by_e[: len(self.constants.T)]
 
-    @cached_property
-    def _J(self) -> np.ndarray:
-        """Derivative of z by e (q, q, n), where z is not e."""
-        return self._by_e[len(self.constants.T) :]
-
-    @cached_property
-    def rates_by_e(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Derivatives of V's and J's first and second rate by e (P + q, q, n); None: zero."""
-        if self.constants.K0 is None:
-            return None
-        return -self._bent_rate, -self._bent_by(2)
-
     def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x: forces by z as forces by e, (q, n) or (m, q, n)."""
-        if self.constants.L is None:
+        if self.constants.bent is None:
             return x
-        out: np.ndarray = np.einsum("...ln,lkn->...kn", x, self._J)
-        return out
+        return np.asarray(np.einsum("...ln,lkn->...kn", x, self._by_e[len(self.constants.T) :]))
+
+    def _by_rates(self, places: np.ndarray | slice, kept: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return derivatives by those e kept, at `places`, and their first and second rates.
+
+        (n, ., k), of a body with geometric stiffness.
+        """
+        every = self._by_e, -self._bent_rate, -self._bent_by(2)
+        return tuple(by_instant(x[places][:, kept]) for x in every)
+
+    def by_rates(self, by: np.ndarray, places: np.ndarray | slice, kept: np.ndarray) -> np.ndarray:
+        """Return the derivative by those e, e', e'' kept of what conjugates displace (n, i, k, 3).
+
+        Args:
+            by: (i, 3, p, n) derivatives by conjugates, or z, and their rates.
+            places: of these p among V and J.
+            kept: (k,).
+        """
+        first = np.ascontiguousarray(np.moveaxis(by, -1, 0))
+        if self.constants.bent is None:
+            own = self.constants.by_e[places][:, kept]
+            found = first.reshape(-1, len(own)) @ own
+            return found.reshape(*first.shape[:3], -1).swapaxes(2, 3)
+        return _chain([first[:, :, r] for r in range(3)], self._by_rates(places, kept))
 
     # -- integrals of the deformed body ------------------------------------------------------
 
@@ -214,7 +223,7 @@ class BodyMotion:
     def _Wz(self) -> np.ndarray:
         """W_c of the modes times z, z', z'' (g, q, 3, n)."""
         q, _, count = self.rates.shape
-        return (self.constants.W @ self.z.reshape(q, -1)).reshape(-1, q, 3, count)
+        return (self.constants.W @ self.z.reshape(q, 3 * count)).reshape(self.dim.g, q, 3, count)
 
     @cached_property
     def Y(self) -> np.ndarray:
@@ -285,14 +294,17 @@ class BodyMotion:
         ]
         return np.concatenate([self.a, self.alpha, *pulls])
 
+    def _pushed(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
+        """Return what works on all conjugates and z (P + q, n), under pushes of the interfaces."""
+        return np.concatenate([self.load_coefficients(outboard), self.modal_inertia])
+
     def rows(self, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the elastic rows (q, n) under pushes of the interfaces, by number."""
-        constants, p = self.constants, self.load_coefficients(outboard)
-        f = self.jacobian_transposed(self.modal_inertia)
-        if constants.K0 is None:
-            f = f + constants.T.T @ p
+        constants = self.constants
+        if constants.bent is None:
+            f = self.modal_inertia + constants.T.T @ self.load_coefficients(outboard)
         else:
-            f = f + np.einsum("pn,pkn->kn", p, self.V)
+            f = np.einsum("pn,pkn->kn", self._pushed(outboard), self._by_e)
         f = f + weighted(constants.K, self.rates[:, 0])
         if constants.D is not None:
             f += weighted(constants.D, self.rates[:, 1])
@@ -308,87 +320,64 @@ class BodyMotion:
         out = np.zeros((d + r, d + 2 * r, self.a.shape[1]))
         out[range(d), range(d)] = self.constants.mass
         spun = dim.by_spin(s)
-        out[:d, d : d + r] = dim.centripetal_by_spin(self.w, s) + 2.0 * dim.by_spin(sd)
+        out[:d, d : d + r] = product(dim.applied.matrix(s), self.alpha_by_spin)
+        out[:d, d : d + r] += 2.0 * dim.by_spin(sd)
         out[:d, d + r :], out[d:, :d] = spun, spun.swapaxes(0, 1)
-        out[d:, d : d + r], out[d:, d + r :] = dim.torque_by_spin(self.w, G, H)
+        of_G, of_H = dim.torque_of.matrix(G), dim.torque_of.matrix(H)
+        out[d:, d : d + r] = product(of_G, self.alpha_by_spin) + 2.0 * compose(of_H, dim.spin)
+        out[d:, d + r :] = compose(of_G, dim.spin)
         return out
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:
         """Derivative of the rows by (a, w, wd), (d + 2 r, q, n)."""
-        by_w, by_wd = self.dim.contracted_by_spin(self.w, self.Y, self.Yd)
-        return np.concatenate([self.V[: self.dim.d], by_w, by_wd])
+        dim = self.dim
+        by_w = product(self.alpha_by_spin.swapaxes(0, 1), self.Y) - 2.0 * dim.axial(self.Yd)
+        return np.concatenate([self.V[: dim.d], by_w, -dim.axial(self.Y)])
 
-    def load_by_rates(self, kept: np.ndarray) -> np.ndarray:
-        """Return the derivatives of (F, T) by those e, e', e'' kept (d + r, 3, k, n)."""
-        dim, P = self.dim, len(self.constants.T)
-        d, across = dim.d, slice(dim.d, dim.d + dim.g)
-        C, Y, Yd = self.V[:d, kept], self.Y[:, kept], self.Yd[:, kept]
-        turned = dim.transposed(Y)
-        first, second = Yd, self.jacobian_transposed(self._Wz[:, :, 2])[:, kept]
-        by_e = dim.apply(self.alpha, C)
-        by_ed = dim.apply(self.beta, C)
-        moved = None
-        if (rates := self.rates_by_e) is not None:
-            vd, vdd = rates[0][:, kept], rates[1][:, kept]
-            by_e += dim.apply(self.beta, vd[:d]) + vdd[:d]
-            by_ed += 2.0 * vd[:d]
-            moved, bending = (dim.transposed(x[across]) for x in (vd, vdd))
-            if self.constants.L is not None:
-                z = dim.transposed(self._Wz[:, :, 0])
-                moved = moved + np.einsum("cln,lkn->ckn", z, vd[P:])
-                bending = bending + np.einsum("cln,lkn->ckn", z, vdd[P:])
-            first, second = first + moved, second + bending
-        T_e = dim.moment(C, self.a) + dim.torque(self.alpha, Y + turned)
-        T_e += dim.torque(self.beta, first) + dim.axial(second)
-        T_ed = dim.torque(self.beta, turned)
-        if moved is not None:
-            T_ed += 2.0 * dim.axial(moved)
-        out = np.empty((d + dim.r, 3, *C.shape[1:]))
-        out[:d, 0], out[:d, 1], out[:d, 2] = by_e, by_ed, C
-        out[d:, 0], out[d:, 1], out[d:, 2] = T_e, T_ed, dim.axial(turned)
+    @cached_property
+    def load_by_conjugates(self) -> np.ndarray:
+        """Derivative of (F, T) by the inertial conjugates and their rates (d + r, 3, d + g + q, n).
+
+        z is `Constants.inertial`'s last.
+        """
+        dim, d, ends = self.dim, self.dim.d, self.dim.d + self.dim.g
+        out = np.zeros((dim.b, 3, ends + len(self.rates), self.a.shape[1]))
+        on_s, on_v, on_z = out[:, :, :d], out[d:, :, d:ends], out[d:, :, ends:]
+        on_s[:d, 0], on_s[:d, 1] = dim.apply.matrix(self.alpha), dim.apply.matrix(self.beta)
+        on_s[range(d), 2, range(d)] = 1.0
+        on_s[d:, 0] = -dim.by_spin(self.a).swapaxes(0, 1)
+        # G, H and I have v and its transpose, v' and v'' transposed; W_c z takes the place of v.
+        of_alpha, of_beta = dim.torque.matrix(self.alpha), dim.torque.matrix(self.beta)
+        for rate, matrix in enumerate((of_alpha, of_beta, -dim.spin.T[:, :, None])):
+            on_v[:, rate] = dim.transposed(matrix.swapaxes(0, 1)).swapaxes(0, 1)
+        on_v[:, 0] += of_alpha
+        on_z[:] = np.einsum("rtgn,gqn->rtqn", on_v, self._Wz[:, :, 0])
+        on_z[:, 0] += product(of_beta, self._Wz[:, :, 1]) + dim.axial(self._Wz[:, :, 2])
         return out
 
-    def rows_by_rates(
-        self, kept: np.ndarray, outboard: dict[int, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the derivatives of the rows by those e, e', e'' kept, pushes held.
+    def load_by_rates(self, kept: np.ndarray) -> np.ndarray:
+        """Return the derivatives of (F, T) by those e, e', e'' kept (n, d + r, k, 3)."""
+        return self.by_rates(self.load_by_conjugates, self.constants.inertial, kept)
 
-        (n, q, k); the mass (q, k) if it is the same at all instants.
-        """
-        constants, q = self.constants, self.constants.num_modes
-        if constants.L is None:
-            by_e, by_ed, by_edd = *self._modal_tangent(kept), constants.M[:, kept]
-            held = self.load_coefficients(outboard)
+    def rows_by_rates(self, kept: np.ndarray, outboard: dict[int, np.ndarray]) -> np.ndarray:
+        """Return the derivatives of the rows by those e, e', e'' kept (n, q, k, 3), pushes held."""
+        constants, q, count = self.constants, self.constants.num_modes, self.w.shape[1]
+        W = constants.W.reshape(-1, q * q)
+        by_z = [(x.T @ W).reshape(count, q, q) for x in (self.alpha, self.beta)]
+        by_z.append(np.broadcast_to(constants.M, (count, q, q)))
+        if constants.bent is None:
+            out = np.stack([x[:, :, kept] for x in by_z], axis=3)
         else:
-            by_z, by_zd = self._modal_tangent(np.arange(q))
-            assert self.rates_by_e is not None
-            P = len(constants.T)
-            J, Jd, Jdd = (
-                np.ascontiguousarray(x[P:].transpose(2, 0, 1))
-                for x in (self._by_e, *self.rates_by_e)
-            )
-            left, own = J.swapaxes(1, 2), J[:, :, kept]
-            M = constants.M
-            by_e = left @ (by_z @ own + by_zd @ Jd[:, :, kept] + M @ Jdd[:, :, kept])
-            by_ed = left @ (by_zd @ own + 2.0 * (M @ Jd[:, :, kept]))
-            by_edd = left @ (M @ own)
-            held = np.concatenate([self.load_coefficients(outboard), self.modal_inertia])
-        if constants.K0 is not None:
-            bent = constants.bent.reshape(len(held), q, q)[:, :, kept]
-            by_e -= (held.T @ bent.reshape(len(held), q * len(kept))).reshape(by_e.shape)
-        by_e += constants.body.K[:, kept]
+            jets = self._by_rates(slice(len(constants.T), None), np.arange(q))
+            out = _chain(by_z, [x[:, :, kept] for x in jets]).reshape(count, q, -1)
+            out = (jets[0].swapaxes(1, 2) @ out).reshape(count, q, -1, 3)
+            held, bent = self._pushed(outboard), constants.bent[:, :, kept]
+            out[..., 0] -= np.tensordot(held.T, bent, 1)
+        out[..., 0] += constants.body.K[:, kept]
         if constants.D is not None:
-            by_ed += constants.body.D[:, kept]
-        return by_e, by_ed, by_edd
-
-    def _modal_tangent(self, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of `modal_inertia` by those z and z' kept (n, q, k)."""
-        q = self.constants.num_modes
-        W = self.constants.W.reshape(-1, q, q)[:, :, kept]
-        flat, shape = W.reshape(len(W), q * len(kept)), (self.w.shape[1], q, len(kept))
-        by_z, by_zd = ((x.T @ flat).reshape(shape) for x in (self.alpha, self.beta))
-        return by_z, by_zd
+            out[..., 1] += constants.body.D[:, kept]
+        return out
 
     # -- gradient ----------------------------------------------------------------------------
 
@@ -405,70 +394,60 @@ class BodyMotion:
         """
         constants, body, zeta = self.constants, self.constants.body, multipliers
         d, ends, P = self.dim.d, self.dim.d + self.dim.g, len(constants.T)
-        p, phi = virtual[:d], virtual[d:]
-        turned = self.dim.turned(phi, self._pushes)
-        every = np.zeros((P, 4, zeta.shape[1]))
-        every[:ends] = self._by_conjugates(p, phi, turned)
+        every = np.zeros((len(constants.by_e), 4, zeta.shape[1]))
+        every[constants.inertial, :3] = np.einsum("irpn,in->prn", self.load_by_conjugates, virtual)
+        every[:d, 3], every[d:ends, 3] = self.a, self.alpha
         for s, one in outboard.items():
             every[constants.outboard(s)] = one
         x = np.concatenate([self.rates, zeta[:, None]], axis=1)
-        by_T = np.tensordot(every, x, ((1, 2), (1, 2)))
-        pushed = zeta if constants.L is None else product(self._J, zeta)
+        by_T = np.tensordot(every[:P], x, ((1, 2), (1, 2)))
         W = np.zeros_like(body.W)
-        W[:, 0, 0], W[:, 1:, 0] = turned[:, 0].sum(axis=1), by_T[d:ends]
-        W[:, 1:, 1:] = self._by_second_moments(phi, pushed)
-        inertial, bent = np.zeros_like(body.K0), np.zeros((0, *body.K.shape))
-        if constants.K0 is not None:
-            if constants.L is not None:
-                every = np.concatenate([every, self._by_z(turned, pushed)])
+        W[:, 0, 0] = self.dim.turned(virtual[d:], self.alpha).sum(axis=1)
+        W[:, 1:, 0], W[:, 1:, 1:] = by_T[d:ends], self._by_second_moments(virtual[d:], zeta)
+        bent = np.zeros((len(every), *body.K.shape))
+        if constants.bent is not None:
+            self._add_modal(every[P:], zeta)
             bent = self._by_bending(every, x)
-            inertial[self.dim.loads] = bent[:ends]
         return ShapeIntegrals(
-            mass=float((p * self.a).sum()),
+            mass=float((virtual[:d] * self.a).sum()),
             w=np.column_stack([every[:d, 0].sum(axis=1), by_T[:d]]),
             W=W,
             K=zeta @ self.rates[:, 0].T,
             D=zeta @ self.rates[:, 1].T,
             outboard=by_T[ends:],
             outboard_point=np.zeros(d),
-            K0=inertial,
-            K0_outboard=bent[ends:P],
+            K0=bent[np.argsort(self.dim.loads)][: len(body.K0)],
+            K0_outboard=bent[ends:P][: len(body.K0_outboard)],
             further_points=np.zeros_like(body.further_points),
-            along_modes=bent[P:].reshape(body.along_modes.shape),
+            along_modes=bent[P:][: len(body.along_modes)].reshape(body.along_modes.shape),
         )
-
-    def _by_conjugates(self, p: np.ndarray, phi: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """Return the derivatives by the conjugates of a and alpha (d + g, 4, n)."""
-        dim, d = self.dim, self.dim.d
-        out = np.empty((d + dim.g, 4, p.shape[1]))
-        out[:d, 0] = dim.applied_transposed(self.alpha, p) - dim.velocity(phi, self.a)
-        out[:d, 1], out[:d, 2], out[:d, 3] = dim.applied_transposed(self.beta, p), p, self.a
-        out[d:, :3], out[d:, 3] = dim.transposed(turned), self.alpha
-        out[d:, 0] += turned[:, 0]
-        return out
 
     @property
     def accelerations(self) -> np.ndarray:
         """alpha_c z + beta_c z' + trace_c z'' (g, q, n)."""
         return np.asarray(np.einsum("crn,krn->ckn", self._pushes, self.z))
 
-    def _by_second_moments(self, phi: np.ndarray, pushed: np.ndarray) -> np.ndarray:
+    def _virtual_z(self, zeta: np.ndarray) -> np.ndarray:
+        """Return J zeta (q, n), the virtual displacement along the modes."""
+        if self.constants.bent is None:
+            return zeta
+        return product(self._by_e[len(self.constants.T) :], zeta)
+
+    def _by_second_moments(self, phi: np.ndarray, zeta: np.ndarray) -> np.ndarray:
         """Return the derivative of the virtual work by the modes' W (g, q, q)."""
         y = self.accelerations
-        left = np.concatenate([pushed, self.z[:, 0]], axis=1)
+        left = np.concatenate([self._virtual_z(zeta), self.z[:, 0]], axis=1)
         right = np.concatenate([y, self.dim.turned(phi, y)], axis=2)
         found: np.ndarray = left @ right.swapaxes(1, 2)  # of N_l' E_c N_k: l, k
         return found
 
-    def _by_z(self, turned: np.ndarray, pushed: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the virtual work by z, its rates and variation (q, 4, n)."""
-        constants, q = self.constants, len(pushed)
-        of_rows = np.einsum("ckl,kn->cln", constants.W.reshape(-1, q, q), pushed)
-        across = self.dim.transposed(self._Wz[:, :, 0])
-        by_z = np.einsum("crn,ckn->krn", self._pushes, of_rows)
-        by_z += np.einsum("crn,ckn->krn", turned, across)
-        by_z[:, 0] += np.einsum("crn,ckrn->kn", turned, self._Wz)
-        return np.concatenate([by_z, self.modal_inertia[:, None]], axis=1)
+    def _add_modal(self, every: np.ndarray, zeta: np.ndarray) -> None:
+        """Add the derivatives of the rows' work by z, its rates and variation (q, 4, n)."""
+        q = len(zeta)
+        W = self.constants.W.reshape(-1, q, q)
+        of_rows = np.einsum("ckl,kn->cln", W, self._virtual_z(zeta))
+        every[:, :3] += np.einsum("crn,ckn->krn", self._pushes, of_rows)
+        every[:, 3] = self.modal_inertia
 
     def _by_bending(self, every: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return the derivative by K0 and L (., q, q), of which the symmetric part counts."""
@@ -477,3 +456,20 @@ class BodyMotion:
         found = e @ np.einsum("prn,krn->pnk", every, half)
         found += ed @ (every[:, 2, :, None] * ed.T)
         return np.asarray(-found)
+
+
+def by_instant(x: np.ndarray) -> np.ndarray:
+    """Return matrices (n, i, j) of (i, j, n)."""
+    return np.ascontiguousarray(x.transpose(2, 0, 1))
+
+
+def _chain(by: Sequence[np.ndarray], rates: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the derivative by e, e', e'' (n, i, k, 3) of f(v, v', v''), v a function of e.
+
+    Args:
+        by: of f by v, v', v'' (n, i, p).
+        rates: V = dv/de, V', V'' (n, p, k).
+    """
+    (by_v, by_rate, by_second), (V, Vd, Vdd) = by, rates
+    by_e = by_v @ V + by_rate @ Vd + by_second @ Vdd
+    return np.stack([by_e, by_rate @ V + 2.0 * (by_second @ Vd), by_second @ V], axis=3)

@@ -1,29 +1,28 @@
-"""A scene as a machine: rigid bodies and rotations in space, joints, closures, mechanism."""
+"""A scene as a machine: rigid bodies, what they carry, joints and what is in them, closures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
 from dolfinopt.multibody.rotations import ONE, roll_pitch_yaw
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     rigid_bar,
+    rigid_body,
     rigid_spatial_body,
 )
 from dolfinopt.multibody.tree import (
     GROUND,
     Friction,
     Joint,
-    JointHardware,
     Mechanism,
     Rotor,
+    Site,
     bearing_body,
-    plane_chain,
-    spatial_mechanism,
     with_bearings,
 )
 from dolfinopt.scene.load import Arm, Scene
@@ -31,37 +30,75 @@ from dolfinopt.scene.tables import machine as scenes
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
 
-# -- A scene's rigid arms, payload and joints -> bodies and joints of a machine in space ---------
-
 Inertia = tuple[float, ...]
 
 
-def rigid_link(arm: Arm, density: float) -> ShapeIntegrals:
+def build_mechanism(scene: Scene, bodies: Sequence[ShapeIntegrals]) -> Mechanism:
+    """Return the scene's machine, of bodies in the order of its arms."""
+    friction = friction_of(scene, soft=False)
+    bearings = {
+        k: bearing_body(one.bearing[0], one.bearing[1], scene.dimension)
+        for k, one in enumerate(joint_parts(scene))
+        if one.bearing is not None
+    }
+    mechanism = _tree(scene, bodies, _loads(scene), friction if friction.acts else None)
+    return with_bearings(mechanism, bearings)
+
+
+def skeleton(scene: Scene) -> Mechanism:
+    """Return the scene's joints and interfaces without any mass: what moves rigid links."""
+    if not scene.is_spatial:
+        return _tree(scene, [rigid_bar(arm.length, arm.height, 0.0, 0.0) for arm in scene.arms], {})
+    points = [arm.interface_points for arm in scene.arms]
+    none = np.zeros(3), np.zeros(6)
+    return _tree(scene, [rigid_spatial_body(0.0, *none, one[0], one[1:]) for one in points], {})
+
+
+def _tree(
+    scene: Scene,
+    bodies: Sequence[ShapeIntegrals],
+    loads: Mapping[Site, Constants],
+    friction: Friction | None = None,
+) -> Mechanism:
+    """Return bodies on the scene's joints and its base."""
+    motion, d = scene.motion, scene.dimension
+    gravity = motion.gravity[:d] if len(motion.gravity) >= d else np.zeros(d)
+    return Mechanism(
+        bodies=tuple(bodies),
+        joints=joints_of(scene),
+        loads=loads,
+        gravity=np.array(gravity, dtype=float)[:, None],
+        end=scene.end_effector,
+        origin=np.zeros(3) if scene.is_spatial else np.array([0.0, motion.joint_height]),
+        cart=None if scene.is_spatial else motion.cart_mass,
+        friction=friction,
+        rods=len(scene.rods),
+    )
+
+
+# -- bodies: rigid arms, payload, what sits at joints ----------------------------------------
+
+
+def rigid_link(arm: Arm, density: float, dimension: int = 3) -> ShapeIntegrals:
     """Return a rigid arm's body: as stated, or of the solid bar of length, height, thickness.
 
     Args:
         arm: of the scene.
         density: of its material, kg/m3.
+        dimension: of the machine, 2 or 3.
     """
     x, y, z = arm.length, arm.height, arm.thickness
     mass = density * x * y * z if arm.mass is None else arm.mass
-    centre = (0.5 * x, 0.0, 0.0) if arm.centre is None else arm.centre
     inertia = arm.inertia
+    if dimension == 2:
+        assert not isinstance(inertia, tuple)  # the scene would have refused it
+        return rigid_bar(x, y, mass, inertia)
     if inertia is None:
         squares = (y * y + z * z, x * x + z * z, x * x + y * y)
         inertia = (*(mass * square / 12.0 for square in squares), 0.0, 0.0, 0.0)
+    centre = (0.5 * x, 0.0, 0.0) if arm.centre is None else arm.centre
     further = arm.interface_points[1:]
     return rigid_spatial_body(mass, centre, _tensor(inertia), (x, 0.0, 0.0), further)
-
-
-def flat_bar(arm: Arm, density: float) -> ShapeIntegrals:
-    """Return a rigid arm's body in the plane likewise."""
-    mass = density * arm.length * arm.height * arm.thickness if arm.mass is None else arm.mass
-    assert not isinstance(arm.inertia, tuple)  # the scene would have refused it
-    return rigid_bar(arm.length, arm.height, mass, arm.inertia)
-
-
-RIGID_ARMS = {2: flat_bar, 3: rigid_link}  # by the machine's dimension
 
 
 def _tensor(inertia: float | Inertia) -> Inertia:
@@ -69,95 +106,90 @@ def _tensor(inertia: float | Inertia) -> Inertia:
     return inertia if isinstance(inertia, tuple) else (*[inertia] * 3, 0.0, 0.0, 0.0)
 
 
-def _spatial_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
-    """Put the bodies on the scene's joints, with what they carry.
-
-    Args:
-        scene: with [[joints]].
-        bodies: of the arms, in the scene's order.
-    """
-    gravity, end = scene.motion.gravity, scene.end_effector
-    carried = {(k, 0): _carried(scene, k) for k in range(len(bodies))}
-    if end[1]:
-        carried[end] = _payload(scene)
-    mechanism = spatial_mechanism(
-        bodies,
-        joints_of(scene),
-        {site: one for site, one in carried.items() if one is not None},
-        gravity if len(gravity) == 3 else (0.0, 0.0, 0.0),
-        end,
-    )
-    mechanism = _with_parts(mechanism, scene)
-    return replace(mechanism, rods=len(scene.rods)) if scene.rods else mechanism
+def _loads(scene: Scene) -> dict[Site, Constants]:
+    """Return what the arms carry at interfaces without a joint: motors and the payload."""
+    payload, found = scene.payload, {}
+    inertia = payload.inertia if scene.is_spatial else payload.moment
+    found[scene.end_effector] = _carried(scene, payload.mass, inertia, payload.offset)
+    for k, arm in enumerate(scene.arms):
+        if arm.joint_mass or arm.joint_inertia:
+            motor = _carried(scene, arm.joint_mass, arm.joint_inertia)
+            found[k, 0] = motor + found[k, 0] if (k, 0) in found else motor
+    return {site: Constants(body) for site, body in found.items()}
 
 
-def _with_parts(mechanism: Mechanism, scene: Scene) -> Mechanism:
-    """Put bearings and friction into the joints of a scene's mechanism."""
-    parts = joint_parts(scene)
-    bearings = {
-        k: bearing_body(np.array(one.bearing[0]), np.array(one.bearing[1]), scene.dimension)
-        for k, one in enumerate(parts)
-        if one.bearing is not None
-    }
-    friction = friction_of(scene, [one if one.stiffness == 0.0 else None for one in parts])
-    mechanism = with_bearings(mechanism, bearings)
-    return replace(mechanism, friction=friction) if friction.acts else mechanism
+def _carried(
+    scene: Scene, mass: float, inertia: float | Inertia, offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> ShapeIntegrals:
+    """Return a rigid body in an interface's frame."""
+    if scene.is_spatial:
+        return rigid_spatial_body(mass, np.array(offset), _tensor(inertia))
+    assert not isinstance(inertia, tuple)
+    return rigid_body(mass, np.zeros(2), inertia, np.zeros(2))
 
 
-def friction_of(scene: Scene, parts: Sequence[JointParts | None]) -> Friction:
-    """Return the friction (R,) of all rigid coordinates by the parts of every arm's joint."""
-    found = Friction.none(scene.num_rigid)
-    for k, one in zip(scene.joint_columns, parts, strict=True):
-        if k is not None and one is not None and one.friction is not None:
-            found.viscous[k], found.coulomb[k], found.speed[k] = one.friction
-    return found
+# -- joints, and what is in them -------------------------------------------------------------
 
 
 def joints_of(scene: Scene) -> tuple[Joint, ...]:
     """Return the joints that hold the arms, in the arms' order."""
+    if not scene.is_spatial:
+        flat = np.ones(1), np.zeros(2), np.eye(2)
+        return tuple(
+            Joint(arm.name, "revolute", k - 1, k + 1, *flat, rotor)
+            for k, (arm, rotor) in enumerate(zip(scene.arms, rotors_of(scene), strict=True))
+        )
     index = {arm.name: k for k, arm in enumerate(scene.arms)}
-    coordinates = {joint.name: i for i, joint in enumerate(scene.movable)}
-    by_child = {index[joint.child]: joint for joint in scene.joints}
-    joints, rotors = [], rotors_of(scene)
-    for k in range(len(scene.arms)):
-        one = by_child[k]
+    by_child = {joint.child: joint for joint in scene.joints}
+    joints, columns = [], scene.joint_columns
+    for arm, coordinate, rotor in zip(scene.arms, columns, rotors_of(scene), strict=True):
+        one = by_child[arm.name]
         parent, interface = GROUND, 0
         if one.parent != scenes.GROUND:
             parent = index[one.parent]
             interface = interface_number(scene.arms[parent], one.parent_interface) or 0
-        axis = np.array((0.0, 0.0, 1.0) if one.axis is None else one.axis)
         joints.append(
             Joint(
                 name=one.name,
                 kind=one.type,
                 parent=parent,
-                coordinate=coordinates.get(one.name),
-                axis=axis / np.linalg.norm(axis),
+                coordinate=coordinate,
+                axis=_unit((0.0, 0.0, 1.0) if one.axis is None else one.axis),
                 origin=np.array(one.origin, dtype=float),
                 rotation=roll_pitch_yaw(one.rpy),
-                rotor=rotors[k],
+                rotor=rotor,
                 interface=interface,
             )
         )
     return tuple(joints)
 
 
+def friction_of(scene: Scene, soft: bool) -> Friction:
+    """Return the friction (R,) of joints, or of the motors before `soft` gears."""
+    found = Friction.none(scene.num_rigid)
+    for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True):
+        if k is not None and one.friction is not None and (one.stiffness > 0.0) == soft:
+            found.viscous[k], found.coulomb[k], found.speed[k] = one.friction
+    return found
+
+
+def soft_joints(scene: Scene) -> dict[int, JointParts]:
+    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
+    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
+    return dict(sorted(found.items()))
+
+
+def rotors_of(scene: Scene) -> list[Rotor | None]:
+    """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
+    motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
+    return [
+        Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
+        for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
+    ]
+
+
 # -- what closes loops -----------------------------------------------------------------------
-
-
-def skeleton(scene: Scene) -> Mechanism:
-    """Return the scene's joints and interfaces without any mass: what moves rigid links."""
-    none = np.zeros(3)
-    if not scene.is_spatial:
-        bars = [rigid_bar(arm.length, arm.height, 0.0, 0.0) for arm in scene.arms]
-        hardware = [JointHardware()] * len(bars)
-        return plane_chain(bars, 0.0, 0.0, (0.0, 0.0), scene.motion.joint_height, hardware=hardware)
-    bodies = []
-    for arm in scene.arms:
-        first, *further = arm.interface_points
-        bodies.append(rigid_spatial_body(0.0, none, np.zeros(6), first, tuple(further)))
-    one = spatial_mechanism(bodies, joints_of(scene), {}, none, scene.end_effector)
-    return replace(one, rods=len(scene.rods))
 
 
 def loops_of(scene: Scene) -> Loops | None:
@@ -185,84 +217,33 @@ def reach_of(mechanism: Mechanism) -> float:
     return total + float(np.linalg.norm(point)) or 1.0
 
 
+# Which axes of the two frames face each other: 0 along the closure's axis, 1 and 2 across it.
+FACING = {
+    "ball": (),
+    "pin": ((0, 1), (0, 2)),
+    "slider": ((1, 2), (2, 0), (0, 1)),
+    "universal": ((1, 0),),
+}
+
+
 def _equations(one: Closures, d: int, reach: float, place: int | None) -> tuple[Equation, ...]:
     """Return a closure's equations; vectors of the second frame are in the joint's."""
     if one.kind == "rod":
         return (Distance(0.0 if place is not None else one.length or 0.0, place),)
-    together: tuple[Equation, ...] = tuple(map(Along, np.eye(d)))
-    if one.kind == "ball" or (one.kind == "pin" and d == 2):
-        return together
-    axis = _unit(one.axis)
+    frame = np.eye(d) if one.kind == "ball" or (d == 2 and one.kind == "pin") else _frame(one, d)
+    lines = frame[1:] if one.kind == "slider" else np.eye(d)
+    pairs = FACING[one.kind] if d == 3 else ()
+    return (*map(Along, lines), *(Facing(frame[i], frame[j], reach) for i, j in pairs))
+
+
+def _frame(one: Closures, d: int) -> np.ndarray:
+    """Return the direction of a closure's axis and those across it (d, d), a row each."""
+    axis = _unit((one.axis or ())[:d])
     if d == 2:
-        return (Along(np.array([-axis[1], axis[0]])),)
-    if one.kind == "universal":
-        return (*together, Facing(_unit(one.cross_axis), axis, reach))
-    across = _unit(np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))
-    other = np.cross(axis, across)
-    if one.kind == "pin":
-        return (*together, Facing(axis, across, reach), Facing(axis, other, reach))
-    pairs = (across, other), (other, axis), (axis, across)
-    return (Along(across), Along(other), *(Facing(u, v, reach) for u, v in pairs))
+        return np.array([axis, [-axis[1], axis[0]]])
+    across = _unit(one.cross_axis or np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))
+    return np.array([axis, across, np.cross(axis, across)])
 
 
-def _unit(v: Sequence[float] | np.ndarray | None) -> np.ndarray:
-    assert v is not None
+def _unit(v: Sequence[float] | np.ndarray) -> np.ndarray:
     return np.asarray(v, dtype=float) / np.linalg.norm(v)
-
-
-def _payload(scene: Scene) -> ShapeIntegrals:
-    """Return the payload, in the frame of the end-effector's interface."""
-    payload = scene.payload
-    return rigid_spatial_body(payload.mass, payload.offset, _tensor(payload.inertia))
-
-
-def _carried(scene: Scene, k: int) -> ShapeIntegrals | None:
-    """Return what arm k carries at its outboard interface: motors, the payload."""
-    arm = scene.arms[k]
-    parts = []
-    if arm.joint_mass or arm.joint_inertia:
-        parts.append(rigid_spatial_body(arm.joint_mass, (0.0,) * 3, _tensor(arm.joint_inertia)))
-    if scene.end_effector == (k, 0):
-        parts.append(_payload(scene))
-    if not parts:
-        return None
-    return parts[0] if len(parts) == 1 else parts[0] + parts[1]
-
-
-def build_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
-    """Return the scene's machine, of bodies in the order of its arms."""
-    build = _spatial_mechanism if scene.dimension == 3 else _plane_mechanism
-    return build(scene, bodies)
-
-
-def _plane_mechanism(scene: Scene, bodies: list[ShapeIntegrals]) -> Mechanism:
-    """Put the bodies on the scene's base, with what sits at their joints and its payload."""
-    mechanism = plane_chain(
-        bodies,
-        scene.payload.mass,
-        scene.payload.moment,
-        (scene.motion.gravity[0], scene.motion.gravity[1]),
-        scene.motion.joint_height,
-        hardware=[
-            JointHardware(arm.joint_mass, arm.joint_inertia, rotor)
-            for arm, rotor in zip(scene.arms, rotors_of(scene), strict=True)
-        ],
-        cart_mass=scene.motion.cart_mass,
-    )
-    return _with_parts(mechanism, scene)
-
-
-def soft_joints(scene: Scene) -> dict[int, JointParts]:
-    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
-    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
-    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
-    return dict(sorted(found.items()))
-
-
-def rotors_of(scene: Scene) -> list[Rotor | None]:
-    """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
-    motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
-    return [
-        Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
-        for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
-    ]

@@ -24,7 +24,7 @@ ch. 2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,11 +37,8 @@ from dolfinopt.multibody.tree import Mechanism, Site
 
 # -- equations: value, force on both frames, and how the force changes as these move -------------
 #
-# Changes are those by a displacement (d, ., n) and a rotation (r, ., n) of either frame; trailing
-# axes of directions come before the instants.
-
-# Loads are (2 d + 2 r, ., n), force and moment on a, then those on b; changes dp_a, s_a, dp_b, s_b
-# likewise.
+# Loads are (2 d + 2 r, n), force and moment on a, then those on b. Changes are those by m moves of
+# both frames, dp_a, s_a, dp_b, s_b (2 d + 2 r, m, n).
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +53,15 @@ class Along:
 
     def loads(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return its gradient as loads on both frames."""
-        e, apart = b.turned(self.e), a.place - b.place
-        return np.concatenate([e, np.zeros((a.dim.r, e.shape[1])), -e, a.dim.moment(e, apart)])
+        e = b.turned(self.e)
+        return _pair(a.dim, e, a.dim.moment(e, a.place - b.place))
 
     def changes(self, a: SiteMotion, b: SiteMotion, moved: np.ndarray) -> np.ndarray:
         """Return how these change."""
-        dim, (by_a, still, by_b, spin) = a.dim, _parts(a.dim, moved)
-        e, apart = _before(b.turned(self.e), by_a), _before(a.place - b.place, by_a)
+        dim, (by_a, _, by_b, spin) = a.dim, _parts(a.dim, moved)
+        e, apart = b.turned(self.e)[:, None], (a.place - b.place)[:, None]
         turned = dim.velocity(spin, e)
-        moment = dim.moment(turned, apart) + dim.moment(e, by_a - by_b)
-        return np.concatenate([turned, np.zeros_like(still), -turned, moment])
+        return _pair(dim, turned, dim.moment(turned, apart) + dim.moment(e, by_a - by_b))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +79,15 @@ class Facing:
     def loads(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return its gradient as loads on both frames."""
         moment = self.length * a.dim.moment(a.turned(self.u), b.turned(self.v))
-        none = np.zeros_like(a.place)
-        return np.concatenate([none, moment, none, -moment])
+        return _pair(a.dim, np.zeros_like(a.place), -moment, moment)
 
     def changes(self, a: SiteMotion, b: SiteMotion, moved: np.ndarray) -> np.ndarray:
         """Return how these change."""
         dim, (by_a, spin_a, _, spin_b) = a.dim, _parts(a.dim, moved)
-        u, v = _before(a.turned(self.u), by_a), _before(b.turned(self.v), by_a)
+        u, v = a.turned(self.u)[:, None], b.turned(self.v)[:, None]
         moment = dim.moment(dim.velocity(spin_a, u), v) + dim.moment(u, dim.velocity(spin_b, v))
-        none, moment = np.zeros_like(by_a), self.length * moment
-        return np.concatenate([none, moment, none, -moment])
+        moment *= self.length
+        return _pair(dim, np.zeros_like(by_a), -moment, moment)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,18 +106,15 @@ class Distance:
     def loads(self, a: SiteMotion, b: SiteMotion) -> np.ndarray:
         """Return its gradient as loads on both frames."""
         apart = a.place - b.place
-        n, none = apart / np.linalg.norm(apart, axis=0), np.zeros((a.dim.r, apart.shape[1]))
-        return np.concatenate([n, none, -n, none])
+        return _pair(a.dim, apart / np.linalg.norm(apart, axis=0))
 
     def changes(self, a: SiteMotion, b: SiteMotion, moved: np.ndarray) -> np.ndarray:
         """Return how these change."""
-        by_a, spin, by_b, _ = _parts(a.dim, moved)
-        apart = _before(a.place - b.place, by_a)
+        by_a, _, by_b, _ = _parts(a.dim, moved)
+        apart, by = (a.place - b.place)[:, None], by_a - by_b
         size = np.linalg.norm(apart, axis=0)
-        n, by = apart / size, by_a - by_b
-        turned = (by - n * (n * by).sum(axis=0)) / size
-        none = np.zeros_like(spin)
-        return np.concatenate([turned, none, -turned, none])
+        n = apart / size
+        return _pair(a.dim, (by - n * (n * by).sum(axis=0)) / size)
 
 
 Equation = Along | Facing | Distance
@@ -133,9 +125,15 @@ def _parts(dim: Dimension, moved: np.ndarray) -> list[np.ndarray]:
     return np.split(moved, [dim.d, dim.b, dim.b + dim.d])
 
 
-def _before(x: np.ndarray, like: np.ndarray) -> np.ndarray:
-    """Return x (d, n) with axes for the directions of (d, ..., n)."""
-    return x.reshape(len(x), *(1,) * (like.ndim - 2), x.shape[-1])
+def _pair(
+    dim: Dimension,
+    force: np.ndarray,
+    moment: np.ndarray | float = 0.0,
+    on_a: np.ndarray | float = 0.0,
+) -> np.ndarray:
+    """Return a force on a and its opposite on b, there with a moment, and one on a."""
+    none = np.zeros((dim.r, *force.shape[1:]))
+    return np.concatenate([force, none + on_a, -force, none + moment])
 
 
 # -- closures ------------------------------------------------------------------------------------
@@ -192,10 +190,14 @@ class Loops:
         """By what (k,) a multiplier is a moment, m; 1 of forces."""
         return np.array([one.length if isinstance(one, Facing) else 1.0 for one in self.equations])
 
+    def split(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return every closure's part of values (..., k) of the equations."""
+        ends = np.cumsum([len(tie.equations) for tie in self.ties])
+        return np.split(values, ends, axis=-1)[: len(self.ties)]
+
     def by_tie(self, values: np.ndarray) -> list[float]:
-        """Return the norm of every closure's part of values (k,) of the equations."""
-        ends = np.cumsum([len(tie.equations) for tie in self.ties])[:-1]
-        return [float(np.linalg.norm(part)) for part in np.split(values, ends)]
+        """Return the norm of every closure's part of values (k,)."""
+        return [float(np.linalg.norm(part)) for part in self.split(values)]
 
     def reactions(self, multipliers: np.ndarray) -> np.ndarray:
         """Return forces and moments on the first frames, N and N m, of multipliers (n, k)."""
@@ -207,52 +209,87 @@ class Loops:
         return ClosedLoops(self, Posed(mechanism, q_r, q))
 
 
+class ClosedTie:
+    """One closure at n poses; loads and moves of its two frames are (2 d + 2 r, ., n)."""
+
+    def __init__(self, tie: Tie, posed: Posed) -> None:
+        """Take it and the poses."""
+        dim, self.equations = posed.mechanism.dim, tie.equations
+        on_a = SiteMotion(posed, tie.a, np.zeros(dim.d), np.eye(dim.d))
+        self.sites = on_a, SiteMotion(posed, tie.b, tie.point, tie.rotation)
+        self.by = np.concatenate([site.by for site in self.sites])
+
+    @cached_property
+    def loads(self) -> np.ndarray:
+        """Loads of the m equations on both frames (2 b, m, n)."""
+        return np.stack([one.loads(*self.sites) for one in self.equations], axis=1)
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """Derivatives of the equations by all coordinates (n, m, C)."""
+        out: np.ndarray = np.einsum("bmn,bcn->nmc", self.loads, self.by)
+        for k, one in enumerate(self.equations):
+            if isinstance(one, Distance) and one.coordinate is not None:
+                out[:, k, one.coordinate] -= 1.0
+        return out
+
+    def loads_of(self, multipliers: np.ndarray) -> list[np.ndarray]:
+        """Return force and moment (b, n) of multipliers (n, m) on either frame."""
+        return np.split(np.einsum("bmn,nm->bn", self.loads, multipliers), 2)
+
+    def changes(self, multipliers: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """Return how these change by moves of both frames (2 b, ., n)."""
+        pairs = zip(multipliers.T, self.equations, strict=True)
+        return np.sum([w * one.changes(*self.sites, moved) for w, one in pairs], axis=0)
+
+    def along(self, virtual: np.ndarray) -> np.ndarray:
+        """Return how both frames move by virtual coordinates (2 b, 1, n)."""
+        return np.asarray(np.einsum("bcn,nc->bn", self.by, virtual)[:, None])
+
+    def hessian(self, multipliers: np.ndarray) -> np.ndarray:
+        """Return the derivative of the generalised force by all coordinates (n, C, C)."""
+        changed = self.changes(multipliers, self.by)
+        found: np.ndarray = np.einsum("bjn,bin->nji", self.by, changed)
+        pairs = zip(self.sites, self.loads_of(multipliers), strict=True)
+        return found + sum(site.hessian(load) for site, load in pairs if site.way)
+
+    def acceleration(self, rates: np.ndarray) -> np.ndarray:
+        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, m), m/s2.
+
+        The power g' of unit loads on moving frames, differentiated.
+        """
+        v, bias = self.along(rates), [x for site in self.sites for x in site.acceleration(rates)]
+        turned = np.concatenate([one.changes(*self.sites, v) for one in self.equations], axis=1)
+        power = turned * v + self.loads * np.concatenate(bias)[:, None]
+        return np.asarray(power.sum(axis=0).T)
+
+
 class ClosedLoops:
     """Closures at n poses: gaps, Jacobian, forces and what they depend on."""
 
     def __init__(self, loops: Loops, posed: Posed) -> None:
         """Take them and the poses."""
         self.loops, self.posed = loops, posed
-        dim = posed.mechanism.dim
-        one, none = np.eye(dim.d), np.zeros(dim.d)
-        self._sites = [
-            (
-                SiteMotion(posed, tie.a, none, one),
-                SiteMotion(posed, tie.b, tie.point, tie.rotation),
-            )
-            for tie in loops.ties
-        ]
+        self.ties = [ClosedTie(tie, posed) for tie in loops.ties]
 
     @property
     def places(self) -> np.ndarray:
         """Where both frames of every closure are (n, closures, 2, d), m."""
-        pairs = [np.stack([a.place.T, b.place.T], axis=1) for a, b in self._sites]
-        return np.stack(pairs, axis=1)
-
-    @property
-    def _equations(self) -> list[tuple[Equation, SiteMotion, SiteMotion]]:
-        pairs = zip(self.loops.ties, self._sites, strict=True)
-        return [(one, a, b) for tie, (a, b) in pairs for one in tie.equations]
+        every = [[site.place for site in tie.sites] for tie in self.ties]
+        return np.moveaxis(np.array(every), -1, 0)
 
     @cached_property
     def gap(self) -> np.ndarray:
         """The equations (n, k), m."""
-        out = np.empty((len(self.posed.q), self.loops.count))
-        for k, (one, a, b) in enumerate(self._equations):
-            out[:, k] = one.value(a, b)
-        return out
+        rows = [one.value(*tie.sites) for tie in self.ties for one in tie.equations]
+        return np.reshape(rows, (len(rows), len(self.posed.q))).T
 
     @cached_property
     def jacobian(self) -> np.ndarray:
         """Their derivatives by all coordinates (n, k, C)."""
-        size = self.posed.mechanism.num_rigid + self.posed.q.shape[1]
-        out = np.empty((len(self.posed.q), self.loops.count, size))
-        for k, (one, a, b) in enumerate(self._equations):
-            on_a, on_b = np.split(one.loads(a, b), 2)
-            out[:, k] = a.generalised_force(on_a) + b.generalised_force(on_b)
-            if isinstance(one, Distance) and one.coordinate is not None:
-                out[:, k, one.coordinate] -= 1.0
-        return out
+        count, elastic = self.posed.q.shape
+        none = np.zeros((count, 0, self.posed.mechanism.num_rigid + elastic))
+        return np.concatenate([none, *(tie.jacobian for tie in self.ties)], axis=1)
 
     def generalised_force(self, multipliers: np.ndarray) -> np.ndarray:
         """Return what the closures' forces of multipliers (n, k) do on every coordinate (n, C)."""
@@ -272,56 +309,26 @@ class ClosedLoops:
     def interface_loads(self, multipliers: np.ndarray) -> dict[Site, np.ndarray]:
         """Return what interfaces give to the closures, force and moment in their components."""
         found: dict[Site, np.ndarray] = {}
-        for sites, loads in zip(self._sites, self._loads(multipliers), strict=True):
-            for site, load in zip(sites, np.split(loads, 2), strict=True):
-                if not site.way:
-                    continue
-                end = site.way[-1]
-                own = site.load_on(*self.posed.interface(*end), -load)
-                found[end] = own + found[end] if end in found else own
+        for tie, part in self._each(multipliers):
+            for site, load in zip(tie.sites, tie.loads_of(part), strict=True):
+                if site.way:
+                    end = site.way[-1]
+                    own = site.load_on(*self.posed.interface(*end), -load)
+                    found[end] = own + found[end] if end in found else own
         return found
 
-    def _loads(
-        self, multipliers: np.ndarray, moved: Sequence[np.ndarray] | None = None
-    ) -> list[np.ndarray]:
-        """Return the loads of every closure on its two frames, or their change as frames move."""
-        weights, found = iter(multipliers.T), []
-        for k, (tie, sites) in enumerate(zip(self.loops.ties, self._sites, strict=True)):
-            every = [
-                one.loads(*sites) if moved is None else one.changes(*sites, moved[k])
-                for one in tie.equations
-            ]
-            found.append(np.sum([next(weights) * loads for loads in every], axis=0))
-        return found
+    def _each(self, multipliers: np.ndarray) -> Iterator[tuple[ClosedTie, np.ndarray]]:
+        """Return every closure and its part of multipliers (n, k)."""
+        return zip(self.ties, self.loops.split(multipliers), strict=True)
 
     def hessian(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the derivative of `generalised_force` by all coordinates (n, C, C)."""
-        moved = [np.concatenate([a.by, b.by]) for a, b in self._sites]
-        every = self._loads(multipliers), moved, self._loads(multipliers, moved)
-        size, count = self.posed.mechanism.num_rigid + self.posed.q.shape[1], len(self.posed.q)
-        found = np.zeros((count, size, size))
-        for sites, loads, by, changed in zip(self._sites, *every, strict=True):
-            found += np.einsum("bjn,bin->nji", by, changed)
-            for site, load in zip(sites, np.split(loads, 2), strict=True):
-                if site.way:
-                    found += site.hessian(load)
-        return found
+        return np.sum([tie.hessian(part) for tie, part in self._each(multipliers)], axis=0)
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
-        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, k), m/s2.
-
-        The power g' of unit loads on moving frames, differentiated.
-        """
-        found = []
-        moved = self._along(rates)
-        bias = [
-            np.concatenate([*a.acceleration(rates), *b.acceleration(rates)]) for a, b in self._sites
-        ]
-        for tie, sites, v, a in zip(self.loops.ties, self._sites, moved, bias, strict=True):
-            for one in tie.equations:
-                power = one.changes(*sites, v) * v + one.loads(*sites) * a
-                found.append(power.sum(axis=0))
-        return np.stack(found, axis=1) if found else np.zeros((len(rates), 0))
+        """Return what rates (n, R) of rigid bodies add to the second derivatives (n, k), m/s2."""
+        none = np.zeros((len(rates), 0))
+        return np.concatenate([none, *(tie.acceleration(rates) for tie in self.ties)], axis=1)
 
     def gradient(
         self, weights: np.ndarray, multipliers: np.ndarray, virtual: np.ndarray
@@ -335,13 +342,10 @@ class ClosedLoops:
         Returns:
             Of every body, by its outboard modes (b, q) and K0_outboard (b, q, q).
         """
-        found, moved = no_gradient(self.posed.mechanism), self._along(virtual)
-        every = self._loads(weights), self._loads(multipliers), self._loads(multipliers, moved)
-        for sites, *loads in zip(self._sites, *every, strict=True):
-            for site, *own in zip(sites, *(np.split(one, 2) for one in loads), strict=True):
-                site.add_gradient(found, *own, virtual)
+        found = no_gradient(self.posed.mechanism)
+        for (tie, part), own in zip(self._each(multipliers), self.loops.split(weights)):
+            changed = np.split(tie.changes(part, tie.along(virtual))[:, 0], 2)
+            loads = tie.loads_of(own), tie.loads_of(part), changed
+            for site, weight, load, change in zip(tie.sites, *loads, strict=True):
+                site.add_gradient(found, weight, load, change, virtual)
         return found
-
-    def _along(self, virtual: np.ndarray) -> list[np.ndarray]:
-        """Return displacement and rotation of every closure's frames."""
-        return [np.concatenate([a.along(virtual), b.along(virtual)]) for a, b in self._sites]

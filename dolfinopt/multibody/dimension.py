@@ -46,25 +46,23 @@ def compose(R: np.ndarray, S: np.ndarray) -> np.ndarray:
     return np.einsum("ijn,jk->ikn", R, S) if S.ndim == 2 < R.ndim else product(R, S)
 
 
-def transposed_product(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Return A' B (j, ..., n) likewise."""
-    return product(A.swapaxes(0, 1), B)
+class Bilinear:
+    """The function sum_jk T_...jk x_j y_k (..., n) of x (j, ..., n) and y (k, ..., n)."""
 
+    def __init__(self, T: np.ndarray) -> None:
+        """Take T."""
+        self._shape, flat = T.shape, T.reshape(-1, *T.shape[-2:]).swapaxes(1, 2)
+        self._rows, self._by_x = len(flat), flat.reshape(-1, T.shape[-2])
 
-Bilinear: TypeAlias = "Callable[[np.ndarray, np.ndarray], np.ndarray]"
+    def matrix(self, x: np.ndarray) -> np.ndarray:
+        """Return its derivative by y (i, k, ..., n), of T's first axes as one."""
+        found = self._by_x.dot(x.reshape(len(x), -1))
+        return found.reshape(self._rows, self._shape[-1], *x.shape[1:])
 
-
-def _bilinear(T: np.ndarray) -> Bilinear:
-    """Return the function sum_jk T_...jk x_j y_k (..., n) of x (j, ..., n) and y (k, ..., n)."""
-    flat, (j, k) = T.reshape(-1, *T.shape[-2:]), T.shape[-2:]
-    rows, by_x = len(flat), flat.swapaxes(1, 2).reshape(-1, j)
-
-    def function(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        matrix = by_x.dot(x.reshape(j, -1)).reshape(rows, k, *x.shape[1:])
-        out: np.ndarray = np.einsum("ij...,j...->i...", matrix, y)
-        return out.reshape(*T.shape[:-2], *out.shape[1:])
-
-    return function
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return its value."""
+        out: np.ndarray = np.einsum("ij...,j...->i...", self.matrix(x), y)
+        return out.reshape(*self._shape[:-2], *out.shape[1:])
 
 
 def components(E: np.ndarray) -> np.ndarray:
@@ -87,10 +85,10 @@ class Dimension:
         velocity: w x p.
         moment: p x f.
         commutator: w x v of angular velocities.
-        apply: A p of the entries alpha of A.
-        centripetal_by_spin: its derivative (d, r, n) by w, of w and p.
-        torque: the moment of accelerations alpha by second moments G.
+        apply: A p of the entries alpha of A; applied: the same of p and alpha.
+        torque: the moment of accelerations alpha by second moments G; torque_of: of G and alpha.
         turned: its adjoint, the entries of (w~)' y.
+        spin: (g, r) entries of w~ by w.
     """
 
     def __init__(
@@ -100,29 +98,25 @@ class Dimension:
         self.E, self.loads, self.turning = E, np.array(loads), turning
         self.d, self.r, self.g, self.b = E.shape[1], len(S), len(E), E.shape[1] + len(S)
         in_E = components(E)
-        self._spin = np.einsum("cab,rab->cr", in_E, S)
+        self.spin = np.einsum("cab,rab->cr", in_E, S)
         self._transposed = np.einsum("cab,eba->ce", in_E, E)
         self.trace = np.trace(in_E, axis1=1, axis2=2)[:, None]
-        self._skew, self._by_spin = S.reshape(self.r, -1).T, S.swapaxes(0, 1).reshape(-1, self.d)
         squares = np.einsum("cab,rad,sdb->crs", in_E, S, S)
         torque = np.einsum("eab,rda,cdb->rce", in_E, S, E)
-        by_w = squares + squares.swapaxes(1, 2)
-        self._inertia = np.einsum("rce,cs->rse", torque, self._spin).reshape(-1, self.g)
-        self._square, self.velocity = _bilinear(squares), _bilinear(S.swapaxes(0, 1))
-        self.moment, self.apply = _bilinear(S.swapaxes(1, 2)), _bilinear(E.swapaxes(0, 1))
-        self.torque, self.turned = _bilinear(torque), _bilinear(torque.transpose(2, 0, 1))
-        self.commutator = _bilinear(np.einsum("tab,rad,sdb->trs", S, S, S))
-        self.centripetal_by_spin = _bilinear(np.einsum("cij,crs->irsj", E, by_w))
-        self._torque_by_w = _bilinear(np.einsum("tce,crs->trse", torque, by_w))
-        self._contracted = _bilinear(by_w.transpose(1, 2, 0))
+        self._square, self._by_spin = Bilinear(squares), Bilinear(squares + squares.swapaxes(1, 2))
+        self.velocity, self.moment = Bilinear(S.swapaxes(0, 1)), Bilinear(S.swapaxes(1, 2))
+        self.commutator = Bilinear(np.einsum("tab,rad,sdb->trs", S, S, S))
+        self.apply, self.applied = Bilinear(E.swapaxes(0, 1)), Bilinear(E.transpose(1, 2, 0))
+        self.torque, self.torque_of = Bilinear(torque), Bilinear(torque.swapaxes(1, 2))
+        self.turned = Bilinear(torque.transpose(2, 0, 1))
 
     def skew(self, w: np.ndarray) -> np.ndarray:
         """Return w~ (d, d, ...) of angular velocities (r, ...)."""
-        return product(self._skew, w).reshape(self.d, self.d, *w.shape[1:])
+        return self.velocity.matrix(w)
 
     def by_spin(self, p: np.ndarray) -> np.ndarray:
         """Return the derivative of w x p by w (d, r, n)."""
-        return product(self._by_spin, p).reshape(self.d, self.r, *p.shape[1:])
+        return self.moment.matrix(p).swapaxes(0, 1)
 
     def transposed(self, x: np.ndarray) -> np.ndarray:
         """Return the entries (g, ..., n) of the transposed matrices."""
@@ -130,32 +124,19 @@ class Dimension:
 
     def alpha(self, w: np.ndarray, wd: np.ndarray) -> np.ndarray:
         """Return the entries (g, n) of A."""
-        return self._square(w, w) + self._spin.dot(wd)
+        return self._square(w, w) + self.spin.dot(wd)
 
     def beta(self, w: np.ndarray) -> np.ndarray:
         """Return the entries (g, n) of 2 Omega."""
-        return product(self._spin, 2.0 * w)
+        return product(self.spin, 2.0 * w)
 
-    def applied_transposed(self, alpha: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return A' p (d, n)."""
-        return self.apply(self.transposed(alpha), p)
+    def alpha_by_spin(self, w: np.ndarray) -> np.ndarray:
+        """Return the derivative of `alpha` by w (g, r, n)."""
+        return self._by_spin.matrix(w)
 
     def axial(self, G: np.ndarray) -> np.ndarray:
         """Return `torque` (r, ..., n) of second moments with accelerations themselves."""
-        return product(-self._spin.T, G)
-
-    def torque_by_spin(
-        self, w: np.ndarray, G: np.ndarray, H: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives (r, r, n) of torque(alpha, G) + torque(beta, H) by w and wd."""
-        of_G, of_H = (product(self._inertia, x).reshape(self.r, self.r, -1) for x in (G, H))
-        return self._torque_by_w(w, G) + 2.0 * of_H, of_G
-
-    def contracted_by_spin(
-        self, w: np.ndarray, Y: np.ndarray, Yd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return derivatives (r, q, n) of alpha_c Y_c + beta_c Yd_c by w and wd."""
-        return self._contracted(w, Y) - 2.0 * self.axial(Yd), -self.axial(Y)
+        return product(-self.spin.T, G)
 
     def rotated(self, R: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return angular velocities (r, ..., n) in other components; in the plane the same."""
@@ -202,6 +183,8 @@ class PlaneTurning:
     def __init__(self, theta: np.ndarray, rate: np.ndarray, second: np.ndarray) -> None:
         """Take the angle and its rates."""
         self.theta, self.velocity, self.acceleration = theta, rate, second
+
+    J = np.ones((1, 1, 1))
 
     @cached_property
     def R(self) -> np.ndarray:
@@ -264,7 +247,7 @@ class SpaceTurning:
 
     def jacobian_transposed(self, x: np.ndarray) -> np.ndarray:
         """Return J' x (3, ..., n)."""
-        return transposed_product(self.J, x)
+        return product(self.J.swapaxes(0, 1), x)
 
     @cached_property
     def velocity(self) -> np.ndarray:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.multibody.body import BodyMotion
-from dolfinopt.multibody.frames import Interface, MovingRotor
+from dolfinopt.multibody.dimension import product
+from dolfinopt.multibody.frames import CarriedFrame, Interface
 from dolfinopt.multibody.newton_euler import Link, carried_load, inward_pass, outward_pass
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -49,32 +49,36 @@ def body_gradient(
     by_rotation = _by_rotation(tree, links, moves, zeta)
     gradient: dict[int, ShapeIntegrals] = {}
     for i in reversed(tree.order):
-        link, own = links[i], zeta[tree.slices[i]]
-        by = [_motion_gradient(link.body, moves[i])]
-        outboard: dict[int, np.ndarray] = {}
+        link, own, dim = links[i], zeta[tree.slices[i]], tree.dim
+        by = _motion_gradient(link.body.load_by_motion, moves[i])
         if link.body.is_flexible:
-            by.append(np.einsum("mqn,qn->mn", link.body.rows_by_motion, own))
+            by += np.einsum("mqn,qn->mn", link.body.rows_by_motion, own)
+        outboard: dict[int, np.ndarray] = {}
         for s, interface in link.interfaces.items():
-            parts = [links[k].joint.passage.transposed(by_motion[k]) for k in tree.hanging[i, s]]
-            parts += [
-                _rotor_gradient(links[k], ends[i, s], drives[:, tree.rotors[k]])
-                for k in tree.hanging[i, s]
-                if k in tree.rotors
-            ]
+            on_interface = np.zeros_like(by)
+            for k in tree.hanging[i, s]:
+                on_interface += _carried(links[k].joint, by_motion[k])
+                if (rotor := links[k].rotor) is not None:
+                    on_interface += _motion_gradient(rotor.load_by_motion, ends[i, s])
+                    on_interface += rotor.force_by_motion[:, None] * drives[:, tree.rotors[k]]
             if s in link.carried:
-                parts.append(_motion_gradient(link.carried[s], ends[i, s]))
-            displaced = np.zeros((link.body.dim.b, 3, zeta.shape[1]))
-            if parts:
-                on_interface = sum(parts[1:], parts[0])
-                by.append(interface.passage.transposed(on_interface))
-                if link.body.is_flexible:
-                    displaced = interface.by_displacement(on_interface)
-            if link.body.is_flexible:
-                both = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
-                outboard[s] = _interface_weights(interface, both, moves[i], own, displaced)
-                if (i, s) in by_rotation:
-                    outboard[s][link.body.dim.d :, 0] += by_rotation[i, s]
-        by_motion[i] = sum(by[1:], by[0])
+                on_interface += _motion_gradient(link.carried[s].load_by_motion, ends[i, s])
+            by += _carried(interface, on_interface)
+            if not link.body.is_flexible:
+                continue
+            load, turning = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
+            weights = np.empty((dim.b, 4, zeta.shape[1]))
+            weights[:, :3] = np.einsum("irbn,in->brn", interface.by_coordinates, on_interface)
+            weights[:, 3] = interface.coefficients(load)
+            for by_x, work in (
+                (interface.load_by_coordinates(load, turning), moves[i]),
+                (interface.coefficients_by_coordinates(load, turning), product(interface.V, own)),
+            ):
+                weights[:, 0] += _motion_gradient(by_x, work)
+            if (i, s) in by_rotation:
+                weights[dim.d :, 0] += by_rotation[i, s]
+            outboard[s] = weights
+        by_motion[i] = by
         gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
     return [gradient[i] for i in range(len(links))]
 
@@ -101,22 +105,21 @@ def _by_rotation(
                 found[i, s] = interface.turning.jacobian_transposed(turned)
             total += turned
             if s in link.applied:
-                given, moved = link.applied[s].in_world, interface.virtual(moves[i], own)
+                given, moved = link.applied[s].in_world, _virtual(interface, moves[i], own)
                 total -= dim.moment(given[: dim.d], moved[: dim.d])
                 total -= dim.commutator(given[dim.d :], moved[dim.d :])
         of_bodies[i] = total
     return found
 
 
-def _motion_gradient(body: BodyMotion | MovingRotor, virtual: np.ndarray) -> np.ndarray:
-    """Return the derivatives of virtual . (F, T) by a motion (d + 2 r, n)."""
-    return np.asarray(np.einsum("ijn,in->jn", body.load_by_motion, virtual))
+def _motion_gradient(by: np.ndarray, virtual: np.ndarray) -> np.ndarray:
+    """Return the derivatives (j, n) of sum_i virtual_i f_i from those of f (i, j, n)."""
+    return np.asarray(np.einsum("ijn,in->jn", by, virtual))
 
 
-def _rotor_gradient(link: Link, virtual: np.ndarray, drive: np.ndarray) -> np.ndarray:
-    """Return the derivatives by the motion of what carries a rotor; `drive` (n,) is its motor's."""
-    assert link.rotor is not None
-    return _motion_gradient(link.rotor, virtual) + link.rotor.force_by_motion[:, None] * drive
+def _carried(frame: CarriedFrame, by: np.ndarray) -> np.ndarray:
+    """Return derivatives (d + 2 r, n) by the carrier's motion from those by a frame's."""
+    return np.asarray(np.einsum("nij,in->jn", frame.transform, by))
 
 
 def _virtual_motion(
@@ -129,36 +132,15 @@ def _virtual_motion(
     for i in tree.order:
         link, joint = links[i], tree.joints[i]
         inner = ground if joint.parent == GROUND else ends[joint.parent, joint.interface]
-        drive = None if joint.coordinate is None else of_forces[:, joint.coordinate]
-        moves[i] = link.joint.virtual(inner, drive)
+        drive = None if joint.coordinate is None else of_forces[None, :, joint.coordinate]
+        moves[i] = link.joint.in_own(link.joint.virtual(inner, drive))
         for s, interface in link.interfaces.items():
-            moved = interface.virtual(moves[i], zeta[tree.slices[i]])
-            ends[i, s] = interface.in_interface(moved)
+            moved = _virtual(interface, moves[i], zeta[tree.slices[i]])
+            ends[i, s] = interface.in_own(moved)
     return moves, ends
 
 
-def _interface_weights(
-    interface: Interface,
-    loads: tuple[np.ndarray, np.ndarray],
-    virtual: np.ndarray,
-    zeta: np.ndarray,
-    displaced: np.ndarray,
-) -> np.ndarray:
-    """Return the derivatives (b, 4, n) by (u, theta), their rates and variation."""
-    # Of a load on a flexible body's interface and its part that turns with it, `virtual` of its
-    # frame, zeta (q, n) its multipliers; `displaced` are those by (u, theta) and their rates
-    # through the interface's motion.
-    (load, own), dim, turning, d = loads, interface.dim, interface.turning, interface.dim.d
-    moved = interface.virtual(virtual, zeta)
-    # The load's lever, its components, and J' of the row.
-    turned = turning.jacobian_transposed(
-        dim.moment(own[:d], moved[:d]) + dim.commutator(own[d:], moved[d:])
-    )
-    by_theta = turning.by_theta(load[d:], -1.0)
-    if by_theta is not None:
-        theta = np.einsum("rkn,kn->rn", interface.body.V[interface.places][d:], zeta)
-        turned = turned + np.einsum("ijn,in->jn", by_theta, theta)
-    weights = np.concatenate([displaced, interface.load_coefficients(load)[:, None]], axis=1)
-    weights[:d, 0] -= dim.velocity(virtual[d:], load[:d])
-    weights[d:, 0] += turned
-    return weights
+def _virtual(interface: Interface, body: np.ndarray, zeta: np.ndarray) -> np.ndarray:
+    """Return an interface's virtual displacement and rotation in its body's components."""
+    x = product(interface.V, zeta) if interface.body.is_flexible else None
+    return interface.virtual(body, x)

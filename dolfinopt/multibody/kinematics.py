@@ -5,6 +5,8 @@ Rotations are to the ground's frame, vectors as in `body`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from dolfinopt.multibody.body import Constants
@@ -20,21 +22,21 @@ class Section:
     Attributes:
         place: (d, n) or (d, 1), m.
         turning: its rotation; None of a rigid body.
-        bent: (b, q, n) what geometric stiffness takes from the outboard modes, or None.
+        V: (b, q, n) derivative of its displacement and rotation by e, or (b, q, 1).
     """
 
     def __init__(self, constants: Constants, number: int, e: np.ndarray) -> None:
         """Take the body's constants, which of its interfaces it is, and e."""
         self.place = constants.points[number][:, None]
         self.turning: Turning | None = None
-        self.bent: np.ndarray | None = None
         if not constants.num_modes:
             return
         places, d = constants.outboard(number), constants.dim.d
-        moved = constants.T[places] @ e
-        if constants.K0 is not None:
-            self.bent = np.tensordot(constants.K0[places], e, 1)
-            moved -= 0.5 * np.einsum("pkn,kn->pn", self.bent, e)
+        moved, self.V = constants.T[places] @ e, constants.T[places][..., None]
+        if constants.bent is not None:
+            bent = np.tensordot(constants.bent[places], e, 1)
+            moved -= 0.5 * np.einsum("pkn,kn->pn", bent, e)
+            self.V = self.V - bent
         self.place = self.place + moved[:d]
         self.turning = constants.dim.turning(*(moved[d:],) * 3)  # of its rates none is asked for
 
@@ -63,7 +65,7 @@ class Posed:
             k = joint.coordinate
             moving = MovingJoint(joint, self._still, None if k is None else self.q_r[:, k][None])
             if moving.is_offset:
-                place = place + product(R, moving.r)
+                place = place + product(R, moving.place)
             self._bodies[i] = moving, place, compose(R, moving.R)
         return self._bodies[i]
 
@@ -83,6 +85,30 @@ class Posed:
         return self._interfaces[i, number]
 
 
+@dataclass(frozen=True, eq=False)
+class FlexibleLink:
+    """A flexible body on the way to a site.
+
+    Attributes:
+        body, number: of the body, and of its interface that leads on.
+        section: that interface.
+        turning: its rotation.
+        place: where it is (d, n), m.
+        R: rotation of the body's frame.
+        columns: places of the body's elastic coordinates among all C.
+        order: how far out they act.
+    """
+
+    body: int
+    number: int
+    section: Section
+    turning: Turning
+    place: np.ndarray
+    R: np.ndarray
+    columns: slice
+    order: int
+
+
 class SiteMotion:
     """An interface of a body, or a point of the ground, at n poses, and how coordinates move it.
 
@@ -92,6 +118,7 @@ class SiteMotion:
         by: (d + r, C, n) displacement and rotation by every coordinate, in the ground's frame;
             by_place, by_spin its parts.
         order: (C,) how far out a coordinate acts; -1: not on the way to the site.
+        flexible: the flexible bodies on the way.
     """
 
     def __init__(self, posed: Posed, site: Site | None, point: np.ndarray, R: np.ndarray) -> None:
@@ -103,6 +130,7 @@ class SiteMotion:
         self.by = np.zeros((dim.b, size, count))
         self.by_place, self.by_spin = self.by[: dim.d], self.by[dim.d :]
         self.order = np.full(size, -1)
+        self.flexible: list[FlexibleLink] = []
         self.way = () if site is None else mechanism.way_to(site)
         if site is None:
             self.place, self.R = np.repeat(point[:, None], count, axis=1), R
@@ -129,31 +157,18 @@ class SiteMotion:
         self.by_place[:, k] = dim.velocity(self.by_spin[:, k], self.place - origin)
 
     def _add_modes(self, i: int, number: int, order: int) -> None:
-        dim = self.dim
-        section = self.posed.section(i, number)
-        if section.turning is None:
+        posed, dim, section = self.posed, self.dim, self.posed.section(i, number)
+        if (turning := section.turning) is None:
             return
-        columns = self.columns(i)
+        part, first = posed.mechanism.slices[i], posed.mechanism.num_rigid
+        columns = slice(first + part.start, first + part.stop)
+        place, R = posed.interface(i, number)[0], posed.body(i)[2]
+        self.flexible.append(FlexibleLink(i, number, section, turning, place, R, columns, order))
         self.order[columns] = order
-        R, V = self.posed.body(i)[2], self.modes(i, number)
-        lever = self.place - self.posed.interface(i, number)[0]
-        spin = dim.rotated(R, section.turning.jacobian_times(V[dim.d :]))
+        spin = dim.rotated(R, turning.jacobian_times(section.V[dim.d :]))
+        lever = (self.place - place)[:, None]
         self.by_spin[:, columns] = spin
-        self.by_place[:, columns] = product(R, V[: dim.d]) + dim.velocity(spin, lever[:, None])
-
-    def columns(self, i: int) -> slice:
-        """Return the places of body i's elastic coordinates among all C."""
-        part, first = self.posed.mechanism.slices[i], self.posed.mechanism.num_rigid
-        return slice(first + part.start, first + part.stop)
-
-    def modes(self, i: int, number: int) -> np.ndarray:
-        """Return the derivative (b, q, n) of an interface's (u, theta) by the coordinates."""
-        constants, section = self.posed.mechanism.constants[i], self.posed.section(i, number)
-        T = constants.T[constants.outboard(number)]
-        count = len(self.posed.q)
-        if section.bent is None:
-            return np.broadcast_to(T[..., None], (*T.shape, count))
-        return T[..., None] - section.bent
+        self.by_place[:, columns] = product(R, section.V[: dim.d]) + dim.velocity(spin, lever)
 
     def turned(self, v: np.ndarray) -> np.ndarray:
         """Return a vector (d,) that is fixed to the frame in the ground's components (d, n)."""
@@ -202,76 +217,66 @@ class SiteMotion:
         if dim.r > 1:
             turned = dim.commutator(s, moment[:, None])
             found += np.where(inboard, np.einsum("rjn,rin->nji", turned, s), 0.0)
-        for i, number in self.way:
-            if self.posed.section(i, number).turning is not None:
-                columns = self.columns(i)
-                found[:, columns, columns] += self._own_hessian(i, number, load)
+        for link in self.flexible:
+            found[:, link.columns, link.columns] += self._own_hessian(link, load)
         return found
 
-    def _own_hessian(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
+    def _own_hessian(self, link: FlexibleLink, load: np.ndarray) -> np.ndarray:
         """Return the part (n, q, q) of one body's own deformation."""
-        dim, force = self.dim, load[: self.dim.d]
-        constants, section = self.posed.mechanism.constants[i], self.posed.section(i, number)
-        assert section.turning is not None
-        d, spin = dim.d, self.by_spin[:, self.columns(i)]
-        lever = self.place - self.posed.interface(i, number)[0]
-        swung = dim.velocity(spin, lever[:, None])
-        found = np.einsum("rkn,rln->nkl", spin, dim.moment(swung, force[:, None]))
-        pull = self.interface_load(i, number, load)
-        own = self._in_body(i, number, load)
-        by_theta = section.turning.by_theta(own[d:], -1.0)
+        dim, d, spin = self.dim, self.dim.d, self.by_spin[:, link.columns]
+        swung = dim.velocity(spin, (self.place - link.place)[:, None])
+        pulled = dim.moment(swung, load[:d, None])
+        found = np.einsum("rkn,rln->nkl", spin, pulled)
+        by_theta = link.turning.by_theta(self._on_interface(link, load)[d:], -1.0)
         if by_theta is not None:
-            theta = self.modes(i, number)[d:]
+            theta = np.broadcast_to(link.section.V[d:], (dim.r, *spin.shape[1:]))
             found += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
-        if constants.K0 is not None:
-            K0 = constants.K0[constants.outboard(number)]
-            found -= np.einsum("pn,pkl->nkl", pull, K0)
+        constants = self.posed.mechanism.constants[link.body]
+        if constants.bent is not None:
+            bent = constants.bent[constants.outboard(link.number)]
+            found -= np.einsum("pn,pkl->nkl", self.interface_load(link, load), bent)
         return found
 
     def load_on(self, point: np.ndarray, R: np.ndarray, load: np.ndarray) -> np.ndarray:
         """Return force and moment about a point (d, n) in the components of a frame."""
         return self.dim.turn(R.swapaxes(0, 1), self.dim.shifted(self.place - point, load))
 
-    def _in_body(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
-        """Return force and moment about the interface of body i in its components."""
-        return self.load_on(self.posed.interface(i, number)[0], self.posed.body(i)[2], load)
+    def _on_interface(self, link: FlexibleLink, load: np.ndarray) -> np.ndarray:
+        """Return force and moment about a body's interface in the body's components."""
+        return self.load_on(link.place, link.R, load)
 
-    def interface_load(self, i: int, number: int, load: np.ndarray) -> np.ndarray:
-        """Return what works on (u, theta) (b, n) of body i's interface on the way."""
-        turning = self.posed.section(i, number).turning
-        assert turning is not None
-        own, d = self._in_body(i, number, load), self.dim.d
-        own[d:] = turning.jacobian_transposed(own[d:])
+    def interface_load(self, link: FlexibleLink, load: np.ndarray) -> np.ndarray:
+        """Return what works on (u, theta) (b, n) of a body's interface on the way."""
+        own, d = self._on_interface(link, load), self.dim.d
+        own[d:] = link.turning.jacobian_transposed(own[d:])
         return own
 
     def interface_load_along(
-        self, i: int, number: int, load: np.ndarray, change: np.ndarray, virtual: np.ndarray
+        self, link: FlexibleLink, load: np.ndarray, change: np.ndarray, virtual: np.ndarray
     ) -> np.ndarray:
         """Return the derivative of `interface_load` (b, n) along virtual coordinates (n, C).
 
         Args:
-            i, number: as there.
+            link: as there.
             load: (d + r, n).
             change: its derivative along them.
             virtual: of all coordinates.
         """
         dim, d, force = self.dim, self.dim.d, load[: self.dim.d]
-        section, columns = self.posed.section(i, number), self.columns(i)
-        assert section.turning is not None
-        outer = self.order[columns][0] if columns.stop > columns.start else 0
-        lever = self.place - self.posed.interface(i, number)[0]
-        inner, own = ((self.order >= 0) & (self.order < k) for k in (outer, outer + 1))
+        lever, columns = self.place - link.place, link.columns
+        on_way = self.order >= 0
+        inner, own = (on_way & (self.order < k) for k in (link.order, link.order + 1))
         spin, shifted = self.along(virtual * inner)[d:], self.along(virtual * own)
         moved = (self.along(virtual) - shifted)[:d] + dim.velocity(shifted[d:], lever)
-        about, back = dim.shifted(lever, load), self.posed.body(i)[2].swapaxes(0, 1)
+        about, back = dim.shifted(lever, load), link.R.swapaxes(0, 1)
         turned = np.concatenate([dim.velocity(spin, force), dim.commutator(spin, about[d:])])
         turned[d:] -= dim.moment(moved, force)
-        by = self._in_body(i, number, change) - dim.turn(back, turned)
-        by[d:] = section.turning.jacobian_transposed(by[d:])
-        by_theta = section.turning.by_theta(dim.turn(back, about)[d:], -1.0)
+        by = self._on_interface(link, change) - dim.turn(back, turned)
+        by[d:] = link.turning.jacobian_transposed(by[d:])
+        by_theta = link.turning.by_theta(dim.turn(back, about)[d:], -1.0)
         if by_theta is not None:
-            theta = np.einsum("rkn,nk->rn", self.modes(i, number)[d:], virtual[:, columns])
-            by[d:] += np.einsum("abn,bn->an", by_theta, theta)
+            theta = (link.section.V[d:] * virtual[:, columns].T).sum(axis=1)
+            by[d:] += product(by_theta, theta)
         return by
 
     def add_gradient(
@@ -291,18 +296,15 @@ class SiteMotion:
             virtual: (n, C).
         """
         mechanism, b = self.posed.mechanism, self.dim.b
-        for i, number in self.way:
-            if self.posed.section(i, number).turning is None:
-                continue
-            e, v = self.posed.q[:, mechanism.slices[i]], virtual[:, self.columns(i)]
-            rate = self.interface_load(i, number, working)
-            value = self.interface_load(i, number, load)
-            value = value + self.interface_load_along(i, number, working, change, virtual)
-            own = slice(b * number, b * (number + 1))
-            found[i]["outboard"][own] += value @ e + rate @ v
-            if "K0_outboard" in found[i]:
+        for link in self.flexible:
+            e, v = self.posed.q[:, mechanism.slices[link.body]], virtual[:, link.columns]
+            rate, value = self.interface_load(link, working), self.interface_load(link, load)
+            value = value + self.interface_load_along(link, working, change, virtual)
+            own, by_body = slice(b * link.number, b * (link.number + 1)), found[link.body]
+            by_body["outboard"][own] += value @ e + rate @ v
+            if "K0_outboard" in by_body:
                 bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T
-                found[i]["K0_outboard"][own] -= bent @ e
+                by_body["K0_outboard"][own] -= bent @ e
 
 
 def no_gradient(mechanism: Mechanism) -> list[dict[str, np.ndarray]]:

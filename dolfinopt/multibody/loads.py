@@ -39,16 +39,18 @@ def body_loads(
         mechanism, motion, rates: as for `inverse_dynamics`.
         pull: see `inward_pass`.
     """
+    return [p for _, p in _loaded_links(mechanism, motion, rates, pull)]
+
+
+def _loaded_links(
+    mechanism: Mechanism, motion: RigidMotion, rates: Rates, pull: Mapping[Site, np.ndarray]
+) -> list[tuple[Link, np.ndarray]]:
     links = outward_pass(mechanism, motion, rates, pull)
-    return _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
-
-
-def _body_loads(links: list[Link], outboard: list[dict[int, np.ndarray]]) -> list[np.ndarray]:
     found = []
-    for link, loads in zip(links, outboard, strict=True):
+    for link, loads in zip(links, inward_pass(mechanism, links, pull=pull).outboard, strict=True):
         pulls = interface_coefficients(link, loads) if link.body.is_flexible else loads
         p, order = link.body.load_coefficients(pulls), link.body.dim.loads
-        found.append(np.concatenate([p[order], p[len(order) :]]).T)
+        found.append((link, np.concatenate([p[order], p[len(order) :]]).T))
     return found
 
 
@@ -71,10 +73,8 @@ def load_coefficients(
     c = -(p, alpha_c z + beta_c z' + trace_c z''), p of `body_loads`, c before the modes, z being
     the displacement along them, see `body`. `pull` is that of `body_loads`.
     """
-    links = outward_pass(mechanism, motion, rates, pull)
-    loads = _body_loads(links, inward_pass(mechanism, links, pull=pull).outboard)
     found = []
-    for link, p in zip(links, loads, strict=True):
+    for link, p in _loaded_links(mechanism, motion, rates, pull):
         elastic = link.body.accelerations.reshape(-1, len(p))
         found.append(-np.hstack([p, elastic.T]))
     return found
@@ -115,11 +115,14 @@ def largest_change(
         loops: closures; or None.
         dependent: rigid coordinates that follow from them.
     """
-    largest = 0.0
-    loads = _loads(mechanism.rigid, motion, loops, dependent)
-    for body, p in zip(mechanism.bodies, loads, strict=True):
-        largest = max(largest, stiffness_change(body, p))
-    return largest
+    rigid, none = mechanism.rigid, np.zeros((len(motion.q), 0))
+    pull: Mapping[Site, np.ndarray] = {}
+    if loops is not None and dependent is not None:
+        forces = inverse_dynamics(rigid, motion, none, none, none)[1]
+        here = loops.at(rigid, motion.q, none)
+        pull = here.interface_loads(here.closing(forces, dependent))
+    loads = body_loads(rigid, motion, (none, none, none), pull)
+    return max(map(stiffness_change, mechanism.bodies, loads), default=0.0)
 
 
 def stiffness_change(body: ShapeIntegrals, p: np.ndarray) -> float:
@@ -130,16 +133,3 @@ def stiffness_change(body: ShapeIntegrals, p: np.ndarray) -> float:
     K0 = inverse @ np.concatenate([body.K0, body.K0_outboard]) @ inverse.T
     values = np.linalg.eigvalsh(np.tensordot(p, K0, 1))
     return float(np.abs(values).max(initial=0.0))
-
-
-def _loads(
-    rigid: Mechanism, motion: RigidMotion, loops: Loops | None, dependent: np.ndarray | None
-) -> list[np.ndarray]:
-    """Return what loads every body (n, loads); in the plane a_x, a_y, wd, -w^2, F_x, F_y, T."""
-    none = np.zeros((len(motion.q), 0))
-    pull: Mapping[Site, np.ndarray] = {}
-    if loops is not None and dependent is not None:
-        forces = inverse_dynamics(rigid, motion, none, none, none)[1]
-        here = loops.at(rigid, motion.q, none)
-        pull = here.interface_loads(here.closing(forces, dependent))
-    return body_loads(rigid, motion, (none, none, none), pull)

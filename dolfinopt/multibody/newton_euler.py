@@ -126,8 +126,8 @@ def rotations(tree: Mechanism, links: list[Link]) -> dict[int, np.ndarray]:
         joint, R = tree.joints[i], links[i].joint.R
         if joint.parent != GROUND:
             interface = links[joint.parent].interfaces[joint.interface]
-            if interface.body.is_flexible:
-                R = compose(interface.turning.R, R)
+            if interface.R is not None:
+                R = compose(interface.R, R)
             R = compose(found[joint.parent], R)
         found[i] = R
     return found
@@ -177,13 +177,13 @@ def inward_pass(
         for s, interface in link.interfaces.items():
             hanging = tree.hanging.get((i, s), ())
             on_it = [links[k] for k in hanging]
-            parts = [links[k].joint.at_interface(joints[k]) for k in hanging]
+            parts = [links[k].joint.load_on_carrier(joints[k]) for k in hanging]
             parts += [one.rotor.load for one in on_it if one.rotor is not None]
             if s in link.carried:
                 parts.append(link.carried[s].load)
             if (i, s) in pull:
                 parts.append(pull[i, s])
-            loads = [interface.in_body(sum(parts[1:], parts[0]))] if parts else []
+            loads = [interface.in_carrier(sum(parts[1:], parts[0]))] if parts else []
             if s in link.applied:
                 loads.append(link.applied[s].load)
             outboard[i][s] = sum(loads[1:], loads[0])
@@ -209,7 +209,7 @@ def elastic_rows(links: list[Link], loads: Loads) -> np.ndarray:
 
 def interface_coefficients(link: Link, outboard: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
     """Return what works on the displacements of a flexible body's interfaces, by number."""
-    return {s: link.interfaces[s].load_coefficients(load) for s, load in outboard.items()}
+    return {s: link.interfaces[s].coefficients(load) for s, load in outboard.items()}
 
 
 def inverse_dynamics(
@@ -232,14 +232,14 @@ def inverse_dynamics(
     loads = inward_pass(tree, links)
     forces = np.zeros((len(q), tree.num_rigid + len(tree.motor_joints)))
     for i in tree.movable:
-        forces[:, tree.joints[i].coordinate] = links[i].joint.drive(loads.joints[i])
+        forces[:, tree.joints[i].coordinate] = links[i].joint.drive_axis @ loads.joints[i]
     for i, k in tree.rotors.items():
         if (rotor := links[i].rotor) is not None:
             forces[:, k] += rotor.force
     if tree.cart is not None:
         forces[:, 0] = tree.cart * motion.qdd[:, 0]
         for i in tree.hanging[GROUND, 0]:
-            forces[:, 0] += links[i].joint.at_interface(loads.joints[i])[0]
+            forces[:, 0] += links[i].joint.load_on_carrier(loads.joints[i])[0]
     if tree.friction is not None:
         forces[:, : tree.num_rigid] += tree.friction.force(motion.qd)
     return elastic_rows(links, loads), forces

@@ -319,13 +319,7 @@ def integrated(
         np.array([np.einsum("ni,nik->k", one, MV) for one in EX]),
         MV_flat.T @ EV,
     )
-    packed = np.concatenate([np.ravel(part) for part in parts])
-    if arm.comm.size > 1:  # one reduction for all integrals
-        packed = arm.comm.allreduce(packed)
-    pieces = np.split(packed, np.cumsum([np.size(part) for part in parts])[:-1])
-    mass, moment, C, second, first, modes = (
-        piece.reshape(np.shape(part)) for piece, part in zip(pieces, parts, strict=True)
-    )
+    mass, moment, C, second, first, modes = map(arm.comm.allreduce, parts)
     return float(mass), np.column_stack([moment, C]), _assembled(E, second, first, modes)
 
 

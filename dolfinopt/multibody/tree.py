@@ -9,162 +9,21 @@ Every body works in its own tangent frame at its inboard joint.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from dolfinopt.multibody.body import Constants, Motion
 from dolfinopt.multibody.dimension import DIMENSIONS, Dimension
-from dolfinopt.multibody.measured import LEAST_INSTANTS, LINEAR_DRIVE_SHARE
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body, rigid_spatial_body
 
 if TYPE_CHECKING:
     from dolfinopt.multibody.rigid_motion import RigidMotion
-
-# -- what moves the free rigid coordinates, and what holds the last interface: drives and
-# closures
-
-
-def saturated(wanted: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a drive gives of a wanted force, and the derivative by it, 1 to 0.
-
-    u = w for |w| <= 0.95 L, u = L sign(w) for |w| >= 1.05 L; between them the derivative falls by
-    the quintic law, 1 - 10 x^3 + 15 x^4 - 6 x^5 with x = (|w| / L - 0.95) / 0.1, hence
-    |u| = L (0.95 + 0.1 (x - 2.5 x^4 + 3 x^5 - x^6)). Three times continuously differentiable:
-    Newton's method, gradients and the integrator see no corner.
-
-    Args:
-        wanted: w (..., R), N, N m.
-        limit: L > 0 (R,); inf without.
-    """
-    limit = np.minimum(limit, np.finfo(float).max)
-    width = 2.0 * (1.0 - LINEAR_DRIVE_SHARE)
-    x = np.clip((np.abs(wanted) / limit - LINEAR_DRIVE_SHARE) / width, 0.0, 1.0)
-    bent = LINEAR_DRIVE_SHARE + width * (x - x**4 * (2.5 - 3.0 * x + x * x))
-    u = np.where(x > 0.0, np.sign(wanted) * limit * bent, wanted)
-    return u, 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
-
-
-@dataclass(frozen=True, eq=False)
-class Friction:
-    """Friction of joints against their speeds v, f = f_v v + f_c tanh(v / v_s).
-
-    Attributes:
-        viscous: f_v (R,), N m s/rad, N s/m.
-        coulomb: f_c (R,), N m, N.
-        speed: v_s (R,) > 0, rad/s, m/s.
-    """
-
-    viscous: np.ndarray
-    coulomb: np.ndarray
-    speed: np.ndarray
-
-    def force(self, v: np.ndarray) -> np.ndarray:
-        """Return f (n, R) at speeds v (n, R)."""
-        return self.viscous * v + self.coulomb * np.tanh(v / self.speed)
-
-    def slope(self, v: np.ndarray) -> np.ndarray:
-        """Return df/dv (n, R)."""
-        bent = 1.0 - np.square(np.tanh(v / self.speed))
-        return self.viscous + self.coulomb / self.speed * bent
-
-    def of(self, coordinates: np.ndarray) -> Friction:
-        """Return that of some coordinates."""
-        return Friction(*(x[coordinates] for x in (self.viscous, self.coulomb, self.speed)))
-
-    @classmethod
-    def none(cls, count: int) -> Friction:
-        """Return none, of so many coordinates."""
-        return cls(np.zeros(count), np.zeros(count), np.ones(count))
-
-    @property
-    def acts(self) -> bool:
-        """Whether there is any."""
-        return bool(self.viscous.any() or self.coulomb.any())
-
-
-@dataclass(frozen=True, eq=False)
-class Springs:
-    """Springs and dampers between motors and arms, whose motors have coordinates of their own.
-
-    Attributes:
-        joints: (M,) places of their joints among the free rigid coordinates.
-        stiffness, damping: (M,) N m/rad, N m s/rad.
-        friction: of the motors, as the joints feel it.
-    """
-
-    joints: np.ndarray
-    stiffness: np.ndarray
-    damping: np.ndarray
-    friction: Friction
-
-
-NOTHING = np.zeros(0)
-NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, Friction.none(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Drives:
-    """Feed-forward plus proportional and derivative feedback of the free rigid coordinates.
-
-    u = limit( u_ff(t) + Kp (q_d - q) + Kd (qd_d - qd) ), coordinate by coordinate, see `saturated`;
-    of infinite limits nothing is cut off. A spring and damper between a drive on its desired motion
-    and the arm is the same without feed-forward.
-
-    Attributes:
-        free: (R,) ascending rigid coordinates, 0 the cart, k + 1 the joint of body k.
-        stiffness, damping: Kp, Kd (R,); N/m and N s/m, N m/rad and N m s/rad.
-        limits: (R,) N, N m; inf without.
-        driven: (R,) True where a drive acts; others follow from a closed loop.
-        rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
-        winding: whether motors behind springs are asked to turn ahead of their joints by what the
-            springs give under u_ff.
-        table: `dynamics.tables.Table` of forces (R) that are added; or None.
-        springs: between drives and arms, where a drive is controlled.
-        friction: (R,) of motors before springs that are on the desired motion; or None.
-    """
-
-    free: np.ndarray
-    stiffness: np.ndarray
-    damping: np.ndarray
-    limits: np.ndarray
-    driven: np.ndarray
-    rigid_feed_forward: bool = False
-    table: Any = None
-    springs: Springs = NO_SPRINGS
-    friction: Friction | None = None
-    winding: bool = False
-
-    def force(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Return u (n, R) from u_ff, q - q_d and its rate, each (n, R)."""
-        return self._saturated(ahead, error, rate)[0]
-
-    def passing(self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Return du / d(wanted force) (n, R): 1 within the limits, 0 beyond."""
-        return self._saturated(ahead, error, rate)[1]
-
-    def _saturated(
-        self, ahead: np.ndarray, error: np.ndarray, rate: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        return saturated(ahead - self.stiffness * error - self.damping * rate, self.limits)
-
-    @property
-    def dependent(self) -> np.ndarray:
-        """Rigid coordinates that follow from a closed loop."""
-        return self.free[~self.driven]
-
-
-# -- few instants: the same bits wherever arrays lie in memory
-
-
-def repeated(count: int) -> np.ndarray | None:
-    """Return indices that make `LEAST_INSTANTS` of fewer, the last one repeated; None: enough."""
-    return np.minimum(np.arange(LEAST_INSTANTS), count - 1) if 0 < count < LEAST_INSTANTS else None
-
 
 # -- a tree of bodies, in the plane and in space: what inverse dynamics works on
 
@@ -223,6 +82,44 @@ class Joint:
         return np.stack([R, R @ S, R @ S @ S], axis=-1)
 
 
+@dataclass(frozen=True, eq=False)
+class Friction:
+    """Friction of joints against their speeds v, f = f_v v + f_c tanh(v / v_s).
+
+    Attributes:
+        viscous: f_v (R,), N m s/rad, N s/m.
+        coulomb: f_c (R,), N m, N.
+        speed: v_s (R,) > 0, rad/s, m/s.
+    """
+
+    viscous: np.ndarray
+    coulomb: np.ndarray
+    speed: np.ndarray
+
+    def force(self, v: np.ndarray) -> np.ndarray:
+        """Return f (n, R) at speeds v (n, R)."""
+        return self.viscous * v + self.coulomb * np.tanh(v / self.speed)
+
+    def slope(self, v: np.ndarray) -> np.ndarray:
+        """Return df/dv (n, R)."""
+        bent = 1.0 - np.square(np.tanh(v / self.speed))
+        return self.viscous + self.coulomb / self.speed * bent
+
+    def of(self, coordinates: np.ndarray) -> Friction:
+        """Return that of some coordinates."""
+        return Friction(*(x[coordinates] for x in (self.viscous, self.coulomb, self.speed)))
+
+    @classmethod
+    def none(cls, count: int) -> Friction:
+        """Return none, of so many coordinates."""
+        return cls(np.zeros(count), np.zeros(count), np.ones(count))
+
+    @property
+    def acts(self) -> bool:
+        """Whether there is any."""
+        return bool(self.viscous.any() or self.coulomb.any())
+
+
 @dataclass(frozen=True)
 class AppliedForce:
     """A given force and moment on an outboard interface, whose values stand in the motion.
@@ -279,8 +176,7 @@ class Mechanism:
     @property
     def foreseen(self) -> Mechanism:
         """The same under the forces alone that are known in advance."""
-        known = tuple(one for one in self.forces if one.known)
-        return self if len(known) == len(self.forces) else replace(self, forces=known)
+        return replace(self, forces=tuple(one for one in self.forces if one.known))
 
     # -- coordinates -------------------------------------------------------------------------
 
@@ -308,8 +204,7 @@ class Mechanism:
     @property
     def bearing_columns(self) -> slice:
         """Place of the bearings' coordinates among all elastic ones: the last ones."""
-        first = self.num_coordinates
-        return slice(first - sum(one.num_modes for one in self.bodies[self.num_arms :]), first)
+        return slice(sum(body.num_modes for body in self.arms), None)
 
     @property
     def num_coordinates(self) -> int:
@@ -339,8 +234,8 @@ class Mechanism:
 
         The motors' own coordinates follow the R rigid ones.
         """
-        pairs = [(k, self.joints[i].coordinate) for i, k in self.rotors.items()]
-        return np.array([own for k, own in sorted(pairs) if k >= self.num_rigid], dtype=int)
+        own = {k: self.joints[i].coordinate for i, k in self.rotors.items()}
+        return np.array([own[k] for k in sorted(own) if k >= self.num_rigid], dtype=int)
 
     @cached_property
     def movable(self) -> tuple[int, ...]:
@@ -363,37 +258,29 @@ class Mechanism:
     @cached_property
     def sites(self) -> tuple[tuple[int, ...], ...]:
         """Of every body the interfaces on which something sits, ascending."""
-        found: list[set[int]] = [set() for _ in self.joints]
-        for joint in self.joints:
-            if joint.parent != GROUND:
-                found[joint.parent].add(joint.interface)
-        for body, interface in (*self.loads, *(one.site for one in self.forces)):
-            found[body].add(interface)
-        return tuple(tuple(sorted(one)) for one in found)
+        taken = {(joint.parent, joint.interface) for joint in self.joints}
+        taken |= {*self.loads, *(one.site for one in self.forces)}
+        every = range(len(self.joints))
+        return tuple(tuple(sorted(s for body, s in taken if body == k)) for k in every)
 
     @cached_property
     def hanging(self) -> Mapping[Site, tuple[int, ...]]:
         """The bodies that hang on every interface on which something sits, and on the ground."""
         sites = [(GROUND, 0), *((i, s) for i, own in enumerate(self.sites) for s in own)]
-        found: dict[Site, list[int]] = {site: [] for site in sites}
-        for k, joint in enumerate(self.joints):
-            found[joint.parent, joint.interface].append(k)
-        return {site: tuple(bodies) for site, bodies in found.items()}
+        places = [(joint.parent, joint.interface) for joint in self.joints]
+        return {site: tuple(k for k, one in enumerate(places) if one == site) for site in sites}
 
     @cached_property
     def order(self) -> tuple[int, ...]:
         """The bodies depth first: behind its parent every one with all that hangs on it."""
-        found: list[int] = []
+        every = range(len(self.joints))
 
-        def visit(site: Site) -> None:
-            for k in self.hanging[site]:
-                found.append(k)
-                for s in self.sites[k]:
-                    visit((k, s))
+        def branch(k: int) -> list[tuple[int, int]]:
+            joint = self.joints[k]
+            before = [] if joint.parent == GROUND else branch(joint.parent)
+            return [*before, (joint.interface, k)]
 
-        visit((GROUND, 0))
-        assert len(found) == len(self.joints), "joints form a loop"
-        return tuple(found)
+        return tuple(sorted(every, key=branch))
 
     @cached_property
     def way(self) -> tuple[Site, ...]:
@@ -409,32 +296,22 @@ class Mechanism:
 
     def is_felt(self, i: int) -> bool:
         """Return whether a body inboard of body i deforms under its load."""
-        parent = self.joints[i].parent
-        if parent == GROUND:
-            return False
-        return self.bodies[parent].num_modes > 0 or self.is_felt(parent)
+        return any(self.bodies[k].num_modes for k, _ in self.way_to((i, 0))[:-1])
 
     def base(self, q_r: np.ndarray) -> np.ndarray:
         """Return where the ground's frame is (d, n), m, for rigid coordinates (n, R)."""
-        place = np.repeat(self.origin[:, None], len(q_r), axis=1)
-        if self.cart is not None:
-            place[0] += q_r[:, 0]
-        return place
+        return self.origin[:, None] + self.virtual_ground(q_r)[: self.dim.d]
 
     def ground(self, motion: RigidMotion) -> Motion:
         """Return the motion of what the first joints sit on: that of the cart, less gravity."""
-        a = np.empty((self.dim.d, len(motion.q)), dtype=motion.qdd.dtype)
-        a[:] = -self.gravity
-        if self.cart is not None:
-            a[0] += motion.qdd[:, 0]
-        still = np.zeros((self.dim.r, len(motion.q)))
-        return a, still, still
+        a, still = np.split(self.virtual_ground(motion.qdd), [self.dim.d])
+        return a - self.gravity, still, still
 
-    def virtual_ground(self, of_forces: np.ndarray) -> np.ndarray:
-        """Return its displacement and rotation (d + r, n) for virtual coordinates (n, .)."""
-        out = np.zeros((self.dim.b, len(of_forces)))
+    def virtual_ground(self, x: np.ndarray) -> np.ndarray:
+        """Return displacement and rotation (d + r, n) of the ground for coordinates (n, .)."""
+        out = np.zeros((self.dim.b, len(x)), dtype=x.dtype)
         if self.cart is not None:
-            out[0] = of_forces[:, 0]
+            out[0] = x[:, 0]
         return out
 
     # -- how stiff and how large it is -------------------------------------------------------
@@ -461,130 +338,37 @@ class Mechanism:
         slides = [True, *slides] if self.cart is not None else slides
         return np.where(slides + [True] * self.rods, 1.0, reach)
 
-    @cached_property
-    def _unit(self) -> tuple[bool, ...]:
-        """Whether bodies' coordinates are normalised: their stiffness is the identity."""
-        return tuple(np.array_equal(body.K, np.eye(len(body.K))) for body in self.bodies)
+    def energies(self, q: np.ndarray) -> np.ndarray:
+        """Return q' K q of every body (..., bodies), twice its energy, N m; q (..., N)."""
+        pairs = zip(self.bodies, (q[..., part] for part in self.slices), strict=True)
+        each = [np.einsum("...k,...k->...", e @ body.K, e) for body, e in pairs]
+        return np.stack(each, axis=-1) if each else np.zeros((*q.shape[:-1], 0))
 
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
-        norms = []
-        for part, body, unit in zip(self.slices, self.bodies, self._unit, strict=True):
-            e = q[..., part]
-            squares = np.einsum("...nk,...nk->...n", e if unit else e @ body.K, e)
-            norms.append(np.sqrt(np.maximum(squares, 0.0).max(axis=-1)))
-        return np.stack(norms, axis=-1)
-
-    def deflections(self, q: np.ndarray) -> np.ndarray:
-        """Return the largest deflection of every arm in q (n, N), over its length (arms,).
-
-        That of its outboard interfaces in its own frame.
-        """
-        own = self.constants[: self.num_arms]
-        lengths = [np.linalg.norm(one.points, axis=1).max() for one in own]
-        pairs = zip(self._interfaces(q, False), lengths, strict=True)
-        return np.array([largest / length if length else 0.0 for largest, length in pairs])
-
-    def rotations(self, q: np.ndarray) -> np.ndarray:
-        """Return the largest rotation of every arm's interfaces in q (n, N), rad (arms,)."""
-        return np.array(list(self._interfaces(q, True)))
-
-    def _interfaces(self, q: np.ndarray, turned: bool) -> Iterator[float]:
-        """Yield the largest displacement, or rotation, of every arm's interfaces in q (n, N)."""
-        d, b = self.dim.d, self.dim.b
-        for part, body in zip(self.slices, self.arms):
-            # Of each interface: displacements, then rotations, of which the plane has one.
-            every = (q[:, part] @ body.outboard.T).reshape(-1, b)
-            own = every[:, d:] if turned else every[:, :d]
-            yield float(np.linalg.norm(own, axis=1).max(initial=0.0))
+        return np.sqrt(np.maximum(self.energies(q), 0.0).max(axis=-2))
 
     def compliance(self, q: np.ndarray) -> np.ndarray:
         """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper; q (n, N)."""
-        pairs = zip(self.arms, (q[:, part] for part in self.slices))
-        return np.stack([np.einsum("nk,nk->n", e @ body.K, e) for body, e in pairs], axis=1)
+        return self.energies(q)[:, : self.num_arms]
+
+    def deflections(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return every arm's largest deflection over its length, and its largest rotation, rad.
+
+        Those (arms,) of its outboard interfaces in its own frame along q (n, N).
+        """
+        d, b, found = self.dim.d, self.dim.b, np.zeros((2, self.num_arms))
+        for k, (part, body) in enumerate(zip(self.slices, self.arms)):
+            moved = (q[:, part] @ body.outboard.T).reshape(-1, b)  # each interface
+            parts = np.split(moved, [d], axis=1)
+            sizes = [np.linalg.norm(x, axis=1).max(initial=0.0) for x in parts]
+            length = np.linalg.norm(self.constants[k].points, axis=1).max()
+            found[:, k] = sizes[0] / (length or np.inf), sizes[1]
+        return found[0], found[1]
 
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
-        K = np.zeros((self.num_coordinates, self.num_coordinates))
-        for part, body in zip(self.slices, self.bodies, strict=True):
-            K[part, part] = body.K
-        return K
-
-
-# -- a cart that carries a chain of flexible arms and a payload
-
-
-@dataclass(frozen=True)
-class JointHardware:
-    """What sits at one arm's ends besides the arm itself.
-
-    Attributes:
-        mass, inertia: at the outboard interface, kg, kg m2.
-        rotor: that drives the inboard joint, or None.
-    """
-
-    mass: float = 0.0
-    inertia: float = 0.0
-    rotor: Rotor | None = None
-
-
-def plane_chain(
-    bodies: Sequence[ShapeIntegrals],
-    payload_mass: float,
-    payload_inertia: float,
-    gravity: Sequence[float],
-    joint_height: float,
-    *,
-    hardware: Sequence[JointHardware] = (),
-    cart_mass: float = 0.0,
-) -> Mechanism:
-    """Return a cart on a horizontal rail that carries a chain of arms and a payload.
-
-    Args:
-        bodies: from the cart outwards.
-        payload_mass: point mass at the last outboard interface, kg.
-        payload_inertia: its rotary inertia, kg m2.
-        gravity: (g_x, g_y), m/s2.
-        joint_height: y of the first joint, m.
-        hardware: what sits at every arm's ends, or none.
-        cart_mass: kg.
-    """
-    hardware, last = hardware or (JointHardware(),) * len(bodies), len(bodies) - 1
-    loads = {
-        (k, 0): Constants.of_point(one.mass, one.inertia)
-        for k, one in enumerate(hardware[:last])
-        if one.mass or one.inertia
-    }
-    if bodies:
-        own = hardware[last]
-        mass, inertia = payload_mass + own.mass, payload_inertia + own.inertia
-        loads[last, 0] = Constants.of_point(mass, inertia)
-    joints = [
-        Joint(f"joint {k}", "revolute", k - 1, 1 + k, np.ones(1), np.zeros(2), np.eye(2), one.rotor)
-        for k, one in enumerate(hardware)
-    ]
-    return Mechanism(
-        bodies=tuple(bodies),
-        joints=tuple(joints),
-        loads=loads,
-        gravity=np.array(gravity, dtype=float)[:, None],
-        end=(last, 0),
-        origin=np.array([0.0, joint_height]),
-        cart=cart_mass,
-    )
-
-
-def spatial_mechanism(
-    bodies: Sequence[ShapeIntegrals],
-    joints: Sequence[Joint],
-    carried: Mapping[Site, ShapeIntegrals],
-    gravity: Sequence[float] | np.ndarray,
-    end: Site,
-) -> Mechanism:
-    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
-    loads = {site: Constants(one) for site, one in carried.items()}
-    down = np.array(gravity, dtype=float)[:, None]
-    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
+        return np.asarray(block_diag(*(body.K for body in self.bodies)))
 
 
 # -- what is between a drive and its arm: bearings, friction ---------------------------------
@@ -594,7 +378,9 @@ def spatial_mechanism(
 IN_PLANE = [0, 1, 5]
 
 
-def bearing_body(stiffness: np.ndarray, damping: np.ndarray, dimension: int) -> ShapeIntegrals:
+def bearing_body(
+    stiffness: Sequence[float], damping: Sequence[float], dimension: int
+) -> ShapeIntegrals:
     """Return a bearing as a body: massless, its outboard interface on springs at its origin.
 
     Its coordinates are displacement and rotation vector of the interface in the directions that

@@ -18,7 +18,6 @@ from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
-from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.trajectory import JointLimit, Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
@@ -409,7 +408,7 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
 
 def _on_closures(scene: Scene, trajectory: Trajectory | None) -> list[str]:
     """Return sentences on closures that hold rigid arms more often than needed."""
-    if trajectory is None or not isinstance(trajectory.problem, MachineSystem):
+    if trajectory is None or trajectory.loops is None:
         return []
     problem, told = trajectory.problem, []
     if problem.num_redundant:

@@ -126,7 +126,7 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
 def _motor_units(trajectory: Trajectory) -> dict[str, str]:
     """Return the unit of every motor's coordinate behind a gear by its joint's name."""
     units = list(trajectory.scene.rigid_units.items())
-    return dict(units[k] for k in trajectory.motor_columns)
+    return dict(units[k] for k in trajectory.problem.motor_joints)
 
 
 def trajectory_units(trajectory: Trajectory) -> dict[str, str]:

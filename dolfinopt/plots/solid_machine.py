@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -314,7 +314,7 @@ def make_solid_film(
     frames: int = FRAMES,
 ) -> SolidFilm:
     """Choose frames evenly from the instants and magnify the deformation; see `draw_motion`."""
-    given = cast(Mechanism, trajectory.mechanism)
+    given = trajectory.mechanism
     # Interfaces move linearly with the coordinates, as surfaces do.
     mechanism = replace(given, bodies=tuple(map(linear_part, given.bodies)))
     machine = assemble(views, mechanism, modes=True)

@@ -18,10 +18,10 @@ from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
 from dolfinopt.dynamics.simulation import simulate_all
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import METHODS, Basis
+from dolfinopt.reduction import Basis
 from dolfinopt.responses.evaluation import decide_stiffening
 from dolfinopt.responses.measured import (
     RICHER_COORDINATES,
@@ -29,13 +29,12 @@ from dolfinopt.responses.measured import (
     TIME_ERROR_SHARE,
     TRIED_COORDINATES_LIMIT,
 )
+from dolfinopt.responses.reductions import RICHER_METHOD, Reductions
 from dolfinopt.responses.response import bodies_in, factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-
-RICHER_METHOD = "craig-bampton"  # of what the motion is compared with
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def choose_coordinates(
     comparison = _Comparison(scene, partition, arms, x_phys, profile)
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
     goal = scene.reduction.tolerance / reserve
-    most = min(max(TRIED_COORDINATES_LIMIT, least), comparison.limit)
+    most = min(max(TRIED_COORDINATES_LIMIT, least), comparison.reductions.limit)
     tried: dict[int, float] = {}
     low, high = least - 1, least
     while not (error := comparison.error(high)) <= goal:  # not a number included
@@ -156,22 +155,20 @@ class _Comparison:
             for k, arm in arms.items():
                 arm.set_design(x_phys[k])
         decide_stiffening(self.scenes, partition, arms)
-        dofs = min((arm.elastic.num_dofs for arm in arms.values()), default=None)
-        known = partition.world.allgather(dofs)
-        self.limit: int = min(one for one in known if one is not None)
+        self.reductions = Reductions(scene, partition, arms, profile)
         self.richer = 0  # coordinates
         self.bases: dict[int, Basis] = {}
         self.motions: list[Trajectory] = []
 
     def error(self, count: int) -> float:
         """Return the error that `count` coordinates make (collective)."""
-        richer = min(max(RICHER_COORDINATES, RICHER_RATIO * count), self.limit)
+        richer = min(max(RICHER_COORDINATES, RICHER_RATIO * count), self.reductions.limit)
         if richer > self.richer:
-            self.bases = self._reduced(RICHER_METHOD, richer)
+            self.bases = self.reductions.reduced(RICHER_METHOD, richer)
             self.motions = self._moved(self.bases)
             self.richer = richer
         try:
-            bases = self._reduced(self.method, count)
+            bases = self.reductions.reduced(self.method, count)
             motions = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do
@@ -181,30 +178,9 @@ class _Comparison:
         energy = gather_arms(self.partition, mine)
         return on_root(self.partition.world, _largest, self.scenes, motions, self.motions, energy)
 
-    def _reduced(self, method: str, count: int) -> dict[int, Basis]:
-        """Return this rank's bases (collective)."""
-        bases = {}
-        with self.profile.phase("choice of coordinates"), together(self.partition.world):
-            for k, arm in self.arms.items():
-                if method == RICHER_METHOD and count <= self.richer:
-                    bases[k] = _leading(self.bases[k], count)
-                else:
-                    bases[k] = METHODS[method].reduce(arm.elastic, arm.options(count), None)
-        return bases
-
-    def _body(self, k: int, basis: Basis, beta: float) -> ShapeIntegrals:
-        arm = self.arms[k]
-        loads = None
-        if arm.stiffened:
-            loads = arm.current.unit_loads.with_modes(basis.V, basis.MV)
-        return shape_integrals(arm.elastic, basis, beta, loads)
-
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
-        beta = self.scenes[0].damping.stiffness_proportional
-        with together(self.partition.world):
-            mine = {k: self._body(k, basis, beta) for k, basis in bases.items()}
-        owned = gather_arms(self.partition, mine)
+        owned = gather_arms(self.partition, self.reductions.bodies(bases))
         kept: list[Trajectory] = []
         on_root(
             self.partition.world, lambda: kept.extend(_simulate(self.scenes, owned, self.profile))
@@ -218,18 +194,6 @@ def _timed(scene: Scene) -> Scene:
     update = {"tolerance": tolerance}
     simulation = scene.simulation.model_copy(update=update)
     return scene.model_copy(update={"simulation": simulation})
-
-
-def _leading(basis: Basis, count: int) -> Basis:
-    """Return the first Craig-Bampton coordinates: constraint modes, then fixed-interface modes."""
-    part = slice(count)
-    return Basis(
-        basis.V[:, :, part],
-        basis.MV[:, :, part],
-        basis.stiffness[part, part],
-        basis.outboard[:, part],
-        basis.start[:, : count - len(basis.outboard)],
-    )
 
 
 def _simulate(

@@ -269,11 +269,11 @@ def loads_gradient(
         by_c.append(by_loads)
         own.append(_integrals(body, by_P, by_K))
     t = motion.t[instants]
-    rates = (motion.unknowns[0][instants], motion.unknowns[1][instants])
-    through = load_gradient(problem, t, (*rates, motion.unknowns[2][instants]), by_c)
-    through.by_rates[0] += motion.by_unknowns(by_q)
-    followed = motion.adjoint.gradient(t, through.by_rates)
-    total = add_gradients(add_gradients(followed, through.by_bodies), own)
+    y, yd, ydd = (x[instants] for x in motion.unknowns)
+    by_rates, by_bodies = load_gradient(problem, t, (y, yd, ydd), by_c)
+    by_rates[0] += motion.by_unknowns(by_q)
+    followed = motion.adjoint.gradient(t, by_rates)
+    total = add_gradients(add_gradients(followed, by_bodies), own)
     if motion.scene is not scene:
         total = [
             cotangents_of_scene(by, factors(scene, motion.scene, index), 1.0)

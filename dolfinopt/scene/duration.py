@@ -8,8 +8,9 @@ from functools import lru_cache
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.paths import TIME, Limits, column_names, last_instant, law_for, read_table
-from dolfinopt.paths import Law as TimeLaw
+from dolfinopt.scene.csv_table import TIME, column_names, last_instant, read_table
+from dolfinopt.scene.laws import Law as TimeLaw
+from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points

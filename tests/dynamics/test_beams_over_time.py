@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bodies import plane_chain
 from remainders import substructure
 
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
-from dolfinopt.multibody.tree import plane_chain
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 
@@ -59,7 +59,7 @@ def spun_up(speed: float) -> Callable[[np.ndarray], RigidMotion]:
 def tip(body: ShapeIntegrals, speed: float, t: np.ndarray) -> np.ndarray:
     """Return axial and transverse deflection (n, 2) of the tip in the rotating frame, m."""
     mechanism = plane_chain((body,), 0.0, 0.0, (0.0, 0.0), 0.0)
-    system = ElasticSystem(mechanism, spun_up(speed), (0.0, RUN_UP, float(t[-1])))
+    system = MachineSystem(mechanism, spun_up(speed), (0.0, RUN_UP, float(t[-1])))
     q = radau.integrate(system, 1e-5, 4, Profile()).sample(t, 0)
     linear = q @ body.outboard[:2].T
     return linear - 0.5 * np.einsum("ni,pij,nj->np", q, body.K0_outboard[:2], q)

@@ -21,6 +21,7 @@ from machines import (
 
 from dolfinopt.bench.field_machines import CRANK, END, ROD, crank, desired, rod, solved, unknowns
 from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.feed_forward import feed_forward
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -110,10 +111,11 @@ def test_crank_without_stiffness_starts_closed_and_at_rest(kind: str) -> None:
     y, yd = system.initial_state()
     assert y[0, 0] == 0.0  # of the crank
     assert np.abs(y[0, 1:]).max() > 0.0
-    ydd = np.zeros_like(y)
-    ydd[:, slice(*system.ends[1:])] = system._rest(y)[1]
+    ydd = system._rest(y)[2]
     left = system.at(np.zeros(1)).residual(y, yd, ydd)[0]
-    size = np.abs(system.feed_forward(trajectory.desired[:1])).max()  # N m; the crank's of gravity
+    size = np.abs(
+        feed_forward(system, trajectory.desired[:1])[0]
+    ).max()  # N m; the crank's of gravity
     assert np.abs(left[1:]).max() < 1e-10 * size
     assert np.abs(gaps(result)).max() < 1e-9  # m
 
@@ -157,7 +159,7 @@ def test_forces_of_its_state() -> None:
     assert left[0] < 1e-10  # N m, of 35
     assert left[1:5].max() < 1e-9  # N, of 160
     assert left[5] < 1e-9 * system.gap_scale
-    moment = instants.forces(y, yd, ydd)[0, 1]
+    moment = instants.state(y, yd, ydd).forces()[0, 1]
     assert moment == pytest.approx(-STATE["forces"][2], rel=1e-9)
 
 
@@ -174,7 +176,7 @@ def test_motion() -> None:
     solution = solved(system, 3200, 5)
     y, yd, ydd = unknowns(system, solution)
     instants = system.at(np.array([END]))
-    motion = instants.motion(y, yd, ydd)
+    motion = instants.state(y, yd, ydd).motion
     angle = motion.q[0, 1:].sum()
     assert angle == pytest.approx(PHI2, abs=5e-12)  # rad; measured 2e-13
     place = end_effector(system.mechanism, motion, y[:, 1:5])[0]
@@ -187,7 +189,9 @@ def test_motion() -> None:
     assert y[0, 3:5] == pytest.approx(Q[2:], abs=5e-13)  # 4e-14, 6e-14
     # 3e-8, or 6e-7 where OpenBLAS takes other kernels: rounding; the next grids 2e-7, 1e-6.
     assert -ydd[0, 5] == pytest.approx(FORCES[0], rel=2e-6)
-    assert -instants.forces(y, yd, ydd)[0, 1] == pytest.approx(FORCES[2], rel=1e-7)  # 2.7e-8
+    assert -instants.state(y, yd, ydd).forces()[0, 1] == pytest.approx(
+        FORCES[2], rel=1e-7
+    )  # 2.7e-8
     t = np.linspace(0.0, END, 4001)
     bending = np.abs(solution.sample(t)[:, 1])
     assert bending.max() == pytest.approx(1.6515e-3, abs=5e-8)

@@ -20,9 +20,9 @@ from machines import (
 from machines import small_two_arm as small
 from runs import TWO_ARM, overrides, run
 
+from dolfinopt.dynamics.drives import saturated
+from dolfinopt.dynamics.measured import LINEAR_DRIVE_SHARE
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.measured import LINEAR_DRIVE_SHARE
-from dolfinopt.multibody.tree import saturated
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Chain, Cloud, assert_close, beam, derivative, random_cloud
+from bodies import Chain, Cloud, assert_close, beam, derivative, plane_chain, random_cloud
 from machines import distance
 from remainders import build
 from scipy.integrate import solve_ivp
@@ -24,8 +24,9 @@ from dolfinopt.dynamics.collocation import (
     residual_at,
     stages_of,
 )
-from dolfinopt.dynamics.elastic_system import ElasticSystem, modes_of
 from dolfinopt.dynamics.estimate import Estimate
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.modes import modes_of
 from dolfinopt.dynamics.newton import Iterate
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, factorise
 from dolfinopt.dynamics.system import relative_error
@@ -35,9 +36,8 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
-from dolfinopt.multibody.tree import plane_chain
-from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
@@ -75,20 +75,20 @@ def two_arms(
     damping: float = 1e-3,
     gravity: tuple[float, float] = (0.0, 0.0),
     arms: int = 2,
-) -> tuple[ElasticSystem, Chain]:
+) -> tuple[MachineSystem, Chain]:
     """Return slender arms of 1 to 50 Hz, and the same as points with their energies."""
     arm = beam(bending=bending, axial=axial, damping=damping)
     chain = Chain((arm,) * arms, payload, 0.01, gravity, 0.0)
-    return ElasticSystem(chain.mechanism(), motion, breakpoints), chain
+    return MachineSystem(chain.mechanism(), motion, breakpoints), chain
 
 
-def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> ElasticSystem:
+def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> MachineSystem:
     """Return one coordinate of that frequency (rad/s) and damping ratio that the cart pushes."""
     none, one, tip = np.zeros(1), np.eye(1), np.array([1.0, 0.0])
     C, D = tip[:, None], 2.0 * damping * frequency * one
     shape = (none, none, one, 0.0 * one, frequency**2 * one, D, np.zeros((3, 1)), tip)
     body = plane_body(1.0, np.zeros(2), 0.0, C, *shape)
-    return ElasticSystem(plane_chain((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
+    return MachineSystem(plane_chain((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
 
 
 PUSH = 0.1  # s, when the cart begins to accelerate
@@ -104,7 +104,7 @@ def pushed(t: np.ndarray) -> RigidMotion:
     return RigidMotion(*columns)
 
 
-def solve(problem: ElasticSystem, tolerance: float, stages: int = 3) -> Solution:
+def solve(problem: MachineSystem, tolerance: float, stages: int = 3) -> Solution:
     """Integrate from cold."""
     return radau.integrate(problem, tolerance, stages, Profile())
 
@@ -157,7 +157,7 @@ def test_rest_under_gravity_is_static_equilibrium() -> None:
 
 
 def fitted_order(
-    problem: ElasticSystem,
+    problem: MachineSystem,
     on_grid: Callable[[np.ndarray], Solution],
     counts: tuple[int, int],
     reference: Solution,
@@ -259,13 +259,13 @@ def test_large_deflections_are_solved_from_rest() -> None:
     assert relative_error(problem.mechanism, found.sample(t) - right, right) <= 1e-5
 
 
-def soft_arms() -> ElasticSystem:
+def soft_arms() -> MachineSystem:
     """Return arms spun up to where centrifugal forces beat the stiffness."""
     spun = lambda t: reach(t, (0.0, 300.0, 0.0))  # noqa: E731
     return two_arms(spun, (0.0, 0.6), bending=1e-2, axial=1.0)[0]
 
 
-def folded_arms() -> ElasticSystem:
+def folded_arms() -> MachineSystem:
     """Return arms that the first acceleration alone would fold."""
     return two_arms(swing, (0.0, 1.0), payload=2.0, bending=1e-4, axial=1e-2)[0]
 
@@ -338,7 +338,7 @@ def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share: float) -
     """Where finer steps have no room, an error between the aim and the tolerance is accepted."""
     honest = radau.estimate
     monkeypatch.setattr(radau, "estimate", lambda *of: replace(honest(*of), error=share * 1e-4))
-    monkeypatch.setattr(radau, "unresolved", lambda *_: 0.0)
+    monkeypatch.setattr(radau, "unresolved", lambda *_: (0.0, 0.0))
     monkeypatch.setattr(radau, "STEPS_LIMIT", 10)
     problem, _ = two_arms()
     if share < 1.0:
@@ -408,14 +408,14 @@ def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
     return Cloud(points, np.full(count, 0.6 / count), modes, K, damping * K, outboard, ends)
 
 
-def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> ElasticSystem:
+def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> MachineSystem:
     """Return two such arms with a payload, in motion under gravity."""
     arm = fine_beam(bending, axial, damping)
     chain = Chain((arm, arm), 1.0, 0.0, (0.0, -9.81), 0.0)
-    return ElasticSystem(chain.mechanism(), reach, ENDS)
+    return MachineSystem(chain.mechanism(), reach, ENDS)
 
 
-def some_stages(problem: ElasticSystem) -> Stages:
+def some_stages(problem: MachineSystem) -> Stages:
     """Return the stages of five steps of two lengths, in modal coordinates."""
     edges = np.concatenate([[0.0], 0.02 * np.cumsum(1.0 + np.arange(5) % 2)])
     return stages_of(modes_of(problem), radau.radau_iia(3), edges)
@@ -446,7 +446,7 @@ def test_modes_are_a_change_of_coordinates() -> None:
     rng = np.random.default_rng(3)
     clouds = tuple(random_cloud(rng, size) for size in (3, 5))
     chain = Chain(clouds, 1.0, 0.1, (0.5, -9.81), 0.0)
-    problem = ElasticSystem(chain.mechanism(), swing, (0.0, 1.0))
+    problem = MachineSystem(chain.mechanism(), swing, (0.0, 1.0))
     modes = modes_of(problem)
     assert_close(modes.system.mechanism.stiffness(), np.eye(8), 1e-12)
     assert (np.diff(modes.frequencies[:3]) < 0.0).all()

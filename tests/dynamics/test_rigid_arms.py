@@ -9,6 +9,7 @@ import pytest
 from machines import Tree, loop_tree, with_keys
 from runs import refusal, run, summary_of
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import dolfinopt as do
 from dolfinopt.part.folder import toml_text
@@ -58,14 +59,18 @@ def test_slider_crank_without_feed_forward() -> None:
     trajectory = do.Model(scene_from_dict(tree)).simulate().trajectory
     assert trajectory is not None
 
+    t = np.linspace(0.0, trajectory.t[-1], 4001)
+    motion = trajectory.problem.motion(t)
+    desired = CubicSpline(t, np.stack([motion.q[:, 1], motion.qd[:, 1]], axis=1))
+
     def rates(t: float, state: np.ndarray) -> list[float]:
         angle, speed = state
-        desired = trajectory.problem.motion(np.array([t]))
+        place, rate = desired(t)
         s, c = np.sin(angle), np.cos(angle)
         root = np.sqrt(rod * rod - r * r * s * s)
         by_angle = -r * s - r * r * s * c / root  # x', of x = r c + root
         curvature = -r * c - r * r * (c * c - s * s) / root - r**4 * (s * c) ** 2 / root**3
-        force = K * (desired.q[0, 1] - angle) + D * (desired.qd[0, 1] - speed)
+        force = K * (place - angle) + D * (rate - speed)
         return [speed, (force - m * by_angle * curvature * speed**2) / (J + m * by_angle**2)]
 
     t, begin = trajectory.t, trajectory.desired.q[0, 1]

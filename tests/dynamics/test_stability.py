@@ -18,7 +18,7 @@ from runs import TWO_ARM, overrides, run, scene, summary_of
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import measured, radau
-from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
@@ -343,7 +343,7 @@ def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> N
     assert "material.young_modulus" in said and "motion.duration" in said and "\n" not in said
 
 
-def quasi_static(problem: ElasticSystem, t: np.ndarray) -> np.ndarray:
+def quasi_static(problem: MachineSystem, t: np.ndarray) -> np.ndarray:
     """Return K^-1 (- rows of the undeformed mechanism) at instants t."""
     rest = np.zeros((len(t), problem.mechanism.num_coordinates))
     rows = inverse_dynamics(problem.mechanism, problem.motion(t), rest, rest, rest)[0]

@@ -6,21 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from bodies import beam
+from bodies import beam, plane_chain
 from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution, Stages, Strategy, radau_iia
-from dolfinopt.dynamics.elastic_system import ElasticSystem
+from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.estimate import _free_vibrations, _lost
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import State, Unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import Tangent
-from dolfinopt.multibody.tree import Drives, plane_chain
-from dolfinopt.paths import Limits, law_for
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -65,7 +64,8 @@ class Pendulum:
         matrix[:, [0, 1], [0, 1], 0] = qdd[:, 2:]
         matrix[:, 2, :2, 0] = matrix[:, :2, 2, 2] = q[:, :2]
         matrix[:, [0, 1], [0, 1], 2] = 1.0
-        return Tangent.of_matrix(matrix, keep)
+        own = np.arange(matrix.shape[2]) if keep is None else keep
+        return Tangent(matrix[:, :, own], own, np.arange(len(own)))
 
     def initial_state(self) -> State:
         return np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 3))
@@ -131,7 +131,7 @@ def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
 def test_drives_follow_their_law() -> None:
     """u = Kp (q_d - q) + Kd (qd_d - qd), of cart and joint."""
     e, ed = np.random.default_rng(1).normal(size=(2, 5, 3))
-    found = controlled(1.0).at(np.linspace(0.0, 0.5, 5)).drive_forces(e, ed)
+    found = controlled(1.0).at(np.linspace(0.0, 0.5, 5)).state(e, ed, ed).drive_forces
     expected = -np.array([4e3, 100.0]) * e[:, :2] - np.array([40.0, 0.5]) * ed[:, :2]
     np.testing.assert_allclose(found, expected, rtol=1e-14)
 
@@ -184,15 +184,16 @@ def still(t: np.ndarray) -> RigidMotion:
 def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
     """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
     method, h = radau_iia(3), np.full(10, 0.1)
-    nothing = ElasticSystem(plane_chain((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
+    nothing = MachineSystem(plane_chain((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
     known = Unchanged(nothing)
     known.uncoupled = tuple(np.full(1, x) for x in (1.0, damping, 1e-290))
     stages = Stages(known, method, h, nothing.at(np.zeros(30)))
     t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]
     states = (t**2, np.zeros_like(t), np.zeros_like(t))
-    found = _free_vibrations(stages, states, np.zeros(1), np.array([0]))
-    assert found.shape == (1,)
-    assert 0.0 <= found[0] < 1e-12
+    amplitudes, rate = _free_vibrations(stages, states, np.zeros(1), np.array([0]))
+    lost, steps = _lost(method, rate * h[:, None], amplitudes, np.array([0]))
+    assert 0.0 <= lost[0] < 1e-12
+    assert steps.shape == (10, 1)
 
 
 @pytest.mark.parametrize("stages", [2, 3, 4])
@@ -200,10 +201,13 @@ def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
 def test_lost_is_what_collocation_makes_of_a_free_vibration(stages: int, z: complex) -> None:
     """y' = z y over unit steps, the stages' equations solved one step after the other."""
     method = radau_iia(stages)
-    y, apart = 1.0 + 0.0j, []
+    y, apart, each = 1.0 + 0.0j, [], []
     for n in range(1, 6):
-        k = np.linalg.solve(np.eye(stages) - z * method.A, np.full(stages, z * y))
-        y = y + method.A[-1] @ k
-        apart.append(abs(np.exp(n * z) - y))
-    found = _lost(method, np.array([[z]]), np.array([5]))
-    assert found[0, 0] == pytest.approx(max(apart), rel=1e-9)
+        k = np.linalg.solve(np.eye(stages) - z * method.A, np.full(stages, z))
+        factor = 1.0 + method.A[-1] @ k
+        each.append(2.0 * abs(np.exp((n - 1) * z) * (np.exp(z) - factor)))
+        y = y * factor
+        apart.append(2.0 * abs(np.exp(n * z) - y))
+    found, steps = _lost(method, np.full((6, 1), z), np.array([[2.0]]), np.array([1]))
+    assert found[0] == pytest.approx(max(apart), rel=1e-9)
+    np.testing.assert_allclose(steps[:, 0], [0.0, *each], rtol=1e-9, atol=1e-12)

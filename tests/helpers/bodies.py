@@ -1,6 +1,6 @@
 """Bodies made of point masses, whose shape integrals are sums, in the plane and in space."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,21 +10,74 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.rotations import skew
 from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
 from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
-    JointHardware,
     Mechanism,
     Rotor,
-    plane_chain,
-    spatial_mechanism,
+    Site,
 )
 
 # By which integrals a function of a body is differentiated.
 CONSTANTS = [one.name for one in TABLE if not one.name.endswith(("_point", "_points"))]
 STEP = 1e-30  # of a complex step
+
+
+@dataclass(frozen=True)
+class JointHardware:
+    """What sits at one arm's ends besides the arm itself.
+
+    Attributes:
+        mass, inertia: at the outboard interface, kg, kg m2.
+        rotor: that drives the inboard joint, or None.
+    """
+
+    mass: float = 0.0
+    inertia: float = 0.0
+    rotor: Rotor | None = None
+
+
+def plane_chain(
+    bodies: Sequence[ShapeIntegrals],
+    payload_mass: float,
+    payload_inertia: float,
+    gravity: Sequence[float],
+    joint_height: float,
+    *,
+    hardware: Sequence[JointHardware] = (),
+    cart_mass: float = 0.0,
+) -> Mechanism:
+    """Return a cart on a horizontal rail that carries a chain of arms and a payload.
+
+    Args:
+        bodies: from the cart outwards.
+        payload_mass: point mass at the last outboard interface, kg.
+        payload_inertia: its rotary inertia, kg m2.
+        gravity: (g_x, g_y), m/s2.
+        joint_height: y of the first joint, m.
+        hardware: what sits at every arm's ends, or none.
+        cart_mass: kg.
+    """
+    hardware, last = hardware or (JointHardware(),) * len(bodies), len(bodies) - 1
+    joints = [
+        Joint(f"joint {k}", "revolute", k - 1, 1 + k, np.ones(1), np.zeros(2), np.eye(2), one.rotor)
+        for k, one in enumerate(hardware)
+    ]
+    loads = {(k, 0): np.array([one.mass, one.inertia]) for k, one in enumerate(hardware)}
+    if bodies:
+        loads[last, 0] += payload_mass, payload_inertia
+    return Mechanism(
+        bodies=tuple(bodies),
+        joints=tuple(joints),
+        loads={at: Constants.of_point(*x) for at, x in loads.items() if x.any() or at[0] == last},
+        gravity=np.array(gravity, dtype=float)[:, None],
+        end=(last, 0),
+        origin=np.array([0.0, joint_height]),
+        cart=cart_mass,
+    )
 
 
 @dataclass(frozen=True)
@@ -270,7 +323,22 @@ class Chain:
 
 
 COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+
+
 # Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
+def spatial_mechanism(
+    bodies: Sequence[ShapeIntegrals],
+    joints: Sequence[Joint],
+    carried: Mapping[Site, ShapeIntegrals],
+    gravity: Sequence[float] | np.ndarray,
+    end: Site,
+) -> Mechanism:
+    """Return bodies on joints; what they carry are rigid bodies in the interfaces' frames."""
+    loads = {site: Constants(one) for site, one in carried.items()}
+    down = np.array(gravity, dtype=float)[:, None]
+    return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
+
+
 HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, Rotor(0.2 / k, 0.5 * k)) for k in (1, 2, 3))
 
 

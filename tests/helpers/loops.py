@@ -261,9 +261,7 @@ def flexible_slider_crank(folder: Path) -> Scene:
 def free(folder: Path, tree: Tree, table: str, bodies: list[ShapeIntegrals]) -> MachineSystem:
     """Return a machine of rigid bodies whose driven joints are let go at the table's start."""
     control = {"feed_forward": "none", "stiffness": [0.0], "damping": [0.0]}
-    system = build_system(closed(folder, table, tree, control=control), bodies)
-    assert isinstance(system, MachineSystem)
-    return system
+    return build_system(closed(folder, table, tree, control=control), bodies)
 
 
 def started(system: MachineSystem, rate: float) -> MachineSystem:

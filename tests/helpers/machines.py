@@ -17,7 +17,6 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.dimension import product
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -171,7 +170,6 @@ def trajectory_of(one: Scene) -> Trajectory:
 def machine(result: SimulationResult) -> tuple[Trajectory, MachineSystem]:
     """Return the trajectory of a simulated machine every `simulation.sample`, and its system."""
     assert result.trajectory is not None
-    assert isinstance(result.trajectory.problem, MachineSystem)
     return result.trajectory.sampled, result.trajectory.problem
 
 
@@ -230,14 +228,8 @@ def states(
     trajectory: Trajectory, t: np.ndarray
 ) -> tuple[RigidMotion, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return rigid motion, elastic coordinates with derivatives, and the drives' forces at t."""
-    y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
-    if not isinstance(trajectory.problem, MachineSystem):
-        motion = trajectory.problem.motion(t)
-        forces = inverse_dynamics(trajectory.mechanism, motion, y, yd, ydd)[1]
-        return motion, y, yd, ydd, forces
-    instants = trajectory.problem.at(t)
-    (_, q, _), (_, qd, _), (_, qdd, _) = (instants.split(x) for x in (y, yd, ydd))
-    return instants.motion(y, yd, ydd), q, qd, qdd, instants.forces(y, yd, ydd)
+    state = trajectory.at(t).state
+    return state.motion, *state.elastic, state.forces()
 
 
 def _power(trajectory: Trajectory, t: np.ndarray) -> np.ndarray:
@@ -266,23 +258,19 @@ class DriveTrains:
 
 def drive_trains(trajectory: Trajectory, t: np.ndarray) -> DriveTrains:
     """Return what gears and motors do: under control by themselves, or on the desired motion."""
-    none = np.zeros(len(t))
-    system = trajectory.problem
-    if not isinstance(system, MachineSystem):
-        return DriveTrains(np.zeros(0, dtype=int), np.zeros((len(t), 0)), none, none)
-    drives, springs, instants = system.drives, system.drives.springs, system.at(t)
-    y, yd = (trajectory.solution.sample(t, k) for k in range(2))
+    system, state = trajectory.problem, trajectory.at(t).state
+    drives, springs, (y, yd, _) = system.drives, system.drives.springs, state.rates
     if len(springs.joints):  # under control
         own, k, c, friction = springs.joints, springs.stiffness, springs.damping, springs.friction
-        speeds = instants.motor_rates(yd, yd)[0]
-        twist, rate = (x[:, own] - instants.motors(x) for x in (y, yd))
+        speeds = state.motor_rates[0]
+        twist, rate = (x[:, own] - x[:, system.motor_columns] for x in (y, yd))
     else:
         own = np.flatnonzero(drives.driven & (drives.stiffness > 0.0))
         if trajectory.scene.control is not None:
             own = own[:0]
         k, c = drives.stiffness[own], drives.damping[own]
         friction = None if drives.friction is None else drives.friction.of(own)
-        speeds = instants.desired.qd[:, drives.free[own]]
+        speeds = state.instants.desired.qd[:, drives.free[own]]
         twist, rate = y[:, own], yd[:, own]
     lost = rate**2 @ c
     if friction is not None:
@@ -330,14 +318,12 @@ def plane_frames(
 
 def gaps(result: SimulationResult) -> np.ndarray:
     """Return the violation of a loop's constraints at all stages (n, m), m."""
-    trajectory, system = machine(result)
-    assert system.loops is not None
+    trajectory, _ = machine(result)
     grid, nodes = trajectory.solution.time_grid, trajectory.solution.nodes
     t = (grid[:-1, None] + np.diff(grid)[:, None] * nodes).ravel()
-    y, yd, ydd = (trajectory.solution.sample(t, k) for k in range(3))
-    instants = system.at(t)
-    motion = instants.motion(y, yd, ydd)
-    return system.loops.at(system.mechanism, motion.q, instants.split(y)[1]).gap
+    closed = trajectory.at(t).state.closed
+    assert closed is not None
+    return closed.gap
 
 
 def fork() -> dict:

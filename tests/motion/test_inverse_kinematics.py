@@ -177,6 +177,7 @@ def test_rotation_vectors_go_on():
 
 
 UP = [[0.6, 0, 0.2], [0.5, 0, 0.2]]
+LOW = [[0.5, 0, 0], [0.4, 0, 0.3]]
 REFUSED = [
     (ARM, "x,y,z", [[0.6, 0, 0.2], [2.0, 0, 0.2]], "", ("at t = ", "off at best")),
     (ARM, "x,y,z", [[2.6, 0, 0.2], [0.6, 0, 0.2]], "", ("at t = 0 s", "motion.initial_joints")),
@@ -184,9 +185,15 @@ REFUSED = [
     (ARM, "x,y", [[0.6, 0], [0.5, 0]], "", ("path.csv", "missing column 'z'")),
     (ROBOT, "x,y,z,roll", np.pad(UP, ((0, 0), (0, 1))), "", ("missing column 'pitch'",)),
     (ARM, "x,y,z,wrist", np.pad(UP, ((0, 0), (0, 1))), "", ("unknown column 'wrist'",)),
-    (ARM, "x,y,z,yaw,shoulder,elbow", np.pad(UP, ((0, 0), (0, 3))), "", ("prescribes all joints",)),
-    (ROBOT, "x,y,z", UP, "", ("at most 3 joints", "found 6", "(roll, pitch, yaw or rx, ry, rz)")),
-    (ARM, "x,y,z", UP, "payload.arm=link1", ("do not move the end-effector", "(elbow)")),
+    (ARM, "x,y,z,yaw,shoulder,elbow", np.pad(UP, ((0, 0), (0, 3))), "", ("cannot be at",)),
+    (
+        ROBOT,
+        "x,y,z",
+        UP,
+        "",
+        ("leave 3 of the joints", "prescribe 3", "or rx, ry, rz"),
+    ),
+    (ARM, "x,y,z", LOW, "payload.arm=link1", ("undetermined (elbow); prescribe 1",)),
 ]
 
 

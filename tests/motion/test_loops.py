@@ -36,8 +36,8 @@ from runs import refused
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.motion.build import follower, loop_start, rigid_motion
-from dolfinopt.motion.plane import rotation
-from dolfinopt.paths import Limits, law_for
+from dolfinopt.motion.paths import rotation
+from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
@@ -370,5 +370,5 @@ def test_links_that_nearly_fit_are_joined(tmp_path) -> None:
     """And those that do not are refused by how much."""
     start = follower(closed(tmp_path, FLAT.format(1.0, 2.2), cranks(longer=1e-5))).start
     assert start.misfit == pytest.approx(9e-6, rel=0.02) and start.redundant == 7
-    with refused("pin two", "cannot be closed", "open by 0.00"):
+    with refused("pin two", "cannot be closed", "leave it 0.00"):
         check_motion(closed(tmp_path, FLAT.format(1.0, 2.2), cranks(longer=2e-3)))

@@ -10,13 +10,16 @@ import pytest
 from bodies import (
     CONSTANTS,
     Chain,
+    JointHardware,
     assert_close,
     change_of,
     changed,
     complex_derivative,
     derivative,
+    plane_chain,
     random_chain,
     random_tree,
+    spatial_mechanism,
     stiffened,
 )
 from mpi4py import MPI
@@ -43,11 +46,8 @@ from dolfinopt.multibody.tree import (
     GROUND,
     AppliedForce,
     Joint,
-    JointHardware,
     Mechanism,
     Rotor,
-    plane_chain,
-    spatial_mechanism,
 )
 from dolfinopt.reduction import Options, craig_bampton, modal
 from dolfinopt.scene.load import load_scene
@@ -202,19 +202,6 @@ def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
         expected = np.einsum("nikj,knmj->nmi", exact[:, rows[wanted]], pairs)
         found = tangent.times(*change, wanted).reshape(expected.shape)
         assert_close(found, expected, DIFFERENCES, 10.0 * scale)
-        assert np.array_equal(tangent.window(1, 3).dense(), tangent.dense()[1:3])
-
-
-@pytest.mark.serial
-def test_bodies_have_columns_of_what_is_inboard_and_outboard() -> None:
-    """By a motion and by a load of few numbers; nothing moves the first, or loads the last."""
-    found: dict[int, dict[str, int]] = {}
-    for one in machine_of(FACTORED).tangent().blocks:
-        kind = "own" if one.left is None else {3: "load", 4: "motion"}[one.right.shape[1]]
-        found.setdefault(one.rows.start, {})[kind] = one.right.shape[2] // 3
-    a, b, c = MANY
-    first, second = {"own": a, "load": b + c}, {"own": b, "load": c, "motion": a}
-    assert list(found.values()) == [first, second, {"own": c, "motion": a + b}]
 
 
 @pytest.mark.serial

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from bodies import spatial_mechanism
 
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.rotations import roll_pitch_yaw
 from dolfinopt.multibody.shape_integrals import inertia_tensor, rigid_spatial_body
-from dolfinopt.multibody.tree import GROUND, Joint, bearing_body, spatial_mechanism, with_bearings
+from dolfinopt.multibody.tree import GROUND, Joint, bearing_body, with_bearings
 
 pin = pytest.importorskip("pinocchio")
 pytestmark = pytest.mark.serial

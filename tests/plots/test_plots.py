@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bodies import plane_chain
 from machines import GAINS, controlled, loop
 from mpi4py import MPI
 from PIL import Image
@@ -17,7 +18,7 @@ from dolfinopt.multibody.closures import Along, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
-from dolfinopt.multibody.tree import Mechanism, plane_chain
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots import animation, curves, design, machine, style

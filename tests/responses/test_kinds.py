@@ -15,7 +15,6 @@ import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.motion.build import rests
 from dolfinopt.part.folder import toml_text
-from dolfinopt.paths import Limits, law_for
 from dolfinopt.responses.constraints import (
     EXCESS,
     constraint_label,
@@ -24,6 +23,7 @@ from dolfinopt.responses.constraints import (
     limits_of,
 )
 from dolfinopt.responses.response import find
+from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.load import scene_from_dict
 
 # Ranks: limits of effort and peak force in test_every_option_gives_the_same_bits_on_any_number...

@@ -15,7 +15,7 @@ from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics.load_gradient import _Probe
+from dolfinopt.dynamics.load_gradient import ProbedSystem
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.fem.stress import places_of, rotated, stress_operator
 from dolfinopt.multibody.newton_euler import outward_pass
@@ -107,7 +107,7 @@ def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
 
 def agree_with_rows(trajectory: Trajectory, tolerance: float) -> None:
     """What loads the bodies is what the rows of coordinates say that never move."""
-    probe = _Probe(trajectory.problem)
+    probe = ProbedSystem(trajectory.problem)
     at = (probe.spread(x) for x in trajectory.unknowns)
     rows = probe.system.at(trajectory.t).residual(*at)
     for part, found in zip(probe.places, trajectory.load_coefficients, strict=True):

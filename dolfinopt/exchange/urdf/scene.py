@@ -33,7 +33,8 @@ from dolfinopt.exchange.urdf.robot import (
     roll_pitch_yaw_of,
     scene_bodies,
 )
-from dolfinopt.paths import Table, column_names, curve_in_time, read_table
+from dolfinopt.motion.paths import curve_in_time
+from dolfinopt.scene.csv_table import Table, column_names, read_table
 
 if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.geometry import LinkCells

@@ -17,17 +17,10 @@ from runs import TWO_ARM, refusal
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
-from dolfinopt.paths import (
-    Curve,
-    Law,
-    Limits,
-    Table,
-    curve_by_chord,
-    curve_in_time,
-    law_for,
-    read_table,
-)
+from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
 from dolfinopt.responses.evaluation import evaluate_batch
+from dolfinopt.scene.csv_table import Table, read_table
+from dolfinopt.scene.laws import Law, Limits, law_for
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -322,7 +315,7 @@ def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path: Pa
         ("1,2\n3,4\n5,6\n", ["line 1", "column '1'", "x,y or t,x,y"]),
         ("\nx;y\n0;1\n1;1\n", ["line 2", "column 'x;y'", "x,y or t,x,y"]),
         ("t,x,y,z\n0,0,0,0\n", ["line 1", "column 'z'", "x,y or t,x,y"]),
-        ("x,y,x\n0,0,0\n", ["line 1", "column 'x' twice", "x,y or t,x,y"]),
+        ("x,y,x\n0,0,0\n", ["line 1", "repeated column 'x'", "x,y or t,x,y"]),
         ("t,x\n0,0\n1,1\n", ["line 1", "column 'y'", "x,y or t,x,y"]),
         ("x,y\n", ["0 row(s)", "at least 2"]),
         ("x,y\n0,0\n", ["1 row(s)", "at least 2"]),
@@ -374,7 +367,7 @@ def test_curve_in_time_goes_from_rest_to_rest() -> None:
     """Through every row, twice (in fact four times) continuously differentiable."""
     curve = curve_in_time(table(TIMES))
     assert curve.end == TIMES[-1]
-    assert curve.kinks == ()
+    assert not curve.kinks.size
     value, _, _ = curve(TIMES)
     assert_close(value, ROWS, 1e-13)
     spline = curve.moves[0][2]

@@ -1,0 +1,127 @@
+"""Tables of points, joint coordinates or forces over time: CSV files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+
+TIME = "t"  # the column that a table may have before all others, s
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The rows of a file.
+
+    Attributes:
+        file: its path.
+        lines: (n,) line of every row, from 1.
+        t: (n,) instants, s, or None.
+        rows: (n, k) values of the columns asked for, in that order.
+    """
+
+    file: str
+    lines: tuple[int, ...]
+    t: np.ndarray | None
+    rows: np.ndarray
+
+
+def read_table(file: str, columns: Sequence[str], further: str = "") -> Table:
+    """Read a CSV file with a line of column names, UTF-8.
+
+    Columns stand in any order, separated by commas; a column t may be there besides `columns`.
+    Blank lines and lines that start with # count for nothing.
+
+    Args:
+        file: its path.
+        columns: names of those asked for.
+        further: what else may be there, for messages.
+
+    Raises:
+        InputError: no such file, other columns, fewer than two rows, no finite number, or t does
+            not increase from 0; names file, line, column and value.
+    """
+    lines = _lines(file)
+    allowed = f"expected {','.join(columns)} or {','.join([TIME, *columns])}{further}"
+    if not lines:
+        raise InputError(f"{file}: no rows; a line of column names is needed: {allowed}")
+    number, names = lines[0]
+    for name in dict.fromkeys([*names, *columns]):
+        wrong = {0: "missing", 1: ""}.get(names.count(name), "repeated")
+        if wrong := wrong if name in (TIME, *columns) else "unknown":
+            raise InputError(f"{file}: line {number}: {wrong} column {name!r}; {allowed}")
+    if len(lines) < 3:
+        found = len(lines) - 1
+        raise InputError(f"{file}: {found} row(s) below the column names; expected at least 2")
+    numbers = tuple(k for k, _ in lines[1:])
+    values = np.array([_row(f"{file}: line {k}", names, cells) for k, cells in lines[1:]])
+    t = values[:, names.index(TIME)] if TIME in names else None
+    if t is not None:
+        _check_times(file, numbers, t)
+    return Table(file, numbers, t, values[:, [names.index(name) for name in columns]])
+
+
+def column_names(file: str) -> list[str]:
+    """Return the names of a table's columns; none of an empty file."""
+    return next((cells for _, cells in _lines(file)), [])
+
+
+def last_instant(file: str) -> float | None:
+    """Return the last t of a table, s; None where it has no such column, or no number there."""
+    lines = [cells for _, cells in _lines(file)]
+    try:
+        return float(lines[-1][lines[0].index(TIME)])
+    except (IndexError, ValueError):
+        return None
+
+
+def _lines(file: str) -> list[tuple[int, list[str]]]:
+    """Return the cells of the lines that count, with their numbers from 1."""
+    try:
+        text = Path(file).read_bytes().decode("utf-8-sig")  # spreadsheets add a byte order mark
+    except UnicodeDecodeError as error:
+        line = error.object.count(b"\n", 0, error.start) + 1
+        raise InputError(f"{file}: line {line}: not UTF-8; save the table as UTF-8") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
+        reason = getattr(error, "strerror", None) or "not a file name"
+        raise InputError(f"{file}: cannot be read ({reason}); name a table (CSV)") from None
+    numbered = enumerate(text.splitlines(), start=1)
+    return [(k, _cells(x)) for k, x in numbered if x.strip() and not x.lstrip().startswith("#")]
+
+
+def _cells(line: str) -> list[str]:
+    """Split a line at its commas; spreadsheets may put names in quotes."""
+    return [cell.strip().strip('"') for cell in line.split(",")]
+
+
+def _row(where: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:
+    """Return the numbers of one line."""
+    if len(cells) != len(names):
+        raise InputError(
+            f"{where}: {len(cells)} value(s); expected {len(names)}, one for each of "
+            f"{','.join(names)}"
+        )
+    values = []
+    for name, cell in zip(names, cells, strict=True):
+        try:
+            values.append(float(cell))
+        except ValueError:
+            values.append(math.nan)
+        if not math.isfinite(values[-1]):
+            raise InputError(f"{where}, column {name} = {cell[:40]!r}: expected a finite number")
+    return values
+
+
+def _check_times(file: str, lines: Sequence[int], t: np.ndarray) -> None:
+    """Raise unless t starts at 0 and increases."""
+    if not (wrong := np.flatnonzero([t[0] != 0.0, *(np.diff(t) <= 0.0)])).size:
+        return
+    row = wrong[0]
+    need = f"more than {t[row - 1]:g} [s], as in the row before"
+    need = need if row else "0 [s] in the first row"
+    raise InputError(f"{file}: line {lines[row]}, column {TIME} = {t[row]:g}: expected {need}")
