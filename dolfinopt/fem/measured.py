@@ -86,5 +86,6 @@ COARSENED_EDGE_RATIO = 2.0
 COARSEST_BAND_WORK = 3e8  # rows times bandwidth squared up to which a grid is the coarsest
 RIGHT_SIDES_CHUNK = 12  # right sides at a time: memory of their vectors on all levels
 SOLVER_ITERATIONS = 500
-SOLUTION_ROUNDING_ERROR = 1e-12  # least tolerance, of the right side's own length
-INDEPENDENT_LENGTH_SHARE = 1e-12  # least part of a direction's length that is none of the others'
+# Least tolerance, of the right side's own length; and least part of a direction's length that is
+# none of the others'.
+ROUNDING_SHARE = 1e-12

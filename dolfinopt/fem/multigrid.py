@@ -29,11 +29,10 @@ from dolfinopt.fem.measured import (
     BOX_CHUNK_COLUMNS,
     COARSENED_EDGE_RATIO,
     COARSEST_BAND_WORK,
-    INDEPENDENT_LENGTH_SHARE,
     RIGHT_SIDES_CHUNK,
+    ROUNDING_SHARE,
     SAME_PLACE_SHARE,
     SMOOTHED_SHARE,
-    SOLUTION_ROUNDING_ERROR,
     SOLVER_ITERATIONS,
 )
 from dolfinopt.parallel import on_root
@@ -467,7 +466,7 @@ def block_conjugate_gradients(
         if held is None:
             return tolerance**2 * own
         left = held - np.einsum("nk,nk->k", B, X)  # falls to that of the whole field, step by step
-        return np.clip(tolerance**2 * left, SOLUTION_ROUNDING_ERROR**2 * own, tolerance**2 * own)
+        return np.clip(tolerance**2 * left, ROUNDING_SHARE**2 * own, tolerance**2 * own)
 
     P = _orthonormal(Z)
     for step in range(SOLVER_ITERATIONS):
@@ -493,7 +492,7 @@ def _orthonormal(P: np.ndarray) -> np.ndarray:
         return P[:, :0]
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > INDEPENDENT_LENGTH_SHARE * values[-1]
+    kept = values > ROUNDING_SHARE * values[-1]
     return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))
 
 

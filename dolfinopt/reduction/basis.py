@@ -14,10 +14,10 @@ from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
 from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
-    INDEPENDENT_ENERGY_RATIO,
+    EXACT_TOLERANCE,
     ORTHONORMAL_ROUNDS_LIMIT,
-    ORTHONORMALITY_ERROR,
     ROUNDING_LENGTH_SHARE,
+    ROUNDING_SHARE,
 )
 
 
@@ -186,7 +186,7 @@ def orthonormalise(
         MQ = arm.mass_times(Q)
         overlap = dot(arm, MQ, np.concatenate([V, Q], axis=2))
         goal = np.eye(V.shape[2] + len(kept))[V.shape[2] :]
-        if np.abs(overlap - goal).max(initial=0.0) <= ORTHONORMALITY_ERROR:
+        if np.abs(overlap - goal).max(initial=0.0) <= EXACT_TOLERANCE:
             return Expansion(Q, MQ, np.vstack([by_V, R]), kept)
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the vectors of the reduction do not become orthonormal; ask for "
@@ -276,7 +276,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > INDEPENDENT_ENERGY_RATIO * shares[-1]:  # not a number included
+            if not shares[0] > ROUNDING_SHARE * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:

@@ -14,17 +14,14 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import Columns, ElasticArm, Rows
 from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
-    ADJOINT_ITERATIONS,
-    ADJOINT_TOLERANCE,
-    EIGEN_TOLERANCE,
     EIGENVALUE_GAP,
+    EXACT_TOLERANCE,
     GUARD_VECTORS,
-    INVERSE_TOLERANCE,
-    LOBPCG_INDEPENDENT_SHARE,
-    LOBPCG_ITERATIONS,
-    LOBPCG_TOLERANCE,
+    ITERATIONS_LIMIT,
     LOST_MODE_SHARE,
     RAMP_SHARE,
+    ROUNDING_SHARE,
+    VECTOR_TOLERANCE,
     WARM_STEPS,
 )
 from dolfinopt.solver import obeying_options, user_options
@@ -93,7 +90,7 @@ class Pencil:
 
     def inverse(self, R: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 R, to nearly all digits."""
-        return self._inverse(lambda F: self.arm.solve(F, INVERSE_TOLERANCE), R)
+        return self._inverse(lambda F: self.arm.solve(F, EXACT_TOLERANCE), R)
 
     def precondition(self, R: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 R, or an approximation of it where solutions are iterative."""
@@ -150,8 +147,8 @@ def complement_solve(
     R = right.copy(order="F")
     Z = conditioned(R)
     P, energy = Z, lengths(R, Z)
-    goal = ADJOINT_TOLERANCE**2 * energy
-    for _ in range(ADJOINT_ITERATIONS):
+    goal = VECTOR_TOLERANCE**2 * energy
+    for _ in range(ITERATIONS_LIMIT):
         if not np.isfinite(energy).all():
             break
         more = energy > goal[here]
@@ -198,7 +195,7 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
         pairs = None
         if not user_options(OPTIONS):
             if arm.is_iterative:
-                pairs = lobpcg(pencil, count, start, LOBPCG_TOLERANCE)
+                pairs = lobpcg(pencil, count, start, VECTOR_TOLERANCE)
             elif start is not None and start.shape[1] > 0:
                 pairs = modes_from(pencil, count, start)
         if pairs is None:
@@ -215,7 +212,7 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
 def _from_cold(pencil: Pencil, count: int) -> Pairs:
     """Return up to `count` pairs by SLEPc, see `lowest_eigenpairs`."""
     with closing(_Search(pencil, pencil.mass)) as search:
-        found = search.largest(count, _ramp(pencil), EIGEN_TOLERANCE)
+        found = search.largest(count, _ramp(pencil), EXACT_TOLERANCE)
         if len(found[0]) == count:  # nothing tells from cold how many modes have one frequency
             found = search.without_gaps(*found)
     inverse, vectors = found
@@ -321,7 +318,7 @@ def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
         if m >= count:
             theta, y = np.linalg.eigh(T[:m, :m], UPLO="U")
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
-            if (length * np.abs(y[-1]) <= EIGEN_TOLERANCE * theta).all():
+            if (length * np.abs(y[-1]) <= EXACT_TOLERANCE * theta).all():
                 pairs = 1.0 / theta, (y.T @ Q[:m]).T
                 close = np.diff(pairs[0]) <= EIGENVALUE_GAP * pairs[0][1:]
                 return None if close.any() or _passes_over(pencil, pairs, start) else pairs
@@ -383,7 +380,7 @@ def lobpcg(pencil: Pencil, count: int, start: np.ndarray | None, tolerance: floa
     noise = _noise(pencil, m - known.shape[1])
     S = _products(pencil, np.hstack([known, pencil.precondition(pencil.precondition(noise))]))
     P = [np.empty((pencil.rows, 0))] * 3
-    for _ in range(LOBPCG_ITERATIONS):
+    for _ in range(ITERATIONS_LIMIT):
         C, values = _ritz(pencil, S)
         C, values = C[:, :m], values[:m]
         # The next directions: what the new vectors have of the last residuals and directions.
@@ -415,7 +412,7 @@ def _ritz(pencil: Pencil, space: list[np.ndarray]) -> tuple[np.ndarray, np.ndarr
 
     def solved() -> tuple[np.ndarray, np.ndarray]:
         lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
-        kept = lengths > LOBPCG_INDEPENDENT_SHARE * lengths[-1]
+        kept = lengths > ROUNDING_SHARE * lengths[-1]
         T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
         values, vectors = np.linalg.eigh(T.T @ K @ T)
         return T @ vectors, values
@@ -527,7 +524,7 @@ class _Search:
         for first in _noise(self.pencil, len(values)).T:
             if self.stiffness.getSize()[0] == len(values):
                 break  # all there are
-            more, vector = self.largest(1, first, EIGEN_TOLERANCE, vectors)
+            more, vector = self.largest(1, first, EXACT_TOLERANCE, vectors)
             if len(more) == 0:
                 raise ConvergenceError(
                     f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "

@@ -29,11 +29,10 @@ from dolfinopt.reduction.basis import (
 )
 from dolfinopt.reduction.eigenproblem import Pencil, complement_solve, lowest_eigenpairs
 from dolfinopt.reduction.measured import (
+    DEFLATION_SHARE,
+    EXACT_TOLERANCE,
     KRYLOV_BLOCKS_LIMIT,
-    RESPONSE_DEFLATION_SHARE,
-    RESPONSE_RANK_SHARE,
-    RESPONSE_TOLERANCE,
-    SHIFT_TOLERANCE,
+    ROUNDING_SHARE,
 )
 
 # -- by modes: Craig-Bampton (constraint and fixed-interface modes), modes of a free arm ----------
@@ -207,7 +206,7 @@ def krylov_adjoint(
         cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
         interior[:, old] -= cotangents[0] @ H[old].T
         outboard[:, old] -= cotangents[1] @ H[old].T
-        mu = solve_at(arm, block.omega, cotangents, SHIFT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
+        mu = solve_at(arm, block.omega, cotangents, EXACT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired
@@ -271,7 +270,7 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 now, columns = np.split(columns, [options.coordinates - V.shape[2]])
                 right = group(arm) if group else arm.restrict(MV)
                 right = right[0][:, now], right[1][:, now]
-                raw = solve_at(arm, omega, right, SHIFT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
+                raw = solve_at(arm, omega, right, EXACT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
                 new = orthonormalise(arm, raw, V, MV)
                 blocks.append(_Block(omega, group, now, new))
                 V, MV = np.concatenate([V, new.Q], axis=2), np.concatenate([MV, new.MQ], axis=2)
@@ -310,14 +309,14 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     """
     arm.profile.counts.reductions += 1
     first = arm.static_response(*_inputs(arm))
-    space = InverseSpace(arm, first, RESPONSE_DEFLATION_SHARE)
+    space = InverseSpace(arm, first, ROUNDING_SHARE)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
     for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()
         reduced = _Reduced.of(space, options.damping)
         omega, weights = quadrature(low, high, reduced.theta, options.damping)
         responses = reduced.responses(omega)
-        if reduced.residual(omega, responses) <= RESPONSE_TOLERANCE:
+        if reduced.residual(omega, responses) <= DEFLATION_SHARE:
             break
     else:
         raise ConvergenceError(
@@ -331,7 +330,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     upper = np.linalg.cholesky(arm.energy_matrix(V)).T
     _, triangle = np.linalg.qr((upper @ reduced.vectors @ factor).T)
     U, sigma, _ = on_root(arm.comm, partial(np.linalg.svd, triangle.T, full_matrices=False))
-    found = int((sigma > RESPONSE_RANK_SHARE * sigma[0]).sum())
+    found = int((sigma > DEFLATION_SHARE * sigma[0]).sum())
     if found < options.coordinates:
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: responses between {options.band[0]:g} and "

@@ -169,7 +169,7 @@ def test_gradient_of_modes_without_a_factor(monkeypatch, method, count):
     assert np.abs(gradients[1] - gradients[0]).max() < 2e-6 * np.abs(gradients[0]).max()
     assert 0 < sum(cycles) < 120 * count
     if method == "craig-bampton":  # a search that begins with the answer is done at once
-        monkeypatch.setattr(eigenproblem, "LOBPCG_ITERATIONS", 1)
+        monkeypatch.setattr(eigenproblem, "ITERATIONS_LIMIT", 1)
         assert eigenproblem.lobpcg(eigenproblem.Pencil(arm.elastic), 3, arm.initial.basis, 1e-6)
 
 
