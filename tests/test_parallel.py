@@ -30,7 +30,8 @@ class FakeWorld:
     """One of `size` ranks; `Split` notes what was asked for."""
 
     def __init__(self, size, rank):
-        self.size, self.rank = size, rank
+        self.size, self.rank, self.attributes = size, rank, {}
+        self.Get_attr, self.Set_attr = self.attributes.get, self.attributes.__setitem__
 
     def Split(self, color, key):
         return SimpleNamespace(color=color, key=key)
