@@ -218,7 +218,7 @@ PLACES = [
     (building, LONE, mesh, "snap"),
     (building, LONE, mesh, "build_model", "arms.1.mesh=meshes/arm.geo"),
     (building, LONE, mesh, "_arm_mesh", "arms.1.mesh=meshes/arm.geo"),
-    (building, LONE, tensors, "compile_kernels"),
+    (building, LONE, tensors, "compile_together"),
     (building, LONE, arm, "Substructure"),
     (evaluating, LONE, design_state, "interpolate"),
     (evaluating, LONE, design_state, "shape_integrals"),
@@ -310,7 +310,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(mesh, "snap"), (tensors, "compile_kernels"), (elasticity, "NodePairs"),
+    [(mesh, "snap"), (tensors, "compile_together"), (elasticity, "NodePairs"),
      (design_state, "interpolate")],
 )  # fmt: skip
 def test_a_shared_arm(owner, name, monkeypatch):

@@ -100,25 +100,31 @@ def compile_kernels(forms: Sequence[ufl.Form | Expression]) -> list[Kernel]:
     One process compiles at a time, others wait for it and then find the forms.
     """
     with _locked(form_folder()) as folder:
-        missing = [form for form in forms if not is_compiled(form)]
+        with quiet_compilers():
+            folders = [_folder(form) for form in forms]
+        missing = [at for at in folders if not _is_complete(at)]
         if missing:
             log.info("compiling %d forms, once", len(missing))
-        for at in map(_folder, missing):
+        for at in missing:
             if at.exists():
                 log.info("%s: a compilation was interrupted there and is repeated", folder)
                 shutil.rmtree(at)
         with quiet_compilers():
-            return [Kernel(form, _compiled(form, _folder(form))) for form in forms]
+            pairs = zip(forms, folders, strict=True)
+            return [Kernel(form, _compiled(form, at)) for form, at in pairs]
 
 
 def is_compiled(form: ufl.Form | Expression) -> bool:
     """Return whether a form is compiled, now or by an earlier run."""
-    return any(_folder(form).glob("*.cached"))
+    return _is_complete(_folder(form))
+
+
+def _is_complete(folder: Path) -> bool:
+    return any(folder.glob("*.cached"))
 
 
 def _folder(form: ufl.Form | Expression) -> Path:
-    signature = ffcx.naming.compute_signature([form], "")
-    return form_folder() / f"dolfinopt_{signature}"
+    return form_folder() / f"dolfinopt_{ffcx.naming.compute_signature([form], '')}"
 
 
 def _compiled(form: ufl.Form | Expression, folder: Path) -> tuple[Any, Any, Any]:

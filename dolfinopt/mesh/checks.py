@@ -343,8 +343,8 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
 def cell_sizes(corners: np.ndarray) -> np.ndarray:
     """Return areas or volumes (n,) of cells with corners (n, c, d) in DOLFINx's order."""
     kind = KINDS[corners.shape[2], corners.shape[1]]
-    # Exact: the Jacobian is of second degree in each direction.
-    points, weights = basix.make_quadrature(kind, 2)
+    # Exact: the Jacobian of tensor products is of second degree in each direction.
+    points, weights = basix.make_quadrature(kind, 2 * (corners.shape[1] > corners.shape[2] + 1))
     functions = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)
     J = np.einsum("eni,kpn->epik", corners, functions[1:, :, :, 0])
     return np.asarray(np.abs(np.linalg.det(J)) @ weights)

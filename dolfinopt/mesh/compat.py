@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -59,11 +60,13 @@ def check_form_cache() -> None:
 
 @contextmanager
 def quiet_compilers() -> Iterator[None]:
-    """Keep the C compiler's command lines, which setuptools logs, from standard error."""
+    """Keep what compilers say from standard error: command lines, UFL's doubts about arrays."""
     before = logging.root.manager.disable
     logging.disable(logging.INFO)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Applying str", UserWarning)
+            yield
     finally:
         logging.disable(before)
 
