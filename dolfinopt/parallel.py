@@ -39,7 +39,8 @@ GRACE = 2.0  # s
 CLOSED = (errno.EPIPE, errno.ENOSPC)
 
 
-# Arms of fewer cells are faster on one rank than on two (see `partition_arms`).
+# Solid arms of fewer cells are faster on one rank than on two, and plane ones of 153 600 still (see
+# `partition_arms`).
 SPLIT_CELLS = 40_000
 
 
@@ -74,7 +75,8 @@ def partition_arms(world: MPI.Comm, cells: Mapping[int, int], *, whole: bool = F
     Args:
         world: all ranks.
         cells: number of cells of every such arm, by its index in the scene.
-        whole: share no arm between ranks, however large.
+        whole: share no arm between ranks, however large, as plane arms: on two ranks MUMPS takes
+            longer than one rank's band.
     """
     arms = sorted(cells)
     count, ranks = len(arms), range(world.size)
