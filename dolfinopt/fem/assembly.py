@@ -86,12 +86,12 @@ class CellMatrix:
         """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""
         pairs, b, pattern = self._pairs, self.block, self.pattern
         by_place = sp.csr_matrix(
-            (scale[pairs.cell], self._places, pairs.starts),
+            (scale.take(pairs.cell, mode="clip"), self._places, pairs.starts),
             shape=(len(pairs.starts) - 1, len(self._blocks)),
         )
         sums = (by_place @ self._blocks).reshape(-1, b, b)
         # Few entries are on the diagonal: their transposes are the same.
-        values = np.concatenate([sums, sums.swapaxes(1, 2)]).take(pairs.source, axis=0)
+        values = np.concatenate([sums, sums.swapaxes(1, 2)]).take(pairs.source, axis=0, mode="clip")
         if b == 1:
             return sp.csr_matrix((values.ravel(), pattern.indices, pattern.indptr), pattern.shape)
         size = b * pattern.shape[0]

@@ -17,7 +17,7 @@ from dolfinopt.bench.run import Goal, goal_table
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.scene import INERTIA
-from dolfinopt.fem.interior import ITERATIVE
+from dolfinopt.bench.solid import ITERATIVE
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import rigid_spatial_body
