@@ -522,7 +522,8 @@ class Model:
     def _arms(self) -> tuple[Partition, dict[int, Arm]]:
         """Return which ranks do which arm, and this rank's, meshed at first use (collective)."""
         if self._built is None:
-            partition = partition_arms(self._world, self.scene.cell_counts)
+            plane = self.scene.dimension == 2
+            partition = partition_arms(self._world, self.scene.cell_counts, whole=plane)
             arms = build_arms(self.scene, partition, self._profile)
             whole = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
             self._order = {k: canonical_order(points) for k, points in whole.items()}

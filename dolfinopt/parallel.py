@@ -39,7 +39,8 @@ GRACE = 2.0  # s
 CLOSED = (errno.EPIPE, errno.ENOSPC)
 
 
-# Arms of fewer cells are faster on one rank than on two (see `partition_arms`).
+# Solid arms of fewer cells are faster on one rank than on two, and plane ones of 153 600 still (see
+# `partition_arms`).
 SPLIT_CELLS = 40_000
 
 
@@ -74,19 +75,39 @@ def partition_arms(world: MPI.Comm, cells: Mapping[int, int], *, whole: bool = F
     Args:
         world: all ranks.
         cells: number of cells of every such arm, by its index in the scene.
-        whole: share no arm between ranks, however large.
+        whole: share no arm between ranks, however large, as plane arms: on two ranks MUMPS takes
+            longer than one rank's band.
     """
     arms = sorted(cells)
-    if world.size <= len(arms):
-        mine = tuple(arms[world.rank :: world.size])
-        color = world.rank
-    elif max(cells.values(), default=0) >= SPLIT_CELLS and not whole:
-        color = world.rank * len(arms) // world.size
-        mine = (arms[color],)
-    else:
-        color = world.rank
-        mine = (arms[world.rank],) if world.rank < len(arms) else ()
-    return Partition(world=world, comm=world.Split(color, world.rank), arms=mine)
+    count, ranks = len(arms), range(world.size)
+    colors = tuple(ranks)
+    mine = arms[world.rank :: world.size]
+    if world.size > count and not whole and max(cells.values(), default=0) >= SPLIT_CELLS:
+        colors = tuple(rank * count // world.size for rank in ranks)
+        mine = [arms[colors[world.rank]]]
+    return Partition(world=world, comm=_split(world, colors), arms=tuple(mine))
+
+
+def _split(world: MPI.Comm, colors: tuple[int, ...]) -> MPI.Comm:
+    """Return the communicator of this rank's color; the same one each time (collective)."""
+    # There are only some tens of thousands of communicators, and nobody knows who still has one.
+    known = world.Get_attr(_SPLITS)
+    if known is None:
+        known = {}
+        world.Set_attr(_SPLITS, known)
+    if colors not in known:
+        known[colors] = world.Split(colors[world.rank], world.rank)
+    comm: MPI.Comm = known[colors]
+    return comm
+
+
+def _free_all(world: MPI.Comm, key: int, known: dict[tuple[int, ...], MPI.Comm]) -> None:
+    """Free what was split off a communicator that is freed itself."""
+    for comm in known.values():
+        comm.Free()
+
+
+_SPLITS = MPI.Comm.Create_keyval(delete_fn=_free_all)
 
 
 def sum_over_arms(partition: Partition, mine: Mapping[int, np.ndarray]) -> np.ndarray:

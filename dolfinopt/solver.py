@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -13,9 +12,6 @@ from scipy.linalg import blas, lapack
 
 from dolfinopt.errors import InputError
 
-# From so many rows on nested dissection beats the narrow band in PETSc's Cholesky on one rank; and
-# from there on both beat MUMPS and CHOLMOD up to 120 000 rows.
-NESTED_ROWS = 30_000
 # LAPACK factorises wider bands block by block, which is faster in the lower triangle; narrower ones
 # entry by entry, faster in the upper triangle. Solutions with the upper one take 60 to 80 %.
 UNBLOCKED = 64
@@ -27,20 +23,6 @@ BLOCKED_RIGHT_SIDES, BLOCKED_BANDWIDTH, BLOCK_COLUMNS = 5, 300, 64
 ROUNDING = 1e-14  # relative residual beyond which conjugate gradients find nothing more
 
 
-class Factor(Protocol):
-    """A factorised matrix.
-
-    Attributes:
-        failed: the last solution is none, as the matrix is singular but for rounding.
-    """
-
-    @property
-    def failed(self) -> bool: ...
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return the solution (n,) or (n, k) of the owned rows, for right sides of that shape."""
-
-
 class BandCholesky:
     """Cholesky factor of one symmetric positive definite band matrix after another, by LAPACK.
 
@@ -50,10 +32,7 @@ class BandCholesky:
     Attributes:
         taken: (m,) places in `rows` and `columns` of the entries that it reads: one triangle.
         bandwidth: of either triangle.
-        failed: always False; what LAPACK refuses is not factorised.
     """
-
-    failed = False
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int):
         """Lay down the band.
@@ -83,7 +62,7 @@ class BandCholesky:
         return lapack.dpbtrf(self._band.T, lower=self._lower, overwrite_ab=1)[1] == 0
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """See `Factor`."""
+        """Return the solution (n,) or (n, k) for right sides of that shape."""
         if right.size == 0:
             return right.copy()
         if (
@@ -137,6 +116,7 @@ class PetscFactor:
 
     Attributes:
         ksp: the solver, set up.
+        failed: the last solution is none, as the matrix is singular but for rounding.
     """
 
     def __init__(self, ksp: PETSc.KSP):
@@ -145,12 +125,12 @@ class PetscFactor:
         self.failed = False
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """See `Factor`; collective."""
-        if right.ndim == 2 and right.shape[1] > 1 and self._takes_blocks:
+        """Return the solution (n, k) of the owned rows for such right sides (collective)."""
+        if right.shape[1] > 1 and self._takes_blocks:
             return self._solved_together(right)
         out = np.empty_like(right)
         self.failed = False
-        for source, target in zip(np.atleast_2d(right.T), np.atleast_2d(out.T), strict=True):
+        for source, target in zip(right.T, out.T, strict=True):
             self._b.array = source
             self.ksp.solve(self._b, self._x)
             target[:] = self._x.array_r
@@ -189,32 +169,28 @@ def obeying_options(prefix: str) -> Iterator[None]:
     try:
         yield
     except PETSc.Error as error:
-        given = PETSc.Options(prefix).getAll()
-        if not given:
+        options = user_options(prefix)
+        if not options:
             raise
-        options = " ".join(f"-{prefix}{key} {value}".strip() for key, value in given.items())
         raise InputError(
             f"PETSc options {options}: PETSc refuses them or fails with them (error {error.ierr})"
         ) from None
 
 
-def has_options(prefix: str) -> bool:
-    """Return whether the user gave PETSc options of this prefix."""
-    return bool(PETSc.Options(prefix).getAll())
+def user_options(prefix: str = "dolfinopt_") -> str:
+    """Return the user's PETSc and SLEPc options of this prefix as they are written."""
+    given = PETSc.Options(prefix).getAll().items()
+    return " ".join(f"-{prefix}{key} {value}".strip() for key, value in sorted(given))
 
 
-def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str, own: bool = True) -> PETSc.KSP:
-    """Return a Cholesky solver: PETSc's own on one rank, MUMPS across ranks.
-
-    PETSc options that begin with the prefix replace these choices.
+def direct_solver(mat: PETSc.Mat, prefix: str, own: bool = False) -> PETSc.KSP:
+    """Return a Cholesky solver by MUMPS, or the PETSc solver of the user's options.
 
     Args:
         mat: symmetric positive definite, marked so.
-        ordering: PETSc's name of the elimination order of a small matrix on one rank; large ones
-            take nested dissection, MUMPS chooses its own.
-        prefix: of the options, e.g. "dolfinopt_stiffness_".
-        own: False for MUMPS on one rank, too, as for large matrices, and for solids, whose factors
-            are dense: PETSc's own takes 60 times as long at 50 000 rows.
+        prefix: of PETSc options that replace these choices, e.g. "dolfinopt_stiffness_".
+        own: take PETSc's own factorisation with nested dissection on one rank, whose solutions take
+            a tenth of MUMPS' time where the factor is sparse, as that of a plane filter is.
 
     Raises:
         InputError: PETSc refuses the user's options.
@@ -227,7 +203,7 @@ def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str, own: bool = True) 
     pc.setType(PETSc.PC.Type.CHOLESKY)
     if mat.comm.size == 1 and own:
         pc.setFactorSolverType("petsc")
-        pc.setFactorOrdering(ordering if mat.getSize()[0] < NESTED_ROWS else "nd")
+        pc.setFactorOrdering("nd")
     else:
         pc.setFactorSolverType("mumps")
     with obeying_options(prefix):
@@ -238,8 +214,7 @@ def direct_solver(mat: PETSc.Mat, ordering: str, prefix: str, own: bool = True) 
 def conjugate_gradients(mat: PETSc.Mat, prefix: str) -> PETSc.KSP:
     """Return conjugate gradients to rounding with the diagonal as preconditioner.
 
-    For well-conditioned matrices; the same on any number of ranks. PETSc's error if they do not
-    converge.
+    For well-conditioned matrices; the same on any number of ranks.
 
     Args:
         mat: symmetric positive definite, marked so.
@@ -251,7 +226,6 @@ def conjugate_gradients(mat: PETSc.Mat, prefix: str) -> PETSc.KSP:
     ksp.setType(PETSc.KSP.Type.CG)
     ksp.getPC().setType(PETSc.PC.Type.JACOBI)
     ksp.setTolerances(rtol=ROUNDING, atol=0.0, max_it=10_000)
-    ksp.setErrorIfNotConverged(True)
     with obeying_options(prefix):
         ksp.setFromOptions()
     return ksp

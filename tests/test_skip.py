@@ -128,7 +128,8 @@ ONE_LOAD, TIP = "objective.loads=[[0,1,0,0,0,0]]", "constraints.tip_deflection=1
 )
 def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most) -> None:
     """In space a solve a load, where nothing else is asked for, not one a constraint mode."""
-    monkeypatch.setattr(interior, "WIDEST", width)
+    for bound in ("WIDEST", "WIDEST_OF_STATICS"):
+        monkeypatch.setattr(interior, bound, width)
     line = ["optimize", str(SPATIAL), "--no-plots", "--out", str(tmp_path / "out")]
     kept = ("arms.link1.cells=[6,2,2]", "arms.link2.cells=[6,2,2]", "arms.passive=0.08",
             "simulation.sample=0.05", "simulation.tolerance=1e-2", "objective.load_cases=3",

@@ -311,7 +311,7 @@ def test_a_batch_does_not_converge_anywhere_when_it_does_not_on_one_rank(monkeyp
 @ON_RANKS
 @pytest.mark.parametrize(
     ("owner", "name"),
-    [(mesh, "snap"), (tensors, "compile_together"), (elasticity, "AffineMatrix"),
+    [(mesh, "snap"), (tensors, "compile_together"), (elasticity, "NodePairs"),
      (design_state, "interpolate")],
 )  # fmt: skip
 def test_a_shared_arm(owner, name, monkeypatch):

@@ -26,7 +26,6 @@ from dolfinopt.density.filter import (
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.interior import Guesses
 from dolfinopt.fem.laws import isotropic
 from dolfinopt.fem.tensors import ElementTensors, element_of
 from dolfinopt.mesh import compat
@@ -50,6 +49,9 @@ THRESHOLD_BOUNDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle ha
 # largest, once in mass and inertia. In geometric stiffness, itself a correction, it is forty times.
 FIELD_ERROR_SHARE, FIELD_ERROR_RATIO = 1e-3, 5.0
 FIELD_TOLERANCES = 1e-10, 1e-6  # bounds
+
+# Tables of a scene that do not change its motion: what was decided about stiffening stays.
+WITHOUT_MOTION = {"name", "reduction", "objective", "constraints", "design", "optimizer", "part"}
 
 # How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
 CLIPPED_DENSITY_LIMIT = 1e-10
@@ -362,9 +364,8 @@ class Arm:
         other.scene, other.initial = scene, InitialVectors()
         if self.scene.reduction != scene.reduction:
             other.coordinates = scene.reduction.count or None
-        loads = ("motion", "payload", "forces", "closures")
-        same = all(getattr(self.scene, key) == getattr(scene, key) for key in loads)
-        if not same or self.scene.simulation.stiffening != scene.simulation.stiffening:
+        decides = type(scene).model_fields.keys() - WITHOUT_MOTION
+        if any(getattr(self.scene, key) != getattr(scene, key) for key in decides):
             other.stiffening = None
         if same_basis(self.scene, scene) and self.basis is not None:
             other.initial.basis = self.initial.basis
@@ -382,7 +383,6 @@ class Arm:
         other = copy(self)
         other.coordinates = self.scene.reduction.count or None
         other.stiffening, other.initial, other._state = None, InitialVectors(), None
-        other.guesses = None
         return other
 
     # -- initial vectors of searches for modes -----------------------------------------------
@@ -402,16 +402,6 @@ class Arm:
         for place, one in zip(self.places, vectors[1:], strict=True):
             if one.shape[1]:
                 self.initial.loaded[place] = one
-
-    @property
-    def guesses(self) -> Guesses | None:
-        """What the next design's iterative solves set out from; None where there is nothing."""
-        return self.substructure.guesses
-
-    @guesses.setter
-    def guesses(self, guesses: Guesses | None) -> None:
-        if (self.substructure.extended or self.substructure.interior).is_iterative:
-            self.substructure.set_guesses(guesses)
 
     def forget_modes(self) -> None:
         """Let the next searches for modes set out from nothing."""

@@ -6,7 +6,7 @@ x_phys.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -160,6 +160,7 @@ class InitialVectors:
     loaded: dict[int, np.ndarray] = field(default_factory=dict)
 
 
+@dataclass(eq=False)
 class DesignState:
     """What belongs to one x_phys of one arm in one scene; immutable.
 
@@ -174,31 +175,26 @@ class DesignState:
         kind: what x_phys is.
         scene: says how to reduce, and the damping.
         num_modes: q of the basis; None where the scene says "auto" and nobody has chosen.
+        initial: from which searches for modes set out.
         stiffened: whether its body has geometric stiffness.
         kept: cache filled by responses, keyed by name.
     """
 
-    def __init__(
-        self,
-        x_phys: np.ndarray,
-        material: Interpolated,
-        elastic: ElasticArm,
-        solid: Material,
-        kind: Kind,
-        scene: scenes.Scene,
-        num_modes: int | None,
-        initial: InitialVectors,
-        stiffened: bool = False,
-    ):
-        self.x_phys = x_phys.copy()
+    x_phys: np.ndarray
+    material: Interpolated
+    elastic: ElasticArm
+    solid: Material
+    kind: Kind
+    scene: scenes.Scene
+    num_modes: int | None
+    initial: InitialVectors
+    stiffened: bool = False
+    kept: dict[str, Any] = field(default_factory=dict, init=False)
+    _loaded: dict[int, tuple[Carried, LoadedModes]] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        self.x_phys = self.x_phys.copy()
         self.x_phys.setflags(write=False)
-        self.material, self.elastic, self.solid, self.kind = material, elastic, solid, kind
-        self.scene, self.num_modes, self.stiffened = scene, num_modes, stiffened
-        self.kept: dict[str, Any] = {}
-        self._initial = initial
-        self._basis: Basis | None = None
-        self._body: ShapeIntegrals | None = None
-        self._loaded: dict[int, tuple[Carried, LoadedModes]] = {}
 
     @property
     def mesh(self) -> ArmMesh:
@@ -237,28 +233,25 @@ class DesignState:
     @property
     def is_reduced(self) -> bool:
         """True once the basis has been asked for."""
-        return self._basis is not None
+        return "basis" in self.__dict__
 
-    @property
+    @cached_property
     def basis(self) -> Basis:
         """The reduced basis by the scene's method."""
-        if self._basis is None:
-            with self.elastic.profile.phase("reduction"):
-                reduce = METHODS[self.scene.reduction.method].reduce
-                self._basis = reduce(self.elastic, self.reduction_options, self._initial.basis)
-            self._initial.basis = self._basis.start
-        return self._basis
+        with self.elastic.profile.phase("reduction"):
+            reduce = METHODS[self.scene.reduction.method].reduce
+            basis = reduce(self.elastic, self.reduction_options, self.initial.basis)
+        self.initial.basis = basis.start
+        return basis
 
-    @property
+    @cached_property
     def body(self) -> ShapeIntegrals:
         """The floating body."""
-        if self._body is None:
-            basis = self.basis
-            with self.elastic.profile.phase("inertia integrals"):
-                damping = self.scene.damping.stiffness_proportional
-                loads = self.stiffening_loads if self.stiffened else None
-                self._body = shape_integrals(self.elastic, basis, damping, loads)
-        return self._body
+        basis = self.basis
+        with self.elastic.profile.phase("inertia integrals"):
+            damping = self.scene.damping.stiffness_proportional
+            loads = self.stiffening_loads if self.stiffened else None
+            return shape_integrals(self.elastic, basis, damping, loads)
 
     @cached_property
     def unit_loads(self) -> UnitLoads:
@@ -303,11 +296,11 @@ class DesignState:
         """
         known = self._loaded.get(place)
         if known is None or known[0] != carried:
-            count, guess = self.scene.objective.modes, self._initial.loaded.get(place)
+            count, guess = self.scene.objective.modes, self.initial.loaded.get(place)
             with self.elastic.profile.phase("vibration"):
                 known = carried, loaded_modes(self.elastic, carried, count, guess)
             self._loaded[place] = known
-            self._initial.loaded[place] = known[1].start
+            self.initial.loaded[place] = known[1].start
         return known[1]
 
     def under(
@@ -318,23 +311,16 @@ class DesignState:
         stiffened: bool = False,
     ) -> DesignState:
         """Return the same design in another scene of the same arm, with what stays the same."""
-        other = DesignState(
-            self.x_phys,
-            self.material,
-            self.elastic,
-            self.solid,
-            self.kind,
-            scene,
-            num_modes,
-            initial,
-            stiffened,
+        other = replace(
+            self, scene=scene, num_modes=num_modes, initial=initial, stiffened=stiffened
         )
         if self.scene.objective == scene.objective:
             other._loaded = dict(self._loaded)
         if self.num_modes == num_modes and same_basis(self.scene, scene):
-            other._basis = self._basis
-            if self.scene.damping == scene.damping and self.stiffened == stiffened:
-                other._body = self._body
+            same = self.scene.damping == scene.damping and self.stiffened == stiffened
+            for name in ("basis", "body") if same else ("basis",):
+                if name in self.__dict__:
+                    other.__dict__[name] = self.__dict__[name]
         return other
 
 

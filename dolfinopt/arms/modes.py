@@ -30,8 +30,7 @@ from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.rotations import ONE, skew
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_spatial_body
 from dolfinopt.multibody.tree import Mechanism
-from dolfinopt.reduction.basis import FreeArm, FreeOperators
-from dolfinopt.reduction.eigenproblem import largest_eigenpairs, lowest_eigenpairs
+from dolfinopt.reduction.eigenproblem import Pencil, largest_eigenpairs, lowest_eigenpairs
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
@@ -181,9 +180,9 @@ def full_first_frequency(arm: ElasticArm, V: np.ndarray, K_r: np.ndarray, M_r: n
     """
     count = min(len(K_r), RITZ_VECTORS)
     values, vectors = _agreed(arm, *eigh(K_r, M_r, subset_by_index=[0, count - 1]))
-    free, loads = FreeArm(arm), arm.mass_times(V @ vectors)
+    loads = arm.mass_times(V @ vectors)
     for _ in range(SUBSPACE_ITERATIONS):
-        Z = free.solve(arm.restrict(loads))
+        Z = arm.static_response(*arm.restrict(loads))
         MZ = arm.mass_times(Z)
         flat = Z.reshape(-1, count).T
         products = flat @ np.stack([loads, MZ]).reshape(2, -1, count)
@@ -243,14 +242,14 @@ def loaded_modes(
         count: number of modes.
         start: `LoadedModes.start` of a nearby design, or None.
     """
-    operator = FreeOperators(arm, carried.matrix())
+    pencil = Pencil(arm, is_free=True, carried=carried.matrix())
     count = min(count, arm.num_dofs)
-    values, vectors = lowest_eigenpairs(operator.pencil, count, start)
+    values, vectors = lowest_eigenpairs(pencil, count, start)
     followed = 0
     if start is not None and start.shape[1] > 0:
-        overlap = arm.comm.allreduce(vectors.T @ operator.mass_times(start[:, 0]))
+        overlap = pencil.total(vectors.T @ pencil.mass(start[:, :1]))[:, 0]
         followed = int(np.argmax(overlap**2))
-    interior, outboard = operator.split(vectors)
+    interior, outboard = pencil.split(vectors)
     order = [followed, *(k for k in range(count) if k != followed)]
     field = arm.expand(interior, outboard)
     return LoadedModes(values, field, outboard, vectors[:, order], followed)
@@ -453,24 +452,22 @@ def buckling_modes(stress: Prestress, count: int, least: float = 0.0) -> Bucklin
     Raises:
         ConvergenceError: they do not converge.
     """
-    arm, free = stress.arm, FreeOperators(stress.arm)
+    arm, pencil = stress.arm, Pencil(stress.arm, is_free=True)
     K0, D = stress.matrix(), stress.rotation[:, 0]
     dim = arm.mesh.dim
 
     def softened(rows: np.ndarray) -> np.ndarray:
-        """Return -T'K0T times a vector."""
-        interior, outboard = free.split(rows)
-        field = arm.expand(interior[:, None], outboard[:, None])[:, :, 0]
-        inner, lower = arm.restrict((K0 @ field)[:, :, None])
-        turned = np.zeros((len(D), len(outboard) // len(D)))
-        turned[:, dim:] = (D @ outboard.reshape(turned.shape)[:, dim:, None])[:, :, 0]
-        return -free.joined(inner[:, 0], lower[:, 0] + turned.ravel())
+        """Return -T'K0T times columns."""
+        field, outboard = pencil.field(rows), pencil.split(rows)[1]
+        flat = field.reshape(len(field), -1)  # K0 is the same in all directions
+        inner, lower = arm.restrict((K0 @ flat).reshape(field.shape))
+        turned = np.zeros((len(D), len(outboard) // len(D), outboard.shape[1]))
+        turned[:, dim:] = D @ outboard.reshape(turned.shape)[:, dim:]
+        return -pencil.joined(inner, lower + turned.reshape(outboard.shape))
 
-    inverse, rows = largest_eigenpairs(free.pencil, softened, count, ROUGHLY)
+    inverse, rows = largest_eigenpairs(pencil, softened, count, ROUGHLY)
     counts = int(np.count_nonzero(inverse > max(COUNTS * inverse[0], least)))
     if counts:
         near = rows[:, :counts]
-        inverse, rows = largest_eigenpairs(free.pencil, softened, counts, TOLERANCE, near)
-    parts = [free.split(one) for one in rows.T]
-    interior, outboard = (np.stack(each, axis=1) for each in zip(*parts, strict=True))
-    return BucklingModes(inverse, arm.expand(interior, outboard))
+        inverse, rows = largest_eigenpairs(pencil, softened, counts, TOLERANCE, near)
+    return BucklingModes(inverse, pencil.field(rows))

@@ -21,7 +21,7 @@ from dolfinopt.arms.arm import uniform_design
 from dolfinopt.bench.measure import Cells, Plan, arms_of, in_processes, mpirun, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
 from dolfinopt.data import template_folder
-from dolfinopt.fem.multigrid import with_rigid_motions
+from dolfinopt.fem.interior import with_rigid_motions
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.output.run_folder import optimize

@@ -16,7 +16,7 @@ from dolfinopt.arms.arm import Arm, field_tolerance
 from dolfinopt.bench.iterations import PlainStatics, pymoto_iteration
 from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Rows, Steps
-from dolfinopt.fem import interior
+from dolfinopt.fem.multigrid import NAME as ITERATIVE
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.mesh.budget import free_memory, solid_bytes
 from dolfinopt.profiling import Profile
@@ -30,7 +30,6 @@ CELLS = (90, 9, 6), (120, 12, 8), (180, 18, 12), (260, 26, 17), (310, 31, 20), (
 QUICK = (40, 4, 3), (60, 6, 4)
 OURS = COLD, WARM = "dolfinopt, first design", "dolfinopt, nearby design"
 PLAIN = "plain DOLFINx, one load"
-ITERATIVE = interior.ITERATIVE
 STATIC, PYMOTO = "dolfinopt, one load", "pyMOTO, one load"
 DESIGNS = FIRST, NEARBY = "first design", "nearby design"
 STATIC_CELLS = (64, 8, 8), (112, 16, 12), (156, 20, 16)  # that three grids divide
@@ -75,7 +74,7 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
         arm.backward(esl_gradient(state, np.eye(6)))
 
     found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
-    return arm.substructure.T.num_dofs, arm.substructure.interior.solver_name, found
+    return arm.substructure.T.num_dofs, arm.substructure.interior.solver.name, found
 
 
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
@@ -99,7 +98,7 @@ def static_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
 
     found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
     system = arm.substructure.extended or arm.substructure.interior
-    return arm.substructure.T.num_dofs, system.solver_name, found
+    return arm.substructure.T.num_dofs, system.solver.name, found
 
 
 def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found | None:

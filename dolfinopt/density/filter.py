@@ -23,12 +23,12 @@ from dolfinopt.density.measured import (
     OUTSIDE_SHARE,
     SIMPLICES,
 )
-from dolfinopt.errors import InputError
+from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
 from dolfinopt.mesh.checks import facet_areas, facet_corners
 from dolfinopt.scene.load import Arm
-from dolfinopt.solver import conjugate_gradients, direct_solver
+from dolfinopt.solver import conjugate_gradients, direct_solver, obeying_options
 
 
 class HelmholtzFilter:
@@ -195,7 +195,7 @@ class _TwoPoint:
 
     def _solve(self, right: np.ndarray) -> np.ndarray:
         self._b.array = right
-        self._solver.solve(self._b, self._x)
+        _solve(self._solver, self._b, self._x)
         return self._x.array_r.copy()
 
 
@@ -269,7 +269,7 @@ class _Hybrid:
         """Return C A^-1 C' values."""
         self._y.array = values
         self._C.multTranspose(self._y, self._b)
-        self._solver.solve(self._b, self._u)
+        _solve(self._solver, self._b, self._u)
         self._C.mult(self._u, self._y)
         return self._y.array_r.copy()
 
@@ -307,12 +307,23 @@ def _solver(mesh: ArmMesh, matrix: PETSc.Mat) -> PETSc.KSP:
     """Return a direct solver; in space conjugate gradients for boxes and for large meshes."""
     prefix = "dolfinopt_filter_"
     if mesh.dim == 2:
-        return direct_solver(matrix, "rcm", prefix)
+        return direct_solver(matrix, prefix, own=True)
     # On boxes 20 to 50 steps; with values in the facets 100 to 1200, 60 for every cell in r.
     by_cell = matrix.getSize()[0] == mesh.mesh.topology.index_map(3).size_global
     if by_cell or matrix.getSize()[0] > FACTORISED_FACETS:
         return conjugate_gradients(matrix, prefix)
-    return direct_solver(matrix, "nd", prefix, own=False)
+    return direct_solver(matrix, prefix)
+
+
+def _solve(solver: PETSc.KSP, right: PETSc.Vec, solution: PETSc.Vec) -> None:
+    """Solve, or raise ConvergenceError; InputError with PETSc options of the user (collective)."""
+    with obeying_options(solver.getOptionsPrefix()):
+        solver.solve(right, solution)
+    if solver.getConvergedReason() < 0:
+        raise ConvergenceError(
+            "the filter's linear system is not solved: its conjugate gradients do not converge; "
+            "take a smaller design.filter_radius, or a mesh of less distorted cells"
+        )
 
 
 def _positive_definite(mat: PETSc.Mat) -> PETSc.Mat:

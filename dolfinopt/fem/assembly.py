@@ -22,44 +22,6 @@ from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.profiling import Profile
 
 
-class AffineMatrix:
-    """sum_e s_e A_e as a SciPy CSR matrix over local dofs, assembled by one sparse product.
-
-    `values = P @ s`: column e of P holds the entries of A_e at their places in the pattern. In the
-    plane this takes 0.6 of what `CellMatrix` does, in space too much memory.
-
-    Attributes:
-        pattern: (size, size) matrix of ones.
-        block: 1, the dofs to a row of the pattern.
-    """
-
-    block = 1
-
-    def __init__(self, dofs: np.ndarray, elements: np.ndarray, size: int):
-        """Set up the pattern from element dofs (n_cells, n), matrices (1 or n_cells, n, n)."""
-        count, width = dofs.shape
-        elements = np.broadcast_to(elements, (count, width, width))
-        rows = np.repeat(dofs, width, axis=1).ravel().astype(np.int64)
-        keys = rows * size + np.tile(dofs, (1, width)).ravel()
-        unique, place = np.unique(keys, return_inverse=True)
-        cell = np.repeat(np.arange(count), width * width)
-        self._assembly = sp.csr_matrix(
-            (elements.ravel(), (place, cell)), shape=(len(unique), count)
-        )
-        row_of = unique // size
-        indptr = np.searchsorted(row_of, np.arange(size + 1))
-        self.pattern = sp.csr_matrix(
-            (np.ones(len(unique)), (unique % size).astype(np.int32), indptr.astype(np.int32)),
-            shape=(size, size),
-        )
-
-    def assemble(self, scale: np.ndarray) -> sp.csr_matrix:
-        """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""
-        pattern = self.pattern
-        values = self._assembly @ scale
-        return sp.csr_matrix((values, pattern.indices, pattern.indptr), pattern.shape)
-
-
 class NodePairs:
     """Which nodes share a cell, and by which pairs of its corners: the pattern of like cells.
 
@@ -69,8 +31,8 @@ class NodePairs:
         pattern: (n_nodes, n_nodes) matrix of ones.
         starts, cell, place: of the pairs' sums: where each begins, and the cells and the places in
             a cell's matrix of all that adds to them.
-        source: (nnz,) the pair whose sum each entry of the pattern has, or its transpose.
-        flipped: entries that have the transpose.
+        source: (nnz,) the pair whose sum each entry of the pattern has; of its transpose the number
+            of pairs is added.
     """
 
     def __init__(self, cells: np.ndarray, num_nodes: int):
@@ -82,15 +44,15 @@ class NodePairs:
         order = np.argsort(keys, kind="stable")
         keys, upper = keys[order], upper[order]
         begin = np.flatnonzero(np.diff(keys, prepend=-1))
-        self.starts = np.append(begin, len(keys))
+        self.starts = np.append(begin, len(keys)).astype(np.int32)
         self.cell = (upper // width**2).astype(np.int32)
         self.place = (upper % width**2).astype(np.int32)
         rows, columns = np.divmod(keys[begin], num_nodes)
         apart = np.flatnonzero(rows != columns)
         every = np.append(keys[begin], columns[apart] * num_nodes + rows[apart])
         order = np.argsort(every, kind="stable")
-        self.source = np.append(np.arange(len(rows)), apart)[order].astype(np.int32)
-        self.flipped = np.flatnonzero(order >= len(rows)).astype(np.int32)
+        count = len(rows)
+        self.source = np.append(np.arange(count), count + apart)[order].astype(np.int32)
         rows, columns = np.divmod(every[order], num_nodes)
         indptr = np.searchsorted(rows, np.arange(num_nodes + 1)).astype(np.int32)
         data = (np.ones(len(rows)), columns.astype(np.int32), indptr)
@@ -114,7 +76,7 @@ class CellMatrix:
         size, n = elements.shape[1], pairs.width
         self.block = b = size // n
         blocks = elements.reshape(-1, n, b, n, b).swapaxes(2, 3).reshape(-1, b * b)
-        self._blocks, self._places = blocks.copy(), pairs.place
+        self._blocks, self._places = blocks, pairs.place
         if len(elements) != 1:
             # In the order of the entries that they add to: read from one end to the other.
             self._blocks = blocks[pairs.cell.astype(np.int64) * n * n + pairs.place]
@@ -124,15 +86,15 @@ class CellMatrix:
         """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""
         pairs, b, pattern = self._pairs, self.block, self.pattern
         by_place = sp.csr_matrix(
-            (scale[pairs.cell], self._places, pairs.starts),
+            (scale.take(pairs.cell, mode="clip"), self._places, pairs.starts),
             shape=(len(pairs.starts) - 1, len(self._blocks)),
         )
-        values = (by_place @ self._blocks)[pairs.source]
+        sums = (by_place @ self._blocks).reshape(-1, b, b)
+        # Few entries are on the diagonal: their transposes are the same.
+        values = np.concatenate([sums, sums.swapaxes(1, 2)]).take(pairs.source, axis=0, mode="clip")
         if b == 1:
             return sp.csr_matrix((values.ravel(), pattern.indices, pattern.indptr), pattern.shape)
         size = b * pattern.shape[0]
-        values = values.reshape(-1, b, b)
-        values[pairs.flipped] = values[pairs.flipped].swapaxes(1, 2)
         return sp.bsr_matrix((values, pattern.indices, pattern.indptr), (size, size))
 
 
@@ -143,7 +105,7 @@ class AssembledMatrix:
         scale: (n_cells,) s, not to be changed.
     """
 
-    def __init__(self, affine: AffineMatrix | CellMatrix, scale: np.ndarray, profile: Profile):
+    def __init__(self, affine: CellMatrix, scale: np.ndarray, profile: Profile):
         self.scale = scale.copy()
         self._affine, self._profile = affine, profile
 
@@ -175,28 +137,7 @@ class InteriorEntries:
     source: np.ndarray
 
 
-def interior_entries(
-    pattern: sp.csr_matrix, components: int, numbers: np.ndarray
-) -> InteriorEntries:
-    """Select the interior entries of a pattern.
-
-    Args:
-        pattern: of the matrix over local dofs; or over local nodes, when it acts on so many
-            displacement `components` alike.
-        components: 1, or the number of directions, see `pattern`.
-        numbers: (n_local_dofs,) global interior number of each local dof, -1 for others.
-    """
-    rows = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
-    spread = [components * rows + c for c in range(components)]
-    rows = numbers[np.concatenate(spread)]
-    cols = numbers[np.concatenate([components * pattern.indices + c for c in range(components)])]
-    source = np.tile(np.arange(pattern.nnz), components)
-    keep = np.flatnonzero((rows >= 0) & (cols >= 0))
-    keep = keep[np.lexsort((cols[keep], rows[keep]))]
-    return InteriorEntries(rows[keep], cols[keep].astype(PETSc.IntType), source[keep])
-
-
-def interior_blocks(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) -> InteriorEntries:
+def interior_entries(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) -> InteriorEntries:
     """Select the interior entries of a matrix of blocks.
 
     Args:
@@ -205,20 +146,24 @@ def interior_blocks(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) -> 
         numbers: (b n_local_nodes,) global interior number of each local dof, -1 for others.
     """
     nodes = np.where(numbers[::block] < 0, -1, numbers[::block] // block)
-    found = interior_entries(pattern, 1, nodes)
-    first = np.flatnonzero(np.diff(found.rows, prepend=-1))
-    lengths = np.diff(np.append(first, len(found.rows)))
+    rows = nodes[np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))]
+    columns = nodes[pattern.indices]
+    source = np.flatnonzero((rows >= 0) & (columns >= 0))
+    source = source[np.lexsort((columns[source], rows[source]))]
+    row, column = rows[source], columns[source]  # of blocks
+    first = np.flatnonzero(np.diff(row, prepend=-1))
+    lengths = np.diff(np.append(first, len(row)))
     start, length = np.repeat(first, lengths), np.repeat(lengths, lengths)
-    base = block * block * start + block * (np.arange(len(found.rows)) - start)
-    size, kind = block * block * len(found.rows), PETSc.IntType
-    rows, columns, source = (np.empty(size, dtype=kind) for _ in range(3))
+    base = block * block * start + block * (np.arange(len(row)) - start)
+    size, kind = block * block * len(row), PETSc.IntType
+    rows, columns, places = (np.empty(size, dtype=kind) for _ in range(3))
     for r in range(block):
         for c in range(block):
             at = base + r * block * length + c
-            rows[at] = block * found.rows + r
-            columns[at] = block * found.columns + c
-            source[at] = block * block * found.source + r * block + c
-    return InteriorEntries(rows, columns, source)
+            rows[at] = block * row + r
+            columns[at] = block * column + c
+            places[at] = block * block * source + r * block + c
+    return InteriorEntries(rows, columns, places)
 
 
 class SharedRows:

@@ -8,6 +8,7 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -15,12 +16,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
-from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import (
-    AffineMatrix,
     AssembledMatrix,
     CellMatrix,
     Cells,
@@ -36,15 +34,23 @@ from dolfinopt.fem.interface import (
     static_fields,
     static_modes,
 )
-from dolfinopt.fem.interior import ExtendedStiffness, ExtendedSystem, Guesses, InteriorSystem
+from dolfinopt.fem.interior import (
+    ExtendedStiffness,
+    LinearSystem,
+    extended_layout,
+    interior_layout,
+)
+from dolfinopt.fem.measured import ENERGY_TOLERANCE, STATICS_TOLERANCE
+from dolfinopt.fem.multigrid import box_of
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.fem.stress import stress_operator
 from dolfinopt.fem.tensors import ElementTensors, element_centre
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together
-from dolfinopt.profiling import Profile
-from dolfinopt.solver import Factor
+
+Columns = Callable[[np.ndarray], np.ndarray]
+Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
 
 class Substructure:
@@ -56,20 +62,22 @@ class Substructure:
         cells: those of this rank, with one element matrix where all are alike, as in a grid.
         profile: of this rank.
         T: the interface transformation.
-        interior: the interior block in PETSc; one factorisation, of the design that asked last.
+        interior: system of the interior; one factorisation, of the design that asked last.
+        extended: that with the interfaces' rows, of solids of which statics alone are asked: a load
+            of the outboard interfaces takes one solution; None of others.
     """
 
     def __init__(
         self,
         operators: ElementTensors,
-        tolerance: float | None = None,
+        tolerance: float = ENERGY_TOLERANCE,
         statics_alone: bool = False,
     ):
         """Number the interior dofs and lay down the sparsity patterns (collective).
 
         Args:
             operators: see above.
-            tolerance: of iterative solutions, see `InteriorSystem`.
+            tolerance: of iterative solutions in energy, relative.
             statics_alone: whether nothing is asked of its designs but what static loads do.
 
         Raises:
@@ -78,28 +86,16 @@ class Substructure:
         self.mesh, self.profile = mesh, profile = operators.mesh, operators.profile
         self.operators, self.cells = operators, Cells(operators)
         with together(mesh.comm):
-            cells, size, dim = operators.cells, len(operators.points), mesh.dim
-            self._stiffness: AffineMatrix | CellMatrix
-            self._mass: AffineMatrix | CellMatrix
-            if dim == 3:  # where memory counts
-                self._pairs = NodePairs(cells, size)
-                self._stiffness = CellMatrix(self._pairs, operators.stiffness)
-                self._mass = CellMatrix(self._pairs, operators.mass)
-            else:
-                dofs = (dim * cells[:, :, None] + np.arange(dim)).reshape(len(cells), -1)
-                self._stiffness = AffineMatrix(dofs, operators.stiffness, dim * size)
-                self._mass = AffineMatrix(cells, operators.mass, size)
+            self._pairs = NodePairs(operators.cells, len(operators.points))
+            self._stiffness = CellMatrix(self._pairs, operators.stiffness)
+            self._mass = CellMatrix(self._pairs, operators.mass)
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
-        quadratic = operators.cells.shape[1] == 10  # tetrahedra
-        box = None
-        if dim == 3 and mesh.wall is None:
-            from dolfinopt.fem.box_multigrid import box_of
-
-            box = box_of(self.T, self.cells, mesh.centroid)
-        self._statics_alone, self._solution = statics_alone, (tolerance, quadratic, box)
-        self.interior = InteriorSystem(
-            self.T, self._stiffness, self._mass, profile, *self._solution
-        )
+        solid = mesh.dim == 3 and mesh.wall is None
+        box = box_of(self.T, self.cells, mesh.centroid) if solid else None
+        tetrahedra = operators.cells.shape[1] == 10
+        layout = interior_layout(mesh.name, self.T, self._pairs.pattern, tetrahedra, box)
+        self.interior = LinearSystem(layout, profile, tolerance)
+        self.extended = self._extended() if statics_alone and mesh.dim == 3 else None
         self._last: ElasticArm | None = None
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> Substructure:
@@ -124,26 +120,13 @@ class Substructure:
         other.T, other._last = self.T.moved(points), None
         return other
 
-    @cached_property
-    def extended(self) -> ExtendedSystem | None:
-        """The system with the interfaces' rows, for solids of which statics alone are asked.
-
-        None of others. Collective.
-        """
-        if not self._statics_alone or self.T.dim == 2:
-            return None
+    def _extended(self) -> LinearSystem:
         touched = np.zeros((*self.operators.points.shape, 1))
         touched[self.operators.cells[self._rigid_forces[0]]] = 1.0
-        near = np.flatnonzero(self.T.restrict(touched)[0])
-        tolerance, irregular, box = self._solution
-        found = ExtendedSystem(
-            self.T, self._stiffness, self._mass, self.profile, tolerance, irregular, box, near
-        )
-        return found if found.is_worth_it else None
-
-    def release_extended(self) -> None:
-        """Free the memory of `extended`, which is made anew when it is asked for."""
-        self.__dict__.pop("extended", None)
+        self._near = np.flatnonzero(self.T.restrict(touched)[0])
+        entries = self.T.dim**2 * self._pairs.pattern.nnz
+        layout = extended_layout(self.interior.layout, self.T, entries, self._near)
+        return LinearSystem(layout, self.profile, min(self.interior.tolerance, STATICS_TOLERANCE))
 
     @cached_property
     def connectivity(self) -> Connectivity:
@@ -205,22 +188,8 @@ class Substructure:
 
     def extend(self, K: AssembledMatrix) -> ExtendedStiffness:
         """Return what `extended` takes of K of a design (collective)."""
-        assert self.extended is not None
         coupling, corner = self.T.restrict(self.rigid_forces(K.scale))
-        return ExtendedStiffness(K, np.append(coupling[self.extended.near].ravel(), corner))
-
-    @property
-    def guesses(self) -> Guesses | None:
-        """What the next design's iterative solves set out from; None where there is nothing."""
-        return (self.extended or self.interior).guesses
-
-    def set_guesses(self, guesses: Guesses | None) -> None:
-        """Let iterative solves set out as others did, see `InteriorSystem.guesses` (collective)."""
-        system, K = self.extended or self.interior, None
-        if guesses is not None and not system.has_hierarchy_of(guesses):
-            K = AssembledMatrix(self._stiffness, guesses.young, Profile())
-        extended = self.extend(K) if K and self.extended else K
-        system.set_guesses(guesses, extended)
+        return ExtendedStiffness(K, np.append(coupling[self._near].ravel(), corner))
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
         """Return the arm with these materials (collective); for the last ones, the same object.
@@ -255,8 +224,8 @@ class ElasticArm:
         substructure: what it shares with other designs of the same arm.
         K, M: assembled stiffness (dofs) and mass (nodes) of this rank's cells.
         mesh, operators, profile: of the substructure.
-        comm, inboard, outboard, rigid, interior_nodes, num_interior, num_dofs, expand, restrict:
-            of its `InterfaceTransformation`.
+        comm, inboard, outboard, rigid, interior_nodes, num_interior, num_dofs, expand, restrict,
+            coordinates: of its `InterfaceTransformation`.
         points: (n_nodes, d) reference positions, m.
     """
 
@@ -271,7 +240,7 @@ class ElasticArm:
         self.inboard, self.outboard, self.rigid = T.inboard, T.outboard, T.rigid
         self.interior_nodes = T.interior_nodes
         self.num_interior, self.num_dofs = T.num_interior, T.num_dofs
-        self.expand, self.restrict = T.expand, T.restrict
+        self.expand, self.restrict, self.coordinates = T.expand, T.restrict, T.coordinates
         self._static_fields: StaticFields | None = None
 
     @property
@@ -335,82 +304,75 @@ class ElasticArm:
 
     # -- the interior ------------------------------------------------------------------------
 
-    def factorise(self) -> Factor:
-        """Return the factor of K_II of this design, see `InteriorSystem`."""
-        return self.substructure.interior.factorise(self.K)
-
-    def interior_stiffness(self) -> PETSc.Mat:
-        """Return K_II, valid until another design of the arm asks for its own or is factorised."""
-        return self.substructure.interior.stiffness(self.K)
-
-    def interior_mass(self) -> PETSc.Mat:
-        """Return M_II, valid until another design of the arm asks for its own."""
-        return self.substructure.interior.mass(self.M.matrix)
+    @property
+    def is_iterative(self) -> bool:
+        """Whether systems of the interior are solved to a tolerance only (collective)."""
+        return self.substructure.interior.is_iterative
 
     def solve(
-        self, right: np.ndarray, purpose: str = "", held: np.ndarray | None = None
+        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
     ) -> np.ndarray:
-        """Solve K_II U = right for (num_interior, k) owned rows.
+        """Solve K_II U = right for (num_interior, k) owned rows; columns of zeros cost nothing.
 
         Args:
             right: right sides.
-            purpose: what for, where the design before had similar ones, see `InteriorSystem.solve`.
-            held: (k,) see `InteriorSystem.solve`.
+            tolerance, held: see `interior.Solver`.
 
         Raises:
             ConvergenceError: K_II is singular but for rounding.
         """
+        loaded = self.comm.allreduce(right.any(axis=0), op=np.logical_or)
         interior = self.substructure.interior
-        interior.factorise(self.K)
-        with self.profile.phase("solves"):
-            out, failed = interior.solve(self.K, right, purpose, held)
-        self._count(right.shape[1], failed)
+        if loaded.all():
+            return interior.solve(self.K, right, tolerance, held)
+        out = np.zeros_like(right)
+        if loaded.any():
+            held = None if held is None else held[loaded]
+            out[:, loaded] = interior.solve(self.K, right[:, loaded], tolerance, held)
         return out
+
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """Return K_II^-1 right, or an approximation of it where solutions are iterative."""
+        return self.substructure.interior.precondition(self.K, right)
+
+    def solve_free(
+        self, interior: np.ndarray, outboard: np.ndarray, inverse: Columns | None = None
+    ) -> Rows:
+        """Return (T'KT)^-1 of loads, the outboard interfaces free, by block elimination.
+
+        With constraint modes Psi and their stiffness S,
+        z_b = S^-1 (f_b + Psi' f_I),  z_I = K_II^-1 f_I + Psi z_b.
+
+        Args:
+            interior: (num_interior, k) f_I, owned rows, N.
+            outboard: (b, k) f_b, N, N m.
+            inverse: in place of `solve`.
+        """
+        modes = self.constraint_modes()
+        lift = self.comm.allreduce(modes.interior.T @ interior)
+        tip = np.linalg.solve(modes.stiffness, outboard + lift)
+        return (inverse or self.solve)(interior) + modes.interior @ tip, tip
+
+    def static_response(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
+        """Return the displacements (n_nodes, d, k) of static loads, see `solve_free`."""
+        return self.expand(*self.solve_free(interior, outboard))
 
     @cached_property
     def _extended(self) -> ExtendedStiffness:
         return self.substructure.extend(self.K)
 
-    def solve_loads(self, loads: np.ndarray, purpose: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return what loads (b, k) of the outboard interfaces do, see `ExtendedSystem.solve_loads`.
+    def solve_loads(self, loads: np.ndarray) -> Rows:
+        """Return what loads (b, k) of the outboard interfaces do, by the `extended` system.
 
         Raises:
             ConvergenceError: K is singular but for rounding.
         """
-        extended = self.substructure.extended
+        extended, size = self.substructure.extended, self.num_interior
         assert extended is not None
-        extended.factorise(self._extended)
-        with self.profile.phase("solves"):
-            interior, tip, failed = extended.solve_loads(self._extended, loads, purpose)
-        self._count(loads.shape[1], failed)
-        return interior, tip
-
-    def _count(self, solves: int, failed: bool) -> None:
-        """Count solutions; raise ConvergenceError where they failed."""
-        self.profile.counts.solves += solves
-        if failed:  # the same on all ranks
-            raise ConvergenceError(
-                f"arm {self.mesh.name!r}: the stiffness matrix cannot be factorised: void is too "
-                "soft for double precision beside solid; raise "
-                "interpolation.floor or design.minimum"
-            )
-
-    def interior_inverse(self, right: np.ndarray) -> np.ndarray:
-        """Return K_II^-1 right for one right side (num_interior,) of owned rows."""
-        self.profile.counts.solves += 1
-        self.factorise()
-        return self.substructure.interior.inverse(self.K, right)
-
-    def interior_stiffness_times(self, vector: np.ndarray) -> np.ndarray:
-        """Return K_II times a vector (num_interior,) of owned rows."""
-        return _times(self.interior_stiffness(), vector)
-
-    def interior_mass_times(self, vector: np.ndarray) -> np.ndarray:
-        """Return M_II times a vector (num_interior,) of owned rows."""
-        if self.comm.size > 1:
-            return _times(self.interior_mass(), vector)
-        nodes = self.substructure.interior.node_mass(self.M.matrix)
-        return (nodes @ vector.reshape(-1, self.mesh.dim)).ravel()
+        right = np.zeros((extended.layout.rows, loads.shape[1]))
+        right[size:] = loads[: extended.layout.rows - size]  # of the last rank
+        out = extended.solve(self._extended, right)
+        return out[:size], self.comm.bcast(out[size:], root=self.comm.size - 1)
 
     @cached_property
     def _constraint_modes(self) -> ConstraintModes:
@@ -439,14 +401,3 @@ class ElasticArm:
         """
         self._static_fields = static_fields(self, loads, self._static_fields)
         return self._static_fields
-
-
-def _times(matrix: PETSc.Mat, vector: np.ndarray) -> np.ndarray:
-    """Return a matrix times owned rows of a vector."""
-    x, y = matrix.createVecs()
-    x.array = vector
-    matrix.mult(x, y)
-    product: np.ndarray = y.array_r.copy()
-    for one in (x, y):
-        one.destroy()
-    return product

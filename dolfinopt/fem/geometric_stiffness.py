@@ -64,7 +64,7 @@ class UnitLoads:
             V: (n_nodes, d, q) modes.
             MV: mass matrix times V, contributions of this rank's cells.
         """
-        modal = static_response(self.arm, *self.arm.restrict(MV), "modal accelerations")
+        modal = self.arm.static_response(*self.arm.restrict(MV))
         parts = [self.fields[:, :, : self.num_frame], modal, self.fields[:, :, self.num_frame :]]
         return UnitLoads(self.arm, np.concatenate(parts, axis=2), V)
 
@@ -137,7 +137,7 @@ class UnitLoads:
             outboard = face.by_fields[:, :, inertial:]
             work = work + _fold(outboard, by_V, modes.field, compliance)
             by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
-        adjoint = static_response(arm, *arm.restrict(forces))
+        adjoint = arm.static_response(*arm.restrict(forces))
         found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face)
         if self.modes is None:
             return found
@@ -282,7 +282,7 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
     Collective on the arm's ranks.
     """
     ones, places = np.moveaxis(arm.rigid_inertia, 2, 0)
-    inertial = static_response(arm, *arm.restrict(accelerations(ones, places)), "accelerations")
+    inertial = arm.static_response(*arm.restrict(accelerations(ones, places)))
     return UnitLoads(arm, np.concatenate([inertial, interface_fields(arm)], axis=2))
 
 
@@ -308,29 +308,6 @@ def accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
     fields[:, 0, 2], fields[:, 1, 2] = -places[:, 1], places[:, 0]
     fields[:, :, 3] = places
     return fields
-
-
-def static_response(
-    arm: ElasticArm, interior: np.ndarray, outboard: np.ndarray, purpose: str = ""
-) -> np.ndarray:
-    """Return the displacements (n_nodes, d, k) of static loads, outboard interface free.
-
-    Args:
-        arm: clamped inboard.
-        interior: (num_interior, k) loads on the interior dofs, N; zero columns cost nothing.
-        outboard: (b, k) force and moment at the outboard interface, N, N m.
-        purpose: see `ElasticArm.solve`.
-    """
-    modes = arm.constraint_modes()
-    loaded = arm.comm.allreduce(np.array([column.any() for column in interior.T]))
-    if loaded.all():
-        particular = arm.solve(interior, purpose)
-    else:
-        particular = np.zeros_like(interior)
-        particular[:, loaded] = arm.solve(interior[:, loaded], purpose)
-    load = outboard + arm.comm.allreduce(modes.interior.T @ interior)
-    tip = np.linalg.solve(modes.stiffness, load)
-    return arm.expand(particular + modes.interior @ tip, tip)
 
 
 # -- what the rotation of second order of a rigid interface adds to the geometric stiffness ------

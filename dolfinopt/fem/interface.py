@@ -89,7 +89,8 @@ class InterfaceTransformation:
     def moved(self, points: np.ndarray) -> InterfaceTransformation:
         """Return that of the same interfaces with the nodes at other points (n_nodes, d), m."""
         other = copy(self)
-        other.__dict__.pop("_fit", None)
+        for name in ("_fit", "_rigid"):
+            other.__dict__.pop(name, None)
         other.points = points
         fields = [other._rigid_field(at, x) for at, x in zip(self.ends, self.places, strict=True)]
         other.rigid = np.concatenate(fields, axis=2)
@@ -173,13 +174,15 @@ class InterfaceTransformation:
             outboard: (b, k) coordinates of the outboard interface, m and rad.
         """
         columns = interior.shape[1]
-        field = np.zeros((len(self.points), self.dim, columns))
-        field[self.interior_nodes] = interior.reshape(-1, self.dim, columns)
-        if self.comm.size > 1:
-            flat = self._from_owners(field.reshape(len(field), self.dim * columns))
-            field = flat.reshape(field.shape)
-        rigid = np.flatnonzero(self.outboard)
-        field[rigid] = self.rigid[rigid] @ outboard
+        rows, others = self._rows
+        shape = len(self.interior_nodes), self.dim * columns
+        # To be taken is ten times as fast as to be put; a rank may have no rows.
+        some = interior.reshape(shape) if shape[0] else np.zeros((1, shape[1]))
+        field = some.take(rows, axis=0, mode="clip")
+        field[others] = 0.0
+        field = self._from_owners(field).reshape(-1, self.dim, columns)
+        rigid, motions = self._rigid
+        field[rigid] = motions @ outboard
         return field
 
     def restrict(self, field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,12 +195,26 @@ class InterfaceTransformation:
             Owned interior rows (num_interior, k) and the outboard rows (b, k).
         """
         columns = field.shape[2]
-        rigid = np.flatnonzero(self.outboard)
-        outboard = np.einsum("nic,nik->ck", self.rigid[rigid], field[rigid])
+        rigid, motions = self._rigid
+        outboard = np.tensordot(motions, field[rigid], ((0, 1), (0, 1)))
         if self.comm.size > 1:
             outboard = self.comm.allreduce(outboard)
             field = self._to_owners(field)
-        return field[self.interior_nodes].reshape(-1, columns), outboard
+        interior = field.take(self.interior_nodes, axis=0, mode="clip")
+        return interior.reshape(-1, columns), outboard
+
+    @cached_property
+    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of every node its place among the owned interior ones, and the nodes that are none."""
+        rows = np.full(len(self.points), -1)
+        rows[self.interior_nodes] = np.arange(len(self.interior_nodes))
+        return rows, np.flatnonzero(rows < 0)
+
+    @cached_property
+    def _rigid(self) -> tuple[np.ndarray, np.ndarray]:
+        """The outboard interfaces' nodes, and their rows of `rigid`."""
+        nodes = np.flatnonzero(self.outboard)
+        return nodes, self.rigid[nodes]
 
     @cached_property
     def _fit(self) -> np.ndarray:
@@ -323,11 +340,9 @@ def static_modes(arm: ElasticArm) -> ConstraintModes:
         ConvergenceError: the contrast between solid and void is too large for this design.
     """
     floating = floats(arm)
-    if not floating:  # of a machine that moves after static loads
-        arm.substructure.release_extended()
     coupling, corner = arm.restrict(arm.substructure.rigid_forces(arm.young))
     # With the interior at rest the interface's motion has up to 1e5 of the modes' energy.
-    interior = arm.solve(-coupling, "constraint modes", np.diag(corner))
+    interior = arm.solve(-coupling, held=np.diag(corner))
     modes = _with_energies(arm, interior, coupling, corner)
     if floating:
         modes = _refined(arm, modes)
@@ -379,15 +394,16 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
         known = StaticFields(*(np.empty((*n, 0)) for n in ((b,), arm.points.shape, (b,), (0,))))
     extended = arm.substructure.extended
     # What a symmetric design's deflection has across the load is an error of the fields.
-    error = extended.tolerance if extended and extended.is_iterative else DEFLECTION_ROUNDING_ERROR
-    new = on_root(arm.comm, _new_directions, known.directions, loads, error)
+    error = extended.solver.tolerance if extended else 0.0
+    new = on_root(
+        arm.comm, _new_directions, known.directions, loads, error or DEFLECTION_ROUNDING_ERROR
+    )
     if new.shape[1] == 0:
         return known
     if arm.has_constraint_modes or extended is None or floats(arm):
         modes = arm.constraint_modes()
         return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
-    purpose = "adjoint loads" if known.directions.shape[1] else "static loads"
-    interior, tip = arm.solve_loads(new, purpose)
+    interior, tip = arm.solve_loads(new)
     field = np.concatenate([known.field, arm.expand(interior, tip)], axis=2)
     found = StaticFields(
         np.hstack([known.directions, new]),

@@ -1,80 +1,45 @@
-"""The interior block of one arm: its matrices, and its one factorisation or hierarchy."""
+"""The linear systems of one arm, and the choice of what solves them.
+
+One has the rows of the interior, K_II. Of solids of which static loads alone are asked, another one
+has the rows of the outboard interfaces, too: [K_II, K_Ib; K_bI, K_bb].
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.fem.assembly import (
-    AffineMatrix,
-    AssembledMatrix,
-    CellMatrix,
-    InteriorEntries,
-    InteriorMatrix,
-    interior_blocks,
-    interior_entries,
-)
-from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_entries
+from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.measured import (
     BAND_WORK_LIMIT,
-    ENERGY_TOLERANCE,
-    EXTENDED_BANDWIDTH_RATIO,
     FACTOR_BYTES,
     FACTOR_EXPONENT,
-    FACTOR_ROWS,
-    FREE_MEMORY_SHARE,
-    KRYLOV_TOLERANCE,
-    LEAST_STATICS_TOLERANCE,
-    MUMPS_ROWS,
     SOLID_BAND_WORK_LIMIT,
-    STATICS_TOLERANCE_SHARE,
     TETRAHEDRA_BAND_WORK_LIMIT,
-    TETRAHEDRA_ROWS,
     WIDEST,
     WIDEST_OF_STATICS,
 )
+from dolfinopt.fem.multigrid import Box, MultigridSolver
 from dolfinopt.mesh.budget import free_memory, ranks_here
 from dolfinopt.profiling import Profile
 from dolfinopt.solver import (
     BandCholesky,
-    Factor,
     PetscFactor,
     direct_solver,
-    has_options,
     obeying_options,
+    user_options,
 )
 
-if TYPE_CHECKING:
-    from dolfinopt.fem.box_multigrid import Box, BoxSolver
-    from dolfinopt.fem.multigrid import AlgebraicSolver
-
-Columns = Callable[[np.ndarray], np.ndarray]
-ITERATIVE = "conjugate gradients"  # name of that solver
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
-
-
-@dataclass(frozen=True, eq=False)
-class Guesses:
-    """From what the iterative solves of one design set out: with it they end in the same bits.
-
-    Attributes:
-        fields: (num_interior, k) by purpose, the solutions of the design before.
-        young: (n_cells,) Young's modulus of the design that the hierarchy was made for, Pa.
-        gradual: how it was made, see `Multigrid`.
-        progress: see `BlockConjugateGradients`.
-    """
-
-    fields: Mapping[str, np.ndarray]
-    young: np.ndarray
-    gradual: bool
-    progress: tuple[float, float]
 
 
 class Stiffness(Protocol):
@@ -93,8 +58,311 @@ class Stiffness(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class Layout:
+    """Rows and entries of a linear system of an arm.
+
+    Attributes:
+        name: of the arm.
+        comm: its ranks.
+        rows: that this rank owns.
+        num_rows: of all ranks.
+        bandwidth: the widest of all ranks' own parts.
+        entries: finds the entries, see `InteriorEntries`.
+        band_work_limit: rows times bandwidth squared up to which a band is factorised as such.
+        box: that all of the arm's cells fill, or None.
+        has_interfaces: whether the outboard coordinates are the last rank's last rows.
+        points: (rows / d, d) of the nodes that this rank owns, m.
+    """
+
+    name: str
+    comm: MPI.Comm
+    rows: int
+    num_rows: int
+    bandwidth: int
+    entries: Callable[[], InteriorEntries]
+    band_work_limit: float
+    box: Box | None
+    has_interfaces: bool
+    points: np.ndarray
+
+
+def interior_layout(
+    name: str, T: InterfaceTransformation, pattern: sp.csr_matrix, tetrahedra: bool, box: Box | None
+) -> Layout:
+    """Return that of K_II.
+
+    Args:
+        name: of the arm.
+        T: numbers the interior dofs.
+        pattern: of the nodes.
+        tetrahedra: whether the mesh is of quadratic tetrahedra, whose bands are wide.
+        box: see `Layout`.
+    """
+    limit = BAND_WORK_LIMIT
+    if T.dim == 3:
+        limit = TETRAHEDRA_BAND_WORK_LIMIT if tetrahedra else SOLID_BAND_WORK_LIMIT
+    return Layout(
+        name,
+        T.comm,
+        T.num_interior,
+        T.num_dofs - T.num_coordinates,
+        T.bandwidth,
+        lambda: interior_entries(pattern, T.dim, T.numbers),
+        limit,
+        box,
+        False,
+        T.points[T.interior_nodes],
+    )
+
+
+class Solver(Protocol):
+    """K^-1 of one design after another, of the rows that this rank owns; all is collective.
+
+    Attributes:
+        name: of the method.
+        tolerance: relative, of solutions in energy; 0 of a factor.
+        failed: K has no factor but for rounding, or the last solution did not converge.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def tolerance(self) -> float: ...
+
+    @property
+    def failed(self) -> bool: ...
+
+    def update(self, K: Stiffness) -> None:
+        """Take another design."""
+
+    def solve(
+        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return K^-1 right (rows, k); see `block_conjugate_gradients` for the other arguments."""
+
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """Return an approximation of K^-1 right (rows, k), symmetric positive definite."""
+
+
+class PetscSolver:
+    """MUMPS' factor, or what the user's PETSc options put in its place; see `Solver`."""
+
+    tolerance = 0.0
+
+    def __init__(self, layout: Layout):
+        self._matrix = InteriorMatrix(layout.comm, layout.entries(), layout.rows)
+        if layout.points.shape[1] == 3 and not layout.has_interfaces:
+            with_rigid_motions(self._matrix.mat, layout.points)  # for multigrid by options
+        self._ksp = direct_solver(self._matrix.mat, OPTIONS)
+        self._factor: PetscFactor | None = None
+
+    @property
+    def name(self) -> str:
+        """That of PETSc's package or preconditioner."""
+        pc = self._ksp.getPC()
+        return str(pc.getFactorSolverType() or pc.getType())
+
+    @property
+    def failed(self) -> bool:
+        """See `Solver`."""
+        return self._factor is not None and self._factor.failed
+
+    def update(self, K: Stiffness) -> None:
+        """See `Solver`."""
+        self._matrix.update(K.data)
+        self._ksp.setOperators(self._matrix.mat)
+        with obeying_options(OPTIONS):
+            self._ksp.setUp()
+        self._factor = PetscFactor(self._ksp)
+
+    def solve(
+        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
+    ) -> np.ndarray:
+        """See `Solver`."""
+        assert self._factor is not None
+        return self._factor.solve(right)
+
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """See `Solver`."""
+        return self.solve(right)
+
+
+class BandSolver:
+    """LAPACK's factor of a band that one rank owns; see `Solver`."""
+
+    name = "LAPACK's band"
+    tolerance = 0.0
+
+    def __init__(self, layout: Layout):
+        self._layout, entries = layout, layout.entries()
+        self._band = BandCholesky(entries.rows, entries.columns, layout.rows)
+        self._source = entries.source[self._band.taken]
+        self._is_definite = True
+
+    @cached_property
+    def _indefinite(self) -> PetscSolver:
+        """What rounding has made indefinite MUMPS factorises all the same."""
+        return PetscSolver(self._layout)
+
+    @property
+    def failed(self) -> bool:
+        """See `Solver`."""
+        return not self._is_definite and self._indefinite.failed
+
+    def update(self, K: Stiffness) -> None:
+        """See `Solver`."""
+        self._is_definite = self._band.factorise(K.data[self._source])
+        if not self._is_definite:
+            self._indefinite.update(K)
+
+    def solve(
+        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
+    ) -> np.ndarray:
+        """See `Solver`."""
+        return (self._band if self._is_definite else self._indefinite).solve(right)
+
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """See `Solver`."""
+        return self.solve(right)
+
+
+def choose_solver(layout: Layout, tolerance: float) -> Solver:
+    """Return what solves a system, by its shape and size (collective).
+
+    PETSc, where the user has given options for it. Conjugate gradients with multigrid for boxes
+    with large cross-sections. A band on one rank where it is narrow; MUMPS otherwise.
+
+    Args:
+        layout: of the system.
+        tolerance: of conjugate gradients.
+
+    Raises:
+        InputError: MUMPS' factor needs more memory than is free.
+    """
+    if user_options(OPTIONS):
+        return PetscSolver(layout)
+    widest = WIDEST_OF_STATICS if layout.has_interfaces else WIDEST
+    if layout.box is not None and layout.bandwidth > widest:
+        return MultigridSolver(layout.box, layout.has_interfaces, tolerance)
+    work = layout.rows * float(layout.bandwidth) ** 2
+    if layout.comm.size == 1 and work <= layout.band_work_limit:
+        return BandSolver(layout)
+    _check_factor(layout)
+    return PetscSolver(layout)
+
+
+def _check_factor(layout: Layout) -> None:
+    """Raise InputError where MUMPS' factor would not fit into the free memory (collective)."""
+    rows, comm, here = layout.num_rows, layout.comm, MPI.Get_processor_name()
+    needed = FACTOR_BYTES * rows**FACTOR_EXPONENT
+    local = comm.allgather(here).count(here)
+    # Other arms' ranks on this machine take theirs at the same time.
+    free = free_memory() * local / ranks_here()
+    if comm.allreduce(needed * local / comm.size > free, op=MPI.LOR):
+        raise InputError(
+            f"arm {layout.name!r}: the factor of {rows} unknowns takes about {needed / 1e9:.2g} "
+            "GB, more than is free; take a coarser mesh, or multigrid by PETSC_OPTIONS="
+            f'"-{OPTIONS}ksp_type cg -{OPTIONS}pc_type gamg -{OPTIONS}ksp_rtol 1e-10"'
+        )
+
+
+def with_rigid_motions(matrix: PETSc.Mat, points: np.ndarray) -> None:
+    """Tell a matrix of three dofs a node, at points (n, 3), its near-nullspace (collective)."""
+    matrix.setBlockSize(3)
+    places = matrix.createVecLeft()
+    places.setBlockSize(3)
+    places.array = points.ravel()
+    matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(places))
+
+
+class LinearSystem:
+    """K of whichever design asked last, and its solver; both last for the whole run.
+
+    What one design left is overwritten when another one asks; the first one then pays, and counts,
+    another factorisation.
+
+    Attributes:
+        layout: of its rows.
+        tolerance: of conjugate gradients in energy, relative.
+    """
+
+    def __init__(self, layout: Layout, profile: Profile, tolerance: float):
+        """Set up; nothing is chosen before it is asked for.
+
+        Args:
+            layout: see above.
+            profile: of this rank.
+            tolerance: see above.
+        """
+        self.layout, self.tolerance, self._profile = layout, tolerance, profile
+        self._factorised: Stiffness | None = None
+
+    @cached_property
+    def solver(self) -> Solver:
+        """See `choose_solver` (collective)."""
+        return choose_solver(self.layout, self.tolerance)
+
+    @property
+    def is_iterative(self) -> bool:
+        """Whether solutions are right to a tolerance only (collective)."""
+        return self.solver.tolerance > 0.0
+
+    def factorise(self, K: Stiffness) -> None:
+        """Make K's factor or hierarchy; nothing is done if it was the last one (collective)."""
+        if self._factorised is K:
+            return
+        self._factorised = None
+        with self._profile.phase("factorisation"):
+            self.solver.update(K)
+        self._profile.counts.factorisations += 1
+        self._factorised = K
+
+    def solve(
+        self,
+        K: Stiffness,
+        right: np.ndarray,
+        tolerance: float | None = None,
+        held: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return K^-1 right (rows, k), see `Solver.solve` (collective).
+
+        Raises:
+            ConvergenceError: K is singular but for rounding, or there are too many iterations.
+        """
+        self.factorise(K)
+        with self._profile.phase("solves"):
+            out = self.solver.solve(right, tolerance, held)
+        self._profile.counts.solves += right.shape[1]
+        if self.solver.failed:  # the same on all ranks
+            raise ConvergenceError(f"arm {self.layout.name!r}: {self._reason()}")
+        return out
+
+    def precondition(self, K: Stiffness, right: np.ndarray) -> np.ndarray:
+        """Return an approximation of K^-1 right (rows, k) (collective)."""
+        self.factorise(K)
+        self._profile.counts.solves += right.shape[1]
+        return self.solver.precondition(right)
+
+    def _reason(self) -> str:
+        remedy = "raise interpolation.floor or design.minimum"
+        if self.is_iterative:
+            return (
+                "conjugate gradients do not converge, as void is too soft beside solid: "
+                f'{remedy}, or take a factor by PETSC_OPTIONS="-{OPTIONS}pc_type cholesky"'
+            )
+        return (
+            "the stiffness matrix cannot be factorised: void is too soft for double precision "
+            f"beside solid; {remedy}"
+        )
+
+
+# -- with the rows of the outboard interfaces -----------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
 class ExtendedStiffness:
-    """K of one design, and what `ExtendedSystem` takes of it at the outboard interfaces.
+    """K of one design, and what the rows of the outboard interfaces take of it.
 
     Attributes:
         of: K over local dofs.
@@ -102,7 +370,7 @@ class ExtendedStiffness:
             coordinates, then stiffness of these alone.
     """
 
-    of: AssembledMatrix
+    of: Stiffness
     border: np.ndarray
 
     @property
@@ -116,474 +384,50 @@ class ExtendedStiffness:
         return np.append(self.of.data, self.border)
 
 
-def _is_too_much(comm: MPI.Comm, needed: float) -> bool:
-    """Return whether the arm's ranks on this machine had better not take so many bytes."""
-    here = MPI.Get_processor_name()
-    # Other arms' ranks on this machine take theirs at the same time.
-    free = free_memory() * comm.allgather(here).count(here) / ranks_here()
-    return needed > FREE_MEMORY_SHARE * free
+def extended_layout(
+    inner: Layout, T: InterfaceTransformation, num_entries: int, near: np.ndarray
+) -> Layout:
+    """Return that with the outboard coordinates as the last rank's last rows.
 
-
-class InteriorSystem:
-    """K_II with one factorisation, and M_II, of whichever design asked last.
-
-    Patterns, ordering and symbolic factor last for the whole run. What one design left is
-    overwritten when another one asks; the first one then pays, and counts, another factorisation.
-
-    Attributes:
-        tolerance: of conjugate gradients in energy, relative.
+    Args:
+        inner: of K_II.
+        T: the arm's interfaces.
+        num_entries: of K over local dofs.
+        near: interior dofs of this rank that an outboard interface's coordinates couple with.
     """
+    is_last = T.comm.rank == T.comm.size - 1
+    rows = inner.rows + (T.num_coordinates if is_last else 0)
+    width = max(inner.bandwidth, rows - 1 - int(near.min(initial=rows)))
 
-    def __init__(
-        self,
-        T: InterfaceTransformation,
-        stiffness: AffineMatrix | CellMatrix,
-        mass: AffineMatrix | CellMatrix,
-        profile: Profile,
-        tolerance: float | None = None,
-        irregular: bool = False,
-        box: Box | None = None,
-    ):
-        """Set up for such matrices; nothing is selected before it is asked for.
+    def entries() -> InteriorEntries:
+        return _with_border(inner.entries(), T, num_entries, near)
 
-        Args:
-            T: numbers the interior dofs.
-            stiffness: over local dofs, or in blocks over local nodes.
-            mass: over local nodes.
-            profile: of this rank.
-            tolerance: in place of `ENERGY_TOLERANCE`.
-            irregular: whether the mesh is of quadratic tetrahedra.
-            box: that all of the arm's cells fill, or None.
-        """
-        self._irregular, self._box = irregular, box
-        self._T, self._profile = T, profile
-        self.tolerance = tolerance or ENERGY_TOLERANCE
-        self._patterns, self._block = (stiffness.pattern, mass.pattern), stiffness.block
-        self._factor: Factor | None = None
-        self._factorised: Stiffness | None = None  # the K whose factor is at hand
-        self._stiffness_of: Stiffness | None = None
-        self._mass_of: sp.csr_matrix | None = None
-        self._solutions: dict[str, np.ndarray] = {}
-        self._node_mass_of: sp.csr_matrix | None = None
-        # Young's modulus of the design that is asked for, and of that the hierarchy was made for.
-        self._asked: np.ndarray | None = None
-        self._young: np.ndarray | None = None
-        self._setups = 0  # of the hierarchy, when `_young` was noted
-
-    @cached_property
-    def _entries(self) -> InteriorEntries:
-        if self._block > 1:
-            return interior_blocks(self._patterns[0], self._block, self._T.numbers)
-        return interior_entries(self._patterns[0], 1, self._T.numbers)
-
-    @property
-    def _num_rows(self) -> int:
-        """Rows of the stiffness that this rank owns."""
-        return self._T.num_interior
-
-    @property
-    def _bandwidth(self) -> int:
-        """That of the stiffness on one rank."""
-        return self._T.bandwidth
-
-    @cached_property
-    def _stiffness(self) -> InteriorMatrix:
-        found = InteriorMatrix(self._T.comm, self._entries, self._num_rows)
-        if self._band is None:  # nothing else asks for them
-            del self._entries
-        return found
-
-    @cached_property
-    def _mass(self) -> InteriorMatrix:
-        T = self._T
-        return InteriorMatrix(
-            T.comm, interior_entries(self._patterns[1], T.dim, T.numbers), T.num_interior
-        )
-
-    @cached_property
-    def _band(self) -> BandCholesky | None:
-        """LAPACK's factor, where one rank owns a band that is narrow enough."""
-        if self._T.comm.size > 1 or has_options(OPTIONS):
-            return None
-        size, most = self._num_rows, BAND_WORK_LIMIT
-        if self._T.dim == 3:
-            most = TETRAHEDRA_BAND_WORK_LIMIT if self._irregular else SOLID_BAND_WORK_LIMIT
-        if size * float(self._bandwidth) ** 2 > most:
-            return None
-        needed = 8.0 * size * (self._bandwidth + 1)
-        if size > FACTOR_ROWS and _is_too_much(self._T.comm, needed):
-            return None
-        return BandCholesky(self._entries.rows, self._entries.columns, size)
-
-    @cached_property
-    def _band_source(self) -> np.ndarray:
-        """Places in K's data of the entries that the band takes."""
-        assert self._band is not None
-        return self._entries.source[self._band.taken]
-
-    @cached_property
-    def _ksp(self) -> PETSc.KSP:
-        # Natural: the interior dofs are numbered for it.
-        own = self._T.dim == 2 and self._T.num_interior < MUMPS_ROWS
-        return direct_solver(self._stiffness.mat, "natural", OPTIONS, own=own)
-
-    @cached_property
-    def is_iterative(self) -> bool:
-        """Whether systems are solved by conjugate gradients: those of large solid arms."""
-        T = self._T
-        if T.dim == 2 or has_options(OPTIONS):
-            return False
-        wide = T.num_dofs > TETRAHEDRA_ROWS if self._irregular else T.bandwidth > self._widest
-        return wide or self._memory_is_short()
-
-    @property
-    def _widest(self) -> int:
-        """Bandwidth beyond which regular meshes are solved by conjugate gradients."""
-        return WIDEST
-
-    def _memory_is_short(self) -> bool:
-        """Return whether a factor would take too much of a machine's free memory (collective)."""
-        T, rows, here = self._T, self._T.num_dofs, MPI.Get_processor_name()
-        share = T.comm.allgather(here).count(here) / T.comm.size
-        factor = share * FACTOR_BYTES * rows * (rows / FACTOR_ROWS) ** FACTOR_EXPONENT
-        short = rows > FACTOR_ROWS and _is_too_much(T.comm, factor)
-        return bool(T.comm.allreduce(short, op=MPI.LOR))
-
-    @cached_property
-    def _boxed(self) -> BoxSolver | None:
-        """Conjugate gradients of a box, where the user gives no options of other ones."""
-        from dolfinopt.fem.multigrid import PREFIX
-
-        if self._box is None or has_options(PREFIX):
-            return None
-        return self._solver_of(self._box)
-
-    def _solver_of(self, box: Box) -> BoxSolver:
-        from dolfinopt.fem.box_multigrid import BoxSolver
-
-        return BoxSolver(box, False, self.tolerance)
-
-    @cached_property
-    def _algebraic(self) -> AlgebraicSolver:
-        from dolfinopt.fem.multigrid import AlgebraicSolver
-
-        self._tell_rigid_motions()
-        return AlgebraicSolver(self._stiffness.mat, self.tolerance)
-
-    @property
-    def iterative(self) -> BoxSolver | AlgebraicSolver:
-        """The iterative solver, of the design that asked last."""
-        return self._boxed or self._algebraic
-
-    def _tell_rigid_motions(self) -> None:
-        from dolfinopt.fem.multigrid import with_rigid_motions
-
-        T = self._T
-        with_rigid_motions(self._stiffness.mat, T.points[T.interior_nodes])
-
-    @property
-    def solver_name(self) -> str:
-        """What solves the systems (collective)."""
-        if self.is_iterative:
-            return ITERATIVE
-        if self._band is not None:
-            return "LAPACK's band"
-        return str(self._ksp.getPC().getFactorSolverType())
-
-    def factorise(self, K: Stiffness) -> Factor:
-        """Return the factor of K_II; nothing is done if K was the last one (collective)."""
-        if self._factor is not None and self._factorised is K:
-            return self._factor
-        self._factorised = None
-        with self._profile.phase("factorisation"):
-            self._factor = self._refreshed(K) if self.is_iterative else self._direct(K)
-        self._profile.counts.factorisations += 1
-        self._factorised = K
-        return self._factor
-
-    def _direct(self, K: Stiffness) -> Factor:
-        band = self._band
-        # What rounding has made indefinite PETSc factorises all the same; whether the result is
-        # worth anything is judged by it.
-        if band is not None and band.factorise(K.data[self._band_source]):
-            return band
-        return self._petsc(K)
-
-    def _refreshed(self, K: Stiffness) -> BoxSolver | AlgebraicSolver:
-        """Return the iterative solver of K_II (collective)."""
-        self._asked = K.scale
-        if self._boxed is not None:
-            self.__dict__.pop("_algebraic", None)
-            self._boxed.update(K.scale)
-            self._young = self._asked
-            return self._boxed
-        self.stiffness(K)
-        if "_algebraic" in self.__dict__:
-            self._algebraic.update()
-        self._note_hierarchy()
-        return self._algebraic
-
-    def _note_hierarchy(self) -> None:
-        """Remember whose hierarchy it is, if it is a new one."""
-        if self._boxed is None and self._algebraic.grid.setups != self._setups:
-            self._setups, self._young = self._algebraic.grid.setups, self._asked
-
-    def solve(
-        self, K: Stiffness, right: np.ndarray, purpose: str, held: np.ndarray | None = None
-    ) -> tuple[np.ndarray, bool]:
-        """Return K_II^-1 right (num_interior, k) and whether that failed (collective).
-
-        Conjugate gradients set out from the best in the space of the last solutions for the same
-        purpose, which the design before has left; of `held` see `BlockConjugateGradients.solve`.
-        """
-        factor = self.factorise(K)
-        if not self.is_iterative:
-            return factor.solve(right), factor.failed
-        if right.shape[1] == 0:
-            return right.copy(), False
-        out, failed = self._iterated(K, right, self._solutions.get(purpose), held=held)
-        if purpose:
-            self._solutions[purpose] = out
-        return out, failed
-
-    def _iterated(
-        self,
-        K: Stiffness,
-        right: np.ndarray,
-        guess: np.ndarray | None = None,
-        tolerance: float | None = None,
-        held: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, bool]:
-        """Return the iterative solution, and whether that failed (collective)."""
-        solver = self._boxed
-        if solver is not None:
-            out = solver.solve(right, guess, tolerance, held)
-            if not solver.failed:
-                return out, False
-            self.stiffness(K)  # this design alone is solved with aggregates
-        out = self._algebraic.solve(right, guess, tolerance, held)
-        self._note_hierarchy()
-        return out, self._algebraic.failed
-
-    @property
-    def guesses(self) -> Guesses | None:
-        """What the next iterative solves set out from; None where there is nothing."""
-        if self._young is None:
-            return None
-        if self._boxed is not None:
-            return Guesses(dict(self._solutions), self._young, False, (-1.0, 0.0))
-        gradual = self._algebraic.grid.gradual
-        return Guesses(dict(self._solutions), self._young, gradual, self._algebraic.progress)
-
-    def set_guesses(self, guesses: Guesses | None, K: Stiffness | None) -> None:
-        """Let the next iterative solves set out from what was `guesses` (collective).
-
-        Args:
-            guesses: None where there was nothing.
-            K: assembled for `guesses.young`, where the hierarchy is another design's; or None.
-        """
-        if guesses is None:
-            self._solutions, self._young, self._setups = {}, None, 0
-            self._factor = self._factorised = None
-            self.__dict__.pop("_algebraic", None)
-            return
-        self._solutions = dict(guesses.fields)
-        if self._boxed is not None:  # whose grids are those of any design
-            self._young = guesses.young
-            return
-        if K is not None:
-            self._factor = self._factorised = None
-            self.stiffness(K)
-            known = "_algebraic" in self.__dict__
-            grid = self._algebraic.grid
-            grid.gradual = guesses.gradual
-            if known or grid.gradual:
-                grid.make()
-            self._young, self._setups = guesses.young, grid.setups
-            self._stiffness_of = None  # the matrix is to be given free
-        self._algebraic.progress = guesses.progress
-
-    def has_hierarchy_of(self, guesses: Guesses) -> bool:
-        """Return whether the hierarchy at hand is that of these guesses (collective)."""
-        if self._boxed is not None:
-            return True
-        mine = self._young is not None and np.array_equal(self._young, guesses.young)
-        mine = mine and self._algebraic.grid.gradual == guesses.gradual
-        return self._T.comm.allreduce(mine, op=MPI.LAND)
-
-    def inverse(self, K: Stiffness, right: np.ndarray) -> np.ndarray:
-        """Return K_II^-1 times a vector (num_interior,), to nearly all digits."""
-        factor = self.factorise(K)
-        if self.is_iterative:
-            return self._iterated(K, right, tolerance=KRYLOV_TOLERANCE)[0]
-        return factor.solve(right)
-
-    def multigrid(self, K: Stiffness) -> tuple[Columns, Columns]:
-        """Return products with K_II and its approximate inverse, of an iterative solver."""
-        self.factorise(K)
-        return self.iterative.times, self.iterative.cycle
-
-    @cached_property
-    def _nodes(self) -> InteriorEntries:
-        dim = self._T.dim
-        numbers = self._T.numbers[0::dim]
-        return interior_entries(self._patterns[1], 1, np.where(numbers < 0, -1, numbers // dim))
-
-    def node_mass(self, M: sp.csr_matrix) -> sp.csr_matrix:
-        """Return M_II of one displacement component, on the arm's only rank; M acts on nodes."""
-        if self._node_mass_of is not M:
-            nodes, size = self._nodes, self._T.num_interior // self._T.dim
-            starts = np.searchsorted(nodes.rows, np.arange(size + 1))
-            values = M.data[nodes.source]
-            self._node_mass = sp.csr_matrix((values, nodes.columns, starts), (size, size))
-            self._node_mass_of = M
-        return self._node_mass
-
-    def _petsc(self, K: Stiffness) -> PetscFactor:
-        self._ksp.setOperators(self.stiffness(K))
-        with obeying_options(OPTIONS):
-            self._ksp.setUp()
-        return PetscFactor(self._ksp)
-
-    def stiffness(self, K: Stiffness) -> PETSc.Mat:
-        """Return K_II, owned by this object (collective)."""
-        if self._stiffness_of is not K:
-            # Those of PETSc would follow the matrix.
-            algebraic = self.is_iterative and self._boxed is None
-            if isinstance(self._factor, PetscFactor) or algebraic:
-                self._factorised = None
-            self._stiffness.update(K.data)
-            self._stiffness_of = K
-        return self._stiffness.mat
-
-    def mass(self, M: sp.csr_matrix) -> PETSc.Mat:
-        """Return M_II, owned by this object (collective); M acts on nodes."""
-        if self._mass_of is not M:
-            self._mass.update(M.data)
-            self._mass_of = M
-        return self._mass.mat
+    return replace(
+        inner,
+        rows=rows,
+        num_rows=T.num_dofs,
+        bandwidth=width if T.comm.size == 1 else inner.bandwidth,
+        entries=entries,
+        has_interfaces=True,
+    )
 
 
-class ExtendedSystem(InteriorSystem):
-    """[K_II, K_Ib; K_bI, K_bb] of a solid: a load of its outboard interfaces takes one solution.
-
-    The interfaces' coordinates are the last rank's last rows: two nodes an interface, one for its
-    displacement, one for its rotation. Rigid motions of the body are known of these, too, so
-    multigrid needs few more steps than for K_II.
-    """
-
-    def __init__(
-        self,
-        T: InterfaceTransformation,
-        stiffness: AffineMatrix | CellMatrix,
-        mass: AffineMatrix | CellMatrix,
-        profile: Profile,
-        tolerance: float | None,
-        irregular: bool,
-        box: Box | None,
-        near: np.ndarray,
-    ):
-        """Set up as an `InteriorSystem`.
-
-        Args:
-            T, stiffness, mass, profile, tolerance, irregular, box: see there.
-            near: interior dofs of this rank that an outboard interface's coordinates couple with.
-        """
-        super().__init__(T, stiffness, mass, profile, tolerance, irregular, box)
-        self.near = near
-        self._is_last = T.comm.rank == T.comm.size - 1
-
-    def _solver_of(self, box: Box) -> BoxSolver:
-        from dolfinopt.fem.box_multigrid import BoxSolver
-
-        exact = max(LEAST_STATICS_TOLERANCE, STATICS_TOLERANCE_SHARE * self.tolerance)
-        return BoxSolver(box, True, min(self.tolerance, exact))
-
-    @property
-    def _widest(self) -> int:
-        return WIDEST if self._boxed is None else min(WIDEST, WIDEST_OF_STATICS)
-
-    @property
-    def is_worth_it(self) -> bool:
-        """Whether factors take no longer than those of the interior (collective)."""
-        alone = self._T.comm.size == 1
-        return (
-            not alone
-            or self.is_iterative
-            or self._bandwidth <= EXTENDED_BANDWIDTH_RATIO * self._T.bandwidth
-        )
-
-    @property
-    def _bandwidth(self) -> int:
-        return max(
-            self._T.bandwidth, self._num_rows - 1 - int(self.near.min(initial=self._num_rows))
-        )
-
-    @property
-    def _num_rows(self) -> int:
-        return self._T.num_interior + (self._T.num_coordinates if self._is_last else 0)
-
-    @cached_property
-    def _entries(self) -> InteriorEntries:
-        T, inner, near = self._T, super()._entries, self.near
-        b, size = T.num_coordinates, T.num_dofs - T.num_coordinates
-        outer = size + np.arange(b)
-        first = T.comm.exscan(T.num_interior) or 0
-        rows, columns = np.repeat(first + near, b), np.tile(outer, len(near))
-        sides = [(rows, columns), (columns, rows)]
-        places = np.arange(rows.size)
-        sources = [places, places]
-        if self._is_last:
-            sides.append((np.repeat(outer, b), np.tile(outer, b)))
-            sources.append(rows.size + np.arange(b * b))
-        rows, columns = (np.concatenate(each) for each in zip(*sides, strict=True))
-        source = self._patterns[0].nnz * self._block**2 + np.concatenate(sources)
-        order = np.lexsort((columns, rows))
-        rows = np.append(inner.rows, rows[order].astype(inner.rows.dtype))
-        # Sorted already but for the rows beside the interfaces, whose last entries these are.
-        merged = np.argsort(rows, kind="stable")
-        columns = np.append(inner.columns, columns[order].astype(PETSc.IntType))
-        source = np.append(inner.source, source[order].astype(inner.source.dtype))
-        return InteriorEntries(rows[merged], columns[merged], source[merged])
-
-    def _tell_rigid_motions(self) -> None:
-        from dolfinopt.fem.multigrid import with_motions
-
-        T = self._T
-        parts: list[np.ndarray] = [rigid_motions(T.points[T.interior_nodes]).reshape(-1, 6)]
-        if self._is_last:
-            for motion in rigid_motions(T.places):
-                parts += [motion, np.eye(6)[3:]]
-        with_motions(self._stiffness.mat, np.concatenate(parts))
-
-    def _owned(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
-        return np.concatenate([interior, outboard]) if self._is_last else interior
-
-    def solve_loads(
-        self, K: ExtendedStiffness, loads: np.ndarray, purpose: str
-    ) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Return what loads (b, k) of the interfaces do, and whether that failed (collective).
-
-        Args:
-            K: of the design.
-            loads: forces and moments, N, N m.
-            purpose: see `solve`; of the last solution the interior is kept, and the interfaces'
-                displacements are any.
-
-        Returns:
-            Owned interior rows (num_interior, k), and the outboard ones (b, k) on every rank.
-        """
-        T = self._T
-        size, b = T.num_interior, T.num_coordinates
-        factor = self.factorise(K)
-        right = self._owned(np.zeros((size, loads.shape[1])), loads)
-        if self.is_iterative:
-            guess = self._solutions.get(purpose)
-            if guess is not None:
-                fixed = np.hstack([np.zeros((b, guess.shape[1])), np.eye(b)])
-                guess = self._owned(np.hstack([guess, np.zeros((size, b))]), fixed)
-            out, failed = self._iterated(K, right, guess)
-            self._solutions[purpose] = out[:size].copy()
-        else:
-            out, failed = factor.solve(right), factor.failed
-        return out[:size], T.comm.bcast(out[size:], root=T.comm.size - 1), failed
+def _with_border(
+    inner: InteriorEntries, T: InterfaceTransformation, num_entries: int, near: np.ndarray
+) -> InteriorEntries:
+    """Return the entries of K_II, sorted, with those of the interfaces' rows and columns."""
+    b, size = T.num_coordinates, T.num_dofs - T.num_coordinates
+    outer, first = size + np.arange(b), T.comm.exscan(T.num_interior) or 0
+    rows, columns = np.repeat(first + near, b), np.tile(outer, len(near))
+    places = np.arange(rows.size)
+    sides = [(inner.rows, inner.columns), (rows, columns), (columns, rows)]
+    sources = [inner.source, num_entries + places, num_entries + places]
+    if T.comm.rank == T.comm.size - 1:
+        sides.append((np.repeat(outer, b), np.tile(outer, b)))
+        sources.append(num_entries + rows.size + np.arange(b * b))
+    rows, columns = (np.concatenate(each) for each in zip(*sides, strict=True))
+    order = np.lexsort((columns, rows))
+    kind = PETSc.IntType
+    return InteriorEntries(
+        rows[order].astype(kind), columns[order].astype(kind), np.concatenate(sources)[order]
+    )

@@ -1,531 +1,572 @@
-"""Conjugate gradients and algebraic multigrid for many right sides at once.
+"""Conjugate gradients with geometric multigrid for a box of equal hexahedra.
 
-PETSc's GAMG makes the hierarchy; the cycles are done here, for all right sides together: a matrix
-is then read once for all of them, in blocks of nodes, which takes a quarter of the time of one
-product after the other.
+The stiffness is never assembled: products with K on the mesh are one dense product of the cells'
+one matrix with all cells' nodal values, scaled by Young's modulus. Coarser grids leave out lines of
+the mesh; their operators are P' K P (Galerkin), summed from the cells that a coarse cell holds,
+since P in a coarse cell is trilinear. Directions with much longer cells than others are coarsened
+later.
+
+The whole box is held by the root of its ranks, which solves for all: a second rank saves nothing.
+
+Source: Trottenberg, Oosterlee & Schüller, Multigrid (2001), sections 2.4, 5.1 and 7.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from itertools import product
 from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
-from petsc4py import PETSc
 
+from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
+from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
 from dolfinopt.fem.measured import (
-    INDEPENDENT_LENGTH_SHARE,
-    KEPT_HIERARCHY_RATIO,
-    LANCZOS_ITERATIONS,
+    BOX_CHUNK_COLUMNS,
+    COARSENED_EDGE_RATIO,
+    COARSEST_BAND_WORK,
     RIGHT_SIDES_CHUNK,
-    SMOOTHED_LOWER_SHARE,
-    SMOOTHED_UPPER_SHARE,
-    SOLUTION_ROUNDING_ERROR,
+    ROUNDING_SHARE,
+    SAME_PLACE_SHARE,
+    SMOOTHED_SHARE,
     SOLVER_ITERATIONS,
-    STEPS_A_DIGIT_LIMIT,
-    ZERO_DIAGONAL_SHARE,
 )
 from dolfinopt.parallel import on_root
+from dolfinopt.solver import BandCholesky
+
+AXES = (0, 2, 1)  # directions in the order of nodes: along, thickness, height; the last is fastest
+CORNERS = tuple(product((0, 1), repeat=3))  # of a cell, in these directions
 
 Columns = Callable[[np.ndarray], np.ndarray]
-PREFIX = "dolfinopt_multigrid_"  # of the PETSc options of the hierarchy
+NAME = "conjugate gradients"  # of the solver
 
 
-class Level:
-    """One matrix of the hierarchy and its products with blocks of vectors (rows, k)."""
+class Scaled(Protocol):
+    """K of one design, by Young's modulus (n_cells,) of this rank's cells, Pa."""
 
-    def __init__(self, matrix: PETSc.Mat, prolongation: PETSc.Mat | None):
-        """Set up.
-
-        Args:
-            matrix: AIJ, symmetric positive definite.
-            prolongation: from the next coarser level; None on the coarsest.
-        """
-        self.matrix, self.prolongation = matrix, prolongation
-        self._products: dict[tuple[str, int], tuple[PETSc.Mat, PETSc.Mat]] = {}
-        self.prepare()
-
-    def prepare(self) -> None:
-        """Take over the values of the matrix (collective)."""
-        self._blocked = _in_blocks(self.matrix)
-        self._products.clear()
-        diagonal = self.matrix.getDiagonal().array
-        largest = self.matrix.comm.tompi4py().allreduce(diagonal.max(initial=0.0), op=MPI.MAX)
-        # Aggregates of a node or two have fewer motions than six: rows of zeros.
-        zero = diagonal <= ZERO_DIAGONAL_SHARE * largest
-        self.inverse_diagonal = np.where(zero, 0.0, 1.0 / np.where(zero, 1.0, diagonal))[:, None]
-        self.__dict__.pop("bounds", None)
-
-    @cached_property
-    def restriction(self) -> PETSc.Mat:
-        """The transposed prolongation."""
-        assert self.prolongation is not None
-        return self.prolongation.copy().transpose()
-
-    @cached_property
-    def bounds(self) -> tuple[float, float]:
-        """The part of the scaled matrix' spectrum that is smoothed (collective)."""
-        x, y = self.matrix.createVecs()
-
-        def times(X: np.ndarray) -> np.ndarray:
-            x.array = X[:, 0]
-            self.matrix.mult(x, y)
-            return y.array_r.copy()[:, None]
-
-        comm = self.matrix.comm.tompi4py()
-        highest = largest_eigenvalue(comm, times, np.sqrt(self.inverse_diagonal[:, 0]))
-        return SMOOTHED_LOWER_SHARE * highest, SMOOTHED_UPPER_SHARE * highest
-
-    def times(self, X: np.ndarray) -> np.ndarray:
-        """Return A X."""
-        return self._product("A", self._blocked, X)
-
-    def restricted(self, X: np.ndarray) -> np.ndarray:
-        """Return P' X."""
-        return self._product("R", self.restriction, X)
-
-    def prolonged(self, X: np.ndarray) -> np.ndarray:
-        """Return P X."""
-        return self._product("P", self.prolongation, X)
-
-    def _product(self, name: str, mat: PETSc.Mat, X: np.ndarray) -> np.ndarray:
-        key = name, X.shape[1]
-        if key not in self._products:
-            (_, _), (rows, size) = mat.getSizes()
-            dense = PETSc.Mat().createDense(((rows, size), (None, X.shape[1])), comm=mat.comm)
-            dense.setUp()
-            dense.assemble()
-            self._products[key] = dense, mat.matMult(dense)
-        dense, result = self._products[key]
-        dense.getDenseArray()[:] = X
-        mat.matMult(dense, result)
-        return result.getDenseArray().copy(order="F")
-
-    def smooth(self, residual: np.ndarray, last: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return a correction and the residual that it leaves, see `chebyshev`."""
-        return chebyshev(self.times, self.inverse_diagonal, self.bounds, residual, last)
+    @property
+    def scale(self) -> np.ndarray: ...
 
 
-def chebyshev(
-    times: Columns,
-    inverse_diagonal: np.ndarray,
-    bounds: tuple[float, float],
-    residual: np.ndarray,
-    last: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the correction by Chebyshev's polynomial of degree 2, and the residual that it leaves.
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box of equal cells of several ranks, clamped at its first nodes, rigid at its last ones.
 
-    Args:
-        times: product with the matrix.
-        inverse_diagonal: (rows, 1) of the matrix.
-        bounds: the part of the diagonally scaled matrix' spectrum that is smoothed.
-        residual: (rows, k).
-        last: whether the residual that is left is not needed.
-    """
-    low, high = bounds
-    theta, delta = 0.5 * (high + low), 0.5 * (high - low)
-    rho = delta / theta
-    step = (inverse_diagonal / theta) * residual
-    residual = residual - times(step)
-    again = 1.0 / (2.0 * theta / delta - rho)
-    second = (again * rho) * step + (2.0 * again / delta) * (inverse_diagonal * residual)
-    if not last:
-        residual = residual - times(second)
-    return step + second, residual
-
-
-def _in_blocks(matrix: PETSc.Mat) -> PETSc.Mat:
-    """Return an AIJ matrix of blocks as a BAIJ matrix; PETSc's own conversion takes ten times."""
-    block = matrix.getBlockSize()
-    if block == 1:
-        return matrix
-    indptr, columns, values = matrix.getValuesCSR()
-    shape = len(indptr) - 1, matrix.getSize()[1]
-    blocks = sp.csr_matrix((values, columns, indptr), shape=shape).tobsr((block, block))
-    csr = blocks.indptr.astype(PETSc.IntType), blocks.indices.astype(PETSc.IntType), blocks.data
-    return PETSc.Mat().createBAIJ(matrix.getSizes(), block, csr=csr, comm=matrix.comm)
-
-
-def largest_eigenvalue(comm: MPI.Comm, times: Columns, scale: np.ndarray) -> float:
-    """Return an estimate of the largest eigenvalue of S A S from below, S = diag(scale).
-
-    Args:
-        comm: the ranks that share the rows.
-        times: product of A with columns (rows, 1).
-        scale: of the owned rows.
-    """
-    first, size = comm.exscan(len(scale)) or 0, comm.allreduce(len(scale))
-    v = np.modf(np.abs(np.sin(12.9898 * np.arange(first + 1.0, first + len(scale) + 1.0))) * 1e4)[0]
-    v -= 0.5
-    v /= np.sqrt(comm.allreduce(v @ v))
-    before, beta = np.zeros_like(v), 0.0
-    diagonal, beside = [], []
-    for _ in range(min(LANCZOS_ITERATIONS, size)):
-        w = scale * times((scale * v)[:, None])[:, 0] - beta * before
-        alpha = comm.allreduce(w @ v)
-        w -= alpha * v
-        beta = float(np.sqrt(comm.allreduce(w @ w)))
-        diagonal.append(alpha)
-        beside.append(beta)
-        if beta <= 1e-12 * abs(alpha):
-            break
-        before, v = v, w / beta
-    T = np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1)
-    return float(np.linalg.eigvalsh(T)[-1])
-
-
-class Multigrid:
-    """A hierarchy for one matrix after another of the same pattern.
+    Nodes and cells are numbered direction by direction, see `AXES`, for all ranks together.
 
     Attributes:
-        setups: how often prolongations were made.
-        gradual: from now on by aggregates of neighbours alone, not of neighbours' neighbours, too.
+        comm: the ranks.
+        shape: number of cells by direction.
+        edges: of a cell, m.
+        stiffness: (24, 24) k_e, corners as in `CORNERS`, three components each.
+        cells: (n_cells,) numbers of the ranks' own cells, rank after rank.
+        nodes: numbers of their interior nodes, counted from the first interior one.
+        owned: which of these are this rank's.
+        rigid: (n, 3, 6) motions of the last nodes by the outboard coordinates.
     """
 
-    def __init__(self, matrix: PETSc.Mat):
-        """Make the hierarchy of an AIJ matrix with its near-nullspace (collective)."""
-        self.matrix = matrix
-        self.setups, self.gradual = 0, False
-        self._hierarchy: PETSc.PC | None = None
-        self.make()
+    comm: MPI.Comm
+    shape: tuple[int, ...]
+    edges: np.ndarray
+    stiffness: np.ndarray
+    cells: np.ndarray
+    nodes: np.ndarray
+    owned: slice
+    rigid: np.ndarray
 
-    def make(self) -> None:
-        """Make the prolongations anew for the matrix' values (collective)."""
-        pc = _gamg(self.matrix, self.gradual)
-        count = pc.getMGLevels()
-        prolongations = [pc.getMGInterpolation(level) for level in range(count - 1, 0, -1)]
-        self.levels = [Level(self.matrix, prolongations[0] if prolongations else None)]
-        for k in range(1, count):
-            below = prolongations[k] if k < count - 1 else None
-            coarse = pc.getMGSmoother(count - 1 - k).getOperators()[0]
-            self.levels.append(Level(coarse, below))
-        self._hierarchy = pc
-        self.setups += 1
-        self._factorise()
+    @property
+    def layer(self) -> int:
+        """Nodes of a cross-section."""
+        return (self.shape[1] + 1) * (self.shape[2] + 1)
 
-    def update(self) -> None:
-        """Take over new values of the matrix with the prolongations at hand (collective)."""
-        self.levels[0].prepare()
-        for fine, coarse in zip(self.levels[:-1], self.levels[1:], strict=True):
-            with quick_products(fine.matrix):
-                if self._hierarchy is None:
-                    fine.matrix.ptap(fine.prolongation, result=coarse.matrix)
-                else:  # up to now they were GAMG's
-                    block = coarse.matrix.getBlockSize()
-                    coarse.matrix = fine.matrix.ptap(fine.prolongation)
-                    coarse.matrix.setBlockSize(block)
-            coarse.prepare()
-        if self._hierarchy is not None:
-            self._hierarchy.destroy()
-            self._hierarchy = None
-        self._factorise()
 
-    def _factorise(self) -> None:
-        """Invert the coarsest matrix, on every rank."""
-        coarse = self.levels[-1].matrix
-        comm = coarse.comm.tompi4py()
-        indptr, columns, values = coarse.getValuesCSR()
-        mine = np.zeros((len(indptr) - 1, coarse.getSize()[1]))
-        mine[np.repeat(np.arange(len(mine)), np.diff(indptr)), columns] = values
-        whole = np.concatenate(comm.allgather(mine))
-        self._first = coarse.getOwnershipRange()[0]
-        self._coarse = np.linalg.pinv(0.5 * (whole + whole.T), hermitian=True)
+def box_of(T: InterfaceTransformation, cells: Cells, centroid: np.ndarray) -> Box | None:
+    """Return the box that an arm's cells fill, or None where they are no such box (collective).
+
+    Args:
+        T: its interfaces.
+        cells: with one stiffness where all are alike.
+        centroid: (n_cells, 3) of this rank's, m.
+    """
+    comm, places = T.comm, T.points[:, AXES]
+    if len(cells.stiffness) != 1 or cells.num_nodes != 8 or len(T.ends) != 1:
+        return None
+    low = comm.allreduce(places.min(axis=0, initial=np.inf), op=np.minimum)
+    high = comm.allreduce(places.max(axis=0, initial=-np.inf), op=np.maximum)
+    corners = places[cells.operators.cells[:1]]
+    first = next(one for one in comm.allgather(corners) if len(one))[0]
+    edges = np.ptp(first, axis=0)
+    counts = np.rint((high - low) / edges)
+    shape = tuple(int(n) for n in counts)
+
+    def numbered(x: np.ndarray, shift: float, size: tuple[int, ...]) -> tuple[np.ndarray, bool]:
+        """Return the numbers of places on a grid, and whether they are there."""
+        steps = (x - low) / edges - shift
+        at = np.rint(steps)
+        there = np.abs(steps - at).max(initial=0.0) < SAME_PLACE_SHARE * counts.max()
+        inside = (at >= 0).all() and (at < size).all()
+        if not (there and inside):
+            return np.zeros(len(x), dtype=int), False
+        return np.ravel_multi_index(at.astype(int).T, size), True
+
+    lines = tuple(n + 1 for n in shape)
+    layer = lines[1] * lines[2]
+    by_node, fits = numbered(places, 0.0, lines)
+    by_cell, fit = numbered(centroid[:, AXES], 0.5, shape)
+    inner = (by_node >= layer) & (by_node < shape[0] * layer)
+    clamped = by_node < layer
+    fits = fits and fit and bool((clamped == T.inboard).all())
+    fits = fits and bool((inner == ~(T.inboard | T.outboard)).all())
+    found = np.concatenate(comm.allgather(by_cell))
+    whole = len(found) == np.prod(shape) == len(np.unique(found))
+    if not comm.allreduce(fits and whole and shape[0] > 1, op=MPI.LAND):
+        return None
+    away = first - first.min(axis=0) - edges * np.array(CORNERS)[:, None]
+    order = np.abs(away).sum(axis=2).argmin(axis=1)  # of the cell's nodes
+    dofs = (3 * order[:, None] + np.arange(3)).ravel()
+    end = np.indices((1, *lines[1:])).reshape(3, -1).T * edges + [high[0], *low[1:]]
+    count = len(T.interior_nodes)
+    before = comm.exscan(count) or 0
+    return Box(
+        comm,
+        shape,
+        edges,
+        cells.stiffness[0][np.ix_(dofs, dofs)],
+        found,
+        np.concatenate(comm.allgather(by_node[T.interior_nodes])) - layer,
+        slice(before, before + count),
+        rigid_motions(end[:, AXES] - T.places[0]),
+    )
+
+
+# -- levels: rows are three a node of the interior, then those of the rigid coordinates, if any ----
+
+
+class Level(Protocol):
+    """K on one grid.
+
+    Attributes:
+        inverse_diagonal: (rows, 1), 0 for the rigid coordinates, which coarser grids alone correct.
+        highest: no less than the largest eigenvalue of the diagonally scaled matrix.
+    """
+
+    inverse_diagonal: np.ndarray
+    highest: float
+
+    def update(self, young: np.ndarray) -> None:
+        """Take Young's modulus (n_cells,) of the box's cells, Pa."""
 
     def times(self, X: np.ndarray) -> np.ndarray:
-        """Return A X."""
+        """Return K X (rows, k)."""
+
+
+class Mesh:
+    """K on the mesh's own grid, by its cells; the interior's rows are component after component.
+
+    See `Level`.
+    """
+
+    def __init__(self, box: Box, rigid: np.ndarray):
+        """Set up, with the rigid coordinates as rows for `rigid` (n, 3, b) motions of the end."""
+        self._box, self._layer, self._rigid = box, box.layer, rigid.transpose(1, 0, 2)
+        lines = tuple(n + 1 for n in box.shape)
+        self._size = int(np.prod(lines))
+        self._interior = 3 * (self._size - 2 * self._layer)
+        self._rows = self._interior + rigid.shape[2]
+        _, z, y = lines
+        # A cell has the number of its first node; those of the last lines are none, with E = 0.
+        self._offsets = [(a * z + c) * y + b for a, c, b in CORNERS]
+        self._count = self._size - self._offsets[-1]
+        self._young = np.zeros(lines)
+        self.highest = _highest(box.stiffness[None])
+
+    def update(self, young: np.ndarray) -> None:
+        """See `Level`."""
+        x, z, y = shape = self._box.shape
+        self._young[:x, :z, :y] = young.reshape(shape)
+        self._each = self._young.ravel()[: self._count]
+        diagonal = np.zeros((3, self._size))
+        entries = np.diag(self._box.stiffness).reshape(8, 3, 1)
+        for offset, one in zip(self._offsets, entries, strict=True):
+            diagonal[:, offset : offset + self._count] += one * self._each
+        self.inverse_diagonal = np.zeros((self._rows, 1))
+        self.inverse_diagonal[: self._interior, 0] = 1.0 / self._inner(diagonal).ravel()
+
+    def _inner(self, field: np.ndarray) -> np.ndarray:
+        return field[..., self._layer : -self._layer]
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """See `Level`."""
+        k, U = X.shape[1], np.zeros((3, X.shape[1], self._size))
+        for one, column in zip(U.swapaxes(0, 1), X[: self._interior].T, strict=True):
+            self._inner(one)[...] = column.reshape(3, -1)
+        U[..., -self._layer :] = (self._rigid @ X[self._interior :]).swapaxes(1, 2)
+        forces = self._forces(U)
+        out = np.empty((self._rows, k), order="F")
+        for one, column in zip(forces.swapaxes(0, 1), out.T, strict=True):
+            column[: self._interior].reshape(3, -1)[...] = self._inner(one)
+        end = forces[..., -self._layer :]
+        out[self._interior :] = np.einsum("cnb,ckn->bk", self._rigid, end)
+        return out
+
+    def _forces(self, U: np.ndarray) -> np.ndarray:
+        """Return K times fields (3, k, nodes) of all nodes."""
+        out, k = np.zeros_like(U), U.shape[1]
+        step = max(1, BOX_CHUNK_COLUMNS // k)
+        for start in range(0, self._count, step):
+            stop = min(start + step, self._count)
+            values = np.empty((8, 3, k, stop - start))
+            for offset, one in zip(self._offsets, values, strict=True):
+                one[...] = U[..., start + offset : stop + offset]
+            forces = (self._box.stiffness @ values.reshape(24, -1)).reshape(values.shape)
+            forces *= self._each[start:stop]
+            for offset, one in zip(self._offsets, forces, strict=True):
+                out[..., start + offset : stop + offset] += one
+        return out
+
+
+class Grid:
+    """K of a coarser grid, P' K P of the box's cells; the interior's rows are node after node.
+
+    See `Level`.
+
+    Attributes:
+        expansion: (3 n_nodes, rows) displacements of all nodes by the rows: none of the clamped
+            ones, rigid ones at the end.
+    """
+
+    def __init__(self, box: Box, kept: Sequence[np.ndarray], rigid: np.ndarray):
+        """Lay down the pattern; `kept` are lines of the mesh, `rigid` (n, 3, b) of their end."""
+        lines = tuple(len(one) for one in kept)
+        number = np.arange(np.prod(lines)).reshape(lines)
+        sides = slice(None, -1), slice(1, None)
+        corners = [number[tuple(sides[i] for i in one)].ravel() for one in CORNERS]
+        self._pairs = NodePairs(np.column_stack(corners), number.size)
+        self._by_kind, self._stiffness = _cells_by_kind(box, kept)
+        self.highest = _highest(self._stiffness)
+        end = rigid.reshape(3 * len(rigid), rigid.shape[2])
+        inner = 3 * number.size - 2 * len(end)
+        clamped = sp.csr_matrix((len(end), inner + end.shape[1]))
+        interior = sp.eye(inner, inner + end.shape[1])
+        self.expansion = sp.vstack(
+            [clamped, interior, sp.hstack([sp.csr_matrix((len(end), inner)), end])], format="csr"
+        )
+        self._restriction = self.expansion.T.tocsr()
+        self._inner = slice(len(end), len(end) + inner)
+
+    def update(self, young: np.ndarray) -> None:
+        """See `Level`."""
+        by_kind = self._by_kind  # whose entries are the numbers of the box's cells
+        values = young[by_kind.data], by_kind.indices, by_kind.indptr
+        stiffness = self._stiffness.reshape(len(self._stiffness), -1)
+        cells = sp.csr_matrix(values, by_kind.shape) @ stiffness
+        matrix = CellMatrix(self._pairs, cells.reshape(-1, 24, 24))
+        self._matrix = matrix.assemble(np.ones(len(cells)))
+        diagonal = self._matrix.diagonal()[self._inner]
+        self.inverse_diagonal = np.zeros((self.expansion.shape[1], 1))
+        self.inverse_diagonal[: len(diagonal), 0] = 1.0 / diagonal
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """See `Level`."""
+        return self._restriction @ (self._matrix @ (self.expansion @ X))
+
+    def assembled(self) -> sp.coo_matrix:
+        """Return the matrix of the rows."""
+        return (self._restriction @ self._matrix.tocsr() @ self.expansion).tocoo()
+
+    @property
+    def band_work(self) -> float:
+        """Rows times bandwidth squared."""
+        matrix = self._pairs.pattern
+        bandwidth = 3 * int((matrix.indices - matrix.nonzero()[0]).max()) + 2
+        return self.expansion.shape[1] * float(bandwidth) ** 2
+
+
+def _cells_by_kind(box: Box, kept: Sequence[np.ndarray]) -> tuple[sp.csr_matrix, np.ndarray]:
+    """Return the box's cells (coarse cells, kinds), and what those of each kind add to K.
+
+    Cells of a kind lie at the same place in equal coarse cells, those between the `kept` lines.
+
+    Returns:
+        A matrix whose entries are the cells' numbers, and (kinds, 24, 24) P' k_e P.
+    """
+    place, kinds, steps = [], [], []
+    for lines, count in zip(kept, box.shape, strict=True):
+        cell = np.searchsorted(lines, np.arange(count), side="right") - 1
+        ends = (np.add.outer([0, 1], np.arange(count)) - lines[cell]) / np.diff(lines)[cell]
+        each, kind = np.unique(ends, axis=1, return_inverse=True)
+        place.append(cell)
+        kinds.append(kind.ravel())
+        steps.append([np.column_stack([1.0 - xi, xi]) for xi in each.T])
+    shape = [len(lines) - 1 for lines in kept]
+    coarse = np.ravel_multi_index(np.ix_(*place), shape).ravel()
+    kind = np.ravel_multi_index(np.ix_(*kinds), [len(one) for one in steps]).ravel()
+    P = [np.kron(reduce(np.kron, one), np.eye(3)) for one in product(*steps)]
+    entries = sp.coo_matrix((np.arange(len(kind)), (coarse, kind)), (np.prod(shape), len(P)))
+    return entries.tocsr(), np.array([one.T @ box.stiffness @ one for one in P])
+
+
+def _highest(stiffness: np.ndarray) -> float:
+    """Return the largest eigenvalue of all diagonally scaled K that such matrices (n, m, m) add to.
+
+    No sum of positive semi-definite matrices has one larger than theirs.
+    """
+    scale = np.sqrt(np.einsum("eii->ei", stiffness))
+    scaled = stiffness / (scale[:, :, None] * scale[:, None])
+    return float(np.linalg.eigvalsh(scaled).max())
+
+
+class BoxMultigrid:
+    """K of a box on the mesh's and coarser grids, for one design after another.
+
+    Attributes:
+        levels: from the mesh to the coarsest grid.
+        steps: from each but the first, its prolongation and that transposed.
+        works: whether the coarsest matrix has a factor.
+    """
+
+    def __init__(self, box: Box, coordinates: bool):
+        """Choose the grids; `coordinates` says whether the rigid ones are rows."""
+        rigid = box.rigid if coordinates else box.rigid[..., :0]
+        self.levels: list[Mesh | Grid] = [Mesh(box, rigid)]
+        self.steps: list[tuple[sp.csr_matrix, sp.csr_matrix]] = []
+        self.works = False
+        lines = [np.arange(n + 1) for n in box.shape]
+        section = rigid.reshape(*(len(one) for one in lines[1:]), *rigid.shape[1:])
+        while True:
+            kept = coarser(lines, box.edges)
+            self._coarsest = Grid(box, kept, np.concatenate(section[np.ix_(*kept[1:])]))
+            P = prolongation(lines, kept, self._coarsest.expansion)
+            if not self.steps:  # rows component after component
+                inner = P.shape[0] - rigid.shape[2]
+                order = np.arange(inner).reshape(-1, 3).T.ravel()
+                P = P[np.append(order, np.arange(inner, P.shape[0]))]
+            self.levels.append(self._coarsest)
+            self.steps.append((P, P.T.tocsr()))
+            last = [len(one) for one in kept] == [len(one) for one in coarser(kept, box.edges)]
+            if last or self._coarsest.band_work <= COARSEST_BAND_WORK:
+                break
+            lines = kept
+
+    def update(self, young: np.ndarray) -> None:
+        """Take Young's modulus (n_cells,) of the cells in the box's order, Pa."""
+        for level in self.levels:
+            level.update(young)
+        matrix = self._coarsest.assembled()  # without zeros: patterns of designs differ
+        self._band = BandCholesky(matrix.row, matrix.col, matrix.shape[0])
+        self.works = self._band.factorise(matrix.data[self._band.taken])
+
+    def times(self, X: np.ndarray) -> np.ndarray:
+        """Return K X (rows, k)."""
         return self.levels[0].times(X)
 
     def cycle(self, B: np.ndarray, level: int = 0) -> np.ndarray:
-        """Return an approximation of A^-1 B, by one V-cycle, symmetric in B."""
+        """Return an approximation of K^-1 B, by one V-cycle, symmetric in B."""
         here = self.levels[level]
-        if level == len(self.levels) - 1:
-            comm = here.matrix.comm.tompi4py()
-            whole = np.concatenate(comm.allgather(B)) if comm.size > 1 else B
-            return (self._coarse @ whole)[self._first : self._first + len(B)]
-        X, residual = here.smooth(B, last=False)
-        correction = here.prolonged(self.cycle(here.restricted(residual), level + 1))
+        if here is self._coarsest:
+            return self._band.solve(B)
+        X, residual = smoothed(here, B, last=False)
+        P, R = self.steps[level]
+        correction = P @ self.cycle(R @ residual, level + 1)
         X += correction
-        return X + here.smooth(residual - here.times(correction), last=True)[0]
+        return X + smoothed(here, residual - here.times(correction), last=True)[0]
 
 
-def _gamg(matrix: PETSc.Mat, gradual: bool) -> PETSc.PC:
-    """Return GAMG's hierarchy of a matrix: smoothed aggregation; see `Multigrid.gradual`."""
-    pc = PETSc.PC().create(matrix.comm)
-    pc.setOptionsPrefix(PREFIX)
-    pc.setOperators(matrix)
-    pc.setType(PETSc.PC.Type.GAMG)
-    options = PETSc.Options(PREFIX)
-    ours = {"pc_gamg_threshold": "0.02", "pc_gamg_coarse_eq_limit": "300"}
-    ours |= {"mg_levels_ksp_max_it": "1", "mg_levels_esteig_ksp_max_it": "5"}
-    if gradual:  # the second word is that of newer versions
-        ours |= {"pc_gamg_square_graph": "0", "pc_gamg_aggressive_coarsening": "0"}
-    with _told(options, ours), quick_products(matrix):
-        pc.setFromOptions()
-        pc.setUp()
-    return pc
+def coarser(lines: Sequence[np.ndarray], edges: np.ndarray) -> list[np.ndarray]:
+    """Return every second one of the lines, in directions where cells are short; or all."""
+    length = np.array([np.diff(one).max() for one in lines]) * edges
+    least = [3, 2, 2]  # cells that can be joined: along, one layer of nodes stays between the ends
+    can = [len(one) > n for one, n in zip(lines, least, strict=True)]
+    longest = COARSENED_EDGE_RATIO * length[can].min(initial=np.inf)
+    return [
+        np.unique(np.append(one[::2], one[-1])) if ok and h <= longest else one
+        for one, ok, h in zip(lines, can, length, strict=True)
+    ]
 
 
-@contextmanager
-def quick_products(matrix: PETSc.Mat) -> Iterator[None]:
-    """Let PETSc make P' A P of A P on one rank: in 0.5 to 0.6 of the time its own choice takes."""
-    alone = matrix.comm.size == 1
-    with _told(PETSc.Options(), {"matptap_via": "rap"} if alone else {}):
-        yield
+def prolongation(
+    fine: Sequence[np.ndarray], coarse: Sequence[np.ndarray], expansion: sp.csr_matrix
+) -> sp.csr_matrix:
+    """Return the trilinear interpolation from a coarser grid, rows node after node.
+
+    Args:
+        fine, coarse: lines of both, by direction.
+        expansion: of the coarse grid's rows, see `Grid`.
+    """
+    along, *across = (_interpolation(*both) for both in zip(fine, coarse, strict=True))
+    nodes = reduce(sp.kron, [along[1:-1], *across, np.eye(3)]).tocsr()  # of interior nodes
+    inner = 3 * (len(coarse[0]) - 2) * len(coarse[1]) * len(coarse[2])
+    b = expansion.shape[1] - inner
+    return sp.vstack([nodes @ expansion, sp.eye(b, inner + b, k=inner)], format="csr")
 
 
-@contextmanager
-def _told(options: PETSc.Options, ours: dict[str, str]) -> Iterator[None]:
-    """Set options of ours where the user has set none."""
-    added = [key for key in ours if not options.hasName(key)]
-    for key in added:
-        options.setValue(key, ours[key])
-    try:
-        yield
-    finally:
-        for key in added:
-            options.delValue(key)
+def _interpolation(fine: np.ndarray, coarse: np.ndarray) -> sp.csr_matrix:
+    """Return the linear interpolation (fine, coarse) along one direction."""
+    cell = np.clip(np.searchsorted(coarse, fine, side="right") - 1, 0, len(coarse) - 2)
+    share = (fine - coarse[cell]) / (coarse[cell + 1] - coarse[cell])
+    at = np.arange(len(fine))
+    values = np.append(1.0 - share, share), (np.append(at, at), np.append(cell, cell + 1))
+    found = sp.csr_matrix(values, (len(fine), len(coarse)))
+    found.eliminate_zeros()
+    return found
 
 
-def with_motions(matrix: PETSc.Mat, motions: np.ndarray) -> None:
-    """Tell a matrix of blocks of three rows its near-nullspace (owned rows, 6) (collective)."""
-    matrix.setBlockSize(3)
-    gram = matrix.comm.tompi4py().allreduce(motions.T @ motions)
-    scale = 1.0 / np.sqrt(np.diag(gram))
-    inverse = np.linalg.inv(np.linalg.cholesky(gram * np.outer(scale, scale)))
-    vectors = []
-    for column in ((motions * scale) @ inverse.T).T:
-        vectors.append(matrix.createVecLeft())
-        vectors[-1].array = column
-    matrix.setNearNullSpace(PETSc.NullSpace().create(vectors=vectors, comm=matrix.comm))
+def smoothed(level: Level, residual: np.ndarray, last: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return the correction by Chebyshev's polynomial of degree 2, and the residual that it leaves.
+
+    Args:
+        level: whose matrix it is.
+        residual: (rows, k).
+        last: whether the residual that is left is not needed.
+    """
+    low, high = SMOOTHED_SHARE * level.highest, level.highest
+    theta, delta = 0.5 * (high + low), 0.5 * (high - low)
+    rho = delta / theta
+    step = (level.inverse_diagonal / theta) * residual
+    residual = residual - level.times(step)
+    again = 1.0 / (2.0 * theta / delta - rho)
+    second = (again * rho) * step + (2.0 * again / delta) * (level.inverse_diagonal * residual)
+    if not last:
+        residual = residual - level.times(second)
+    return step + second, residual
 
 
-def with_rigid_motions(matrix: PETSc.Mat, points: np.ndarray) -> None:
-    """Tell a matrix of three dofs a node, at points (n, 3), its near-nullspace (collective)."""
-    matrix.setBlockSize(3)
-    places = matrix.createVecLeft()
-    places.setBlockSize(3)
-    places.array = points.ravel()
-    matrix.setNearNullSpace(PETSc.NullSpace().createRigidBody(places))
+# -- conjugate gradients for many right sides at once -------------------------------------------
 
 
-# -- conjugate gradients for many right sides at once, preconditioned by multigrid -----------
-
-
-class Preconditioned(Protocol):
-    """A matrix with an approximate inverse, of the owned rows."""
-
-    def times(self, X: np.ndarray) -> np.ndarray:
-        """Return A X (rows, k)."""
-
-    def cycle(self, B: np.ndarray) -> np.ndarray:
-        """Return an approximation of A^-1 B (rows, k), symmetric positive definite."""
-
-
-class BlockConjugateGradients:
-    """K^-1 for blocks of right sides.
+def block_conjugate_gradients(
+    times: Columns, precondition: Columns, B: np.ndarray, tolerance: float, held: np.ndarray | None
+) -> tuple[np.ndarray, int]:
+    """Return K^-1 B (rows, k), and the number of steps, SOLVER_ITERATIONS where it fails.
 
     O'Leary's block conjugate gradients, with directions made orthonormal and dependent ones left
     out. All right sides share one space, which takes fewer steps than each by itself.
     Source: O'Leary, Linear Algebra Appl. 29 (1980) 293-322, doi:10.1016/0024-3795(80)90247-5;
     Ji & Li, BIT 57 (2017) 379-403, doi:10.1007/s10543-016-0631-z.
 
-    Attributes:
-        grid: K and its approximate inverse.
-        failed: the last solution did not converge.
-        steps: of the last solution.
-        digits: that its tolerance has asked for.
+    Args:
+        times: products with K.
+        precondition: those with an approximation of K^-1.
+        B: right sides (rows, k).
+        tolerance: of the residual in the norm of the preconditioner, relative to the right side's:
+            about that of the solution in energy.
+        held: (k,) energies, twice, of boundary motions before the solutions relax them, N m: the
+            tolerance is of what is left of them then.
     """
+    R, X = np.array(B, order="F"), np.zeros(B.shape, order="F")
+    Z = precondition(R)
+    own = np.einsum("nk,nk->k", R, Z)
 
-    def __init__(self, grid: Preconditioned, comm: MPI.Comm, tolerance: float):
-        """Set up.
+    def goal() -> np.ndarray:
+        """Return the squared tolerance (k,) of the residual."""
+        if held is None:
+            return tolerance**2 * own
+        left = held - np.einsum("nk,nk->k", B, X)  # falls to that of the whole field, step by step
+        return np.clip(tolerance**2 * left, ROUNDING_SHARE**2 * own, tolerance**2 * own)
 
-        Args:
-            grid: see above.
-            comm: the ranks that share the rows.
-            tolerance: of the residual in the norm of the preconditioner, relative to the right
-                side's: about that of the solution in energy.
-        """
-        self.grid, self._comm, self.tolerance = grid, comm, tolerance
-        self.failed, self.steps, self.digits = False, 0, 1.0
-
-    def solve(
-        self,
-        right: np.ndarray,
-        guess: np.ndarray | None = None,
-        tolerance: float | None = None,
-        held: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Return the solution (n, k) of the owned rows, so many columns at a time (collective).
-
-        Args:
-            right: of that shape.
-            guess: (n, m) fields in whose space there may be something like it; or None.
-            tolerance: in place of the own one.
-            held: (k,) energies, twice, of boundary motions before the solutions relax them, N m:
-                the tolerance is of what is left of them then.
-        """
-        tolerance = tolerance or self.tolerance
-        out, self.failed, most = np.empty_like(right), False, 0
-        self.digits = -np.log10(tolerance)
-        for first in range(0, right.shape[1], RIGHT_SIDES_CHUNK):
-            part = slice(first, first + RIGHT_SIDES_CHUNK)
-            energies = None if held is None else held[part]
-            out[:, part] = self._solve(right[:, part], guess, tolerance, energies)
-            most = max(most, self.steps)
-        self.steps = most
-        return out
-
-    def _dot(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        part = left.T @ right
-        return part if self._comm.size == 1 else self._comm.allreduce(part)
-
-    def _lengths(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        part = np.einsum("nk,nk->k", left, right)
-        return part if self._comm.size == 1 else self._comm.allreduce(part)
-
-    def _solve(
-        self,
-        B: np.ndarray,
-        guess: np.ndarray | None,
-        tolerance: float,
-        held: np.ndarray | None,
-    ) -> np.ndarray:
-        grid = self.grid
-        R = np.array(B, order="F")
-        Z = grid.cycle(R)
-        own = self._lengths(R, Z)
-        X = np.zeros_like(R)
-
-        def goal() -> np.ndarray:
-            """Return the squared tolerance (k,) of the residual."""
-            if held is None:
-                return tolerance**2 * own
-            left = held - self._lengths(B, X)  # falls to that of the whole field, step by step
-            return np.clip(
-                tolerance**2 * left, SOLUTION_ROUNDING_ERROR**2 * own, tolerance**2 * own
-            )
-
-        if guess is not None:  # the best of their space, in energy
-            P = self._orthonormal(guess)
-            Q = grid.times(P)
-            both = self._dot(P, np.concatenate([Q, R], axis=1))
-            energy, along = np.split(both, [P.shape[1]], axis=1)
-            step = np.linalg.solve(0.5 * (energy + energy.T), along)
-            X += P @ step
-            R -= Q @ step
-            Z = grid.cycle(R)
-        P = self._orthonormal(Z)
-        self.steps = 0
-        while not (self._lengths(R, Z) <= goal()).all():  # not a number included
-            if self.steps == SOLVER_ITERATIONS or P.shape[1] == 0 or not np.isfinite(P[:1]).all():
-                self.failed = True
-                break
-            Q = grid.times(P)
-            both = self._dot(P, np.concatenate([Q, R], axis=1))
-            energy, along = np.split(both, [P.shape[1]], axis=1)
-            inverse = np.linalg.inv(0.5 * (energy + energy.T))
-            step = inverse @ along
-            X += P @ step
-            R -= Q @ step
-            Z = grid.cycle(R)
-            self.steps += 1
-            P = self._orthonormal(Z - P @ (inverse @ self._dot(Q, Z)))
-        shares = np.sqrt(goal()[own > 0.0] / own[own > 0.0])
-        self.digits = max(self.digits, -np.log10(shares.min(initial=1.0)))
-        return X
-
-    def _orthonormal(self, P: np.ndarray) -> np.ndarray:
-        """Return an orthonormal basis of the columns, dependent ones left out."""
-        gram = self._dot(P, P)
-        if not np.isfinite(gram).all():
-            return P[:, :0]
-        scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-        values, vectors = on_root(self._comm, np.linalg.eigh, gram / np.outer(scale, scale))
-        kept = values > INDEPENDENT_LENGTH_SHARE * values[-1]
-        return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))
+    P = _orthonormal(Z)
+    for step in range(SOLVER_ITERATIONS):
+        if (np.einsum("nk,nk->k", R, Z) <= goal()).all():
+            return X, step
+        if P.shape[1] == 0:  # nothing is left, or numbers are not finite
+            break
+        Q = times(P)
+        energy = P.T @ Q
+        inverse = np.linalg.inv(0.5 * (energy + energy.T))
+        amplitudes = inverse @ (P.T @ R)
+        X += P @ amplitudes
+        R -= Q @ amplitudes
+        Z = precondition(R)
+        P = _orthonormal(Z - P @ (inverse @ (Q.T @ Z)))
+    return X, SOLVER_ITERATIONS
 
 
-class AlgebraicSolver:
-    """K^-1 of one design after another by conjugate gradients with algebraic multigrid.
+def _orthonormal(P: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of the columns, dependent ones left out; of nan none."""
+    gram = P.T @ P
+    if not np.isfinite(gram).all():
+        return P[:, :0]
+    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+    kept = values > ROUNDING_SHARE * values[-1]
+    return np.asfortranarray(P @ (vectors[:, kept] / scale[:, None] / np.sqrt(values[kept])))
+
+
+# -- the solver of the ranks' rows, which the root has ------------------------------------------
+
+
+class MultigridSolver:
+    """K^-1 of one design after another by the root, for the rows of all ranks (collective).
 
     Attributes:
-        grid: the hierarchy.
+        tolerance: of solutions, relative in energy.
         failed: the last solution did not converge.
-        rate: steps a digit of the last solution.
+        steps: of conjugate gradients, of the last solution.
     """
 
-    def __init__(self, matrix: PETSc.Mat, tolerance: float):
-        """Set up for a matrix with its near-nullspace (collective).
+    name = NAME
 
-        Args:
-            matrix: AIJ, symmetric positive definite, blocks of nodes.
-            tolerance: see `BlockConjugateGradients`.
-        """
-        self.grid = Multigrid(matrix)
-        self._solver = BlockConjugateGradients(self.grid, matrix.comm.tompi4py(), tolerance)
-        self.rate = 0.0
-        self._first_rate = 0.0  # right after the hierarchy was made
-        self._fresh = True
+    def __init__(self, box: Box, coordinates: bool, tolerance: float):
+        """Set up for a box, see `BoxMultigrid`."""
+        self._box, self.tolerance, self.failed, self.steps = box, tolerance, False, 0
+        count, comm = len(box.nodes), box.comm
+        # The multigrid's row of each of the ranks' rows; the coordinates are the last rank's.
+        place = np.add.outer(box.nodes, count * np.arange(3)).ravel()
+        rigid = 3 * count + np.arange(box.rigid.shape[2] * coordinates)
+        self._place = np.append(place, rigid)
+        mine = self._place[3 * box.owned.start : 3 * box.owned.stop]
+        self._mine = np.append(mine, rigid) if comm.rank == comm.size - 1 else mine
+        if comm.rank == 0:
+            self._grids = BoxMultigrid(box, coordinates)
 
-    @property
-    def failed(self) -> bool:
-        return self._solver.failed
-
-    @property
-    def steps(self) -> int:
-        """Of the last solution."""
-        return self._solver.steps
-
-    @property
-    def progress(self) -> tuple[float, float]:
-        """Steps a digit of the first solution with this hierarchy, -1 before, and of the last."""
-        return (-1.0 if self._fresh else self._first_rate), self.rate
-
-    @progress.setter
-    def progress(self, rates: tuple[float, float]) -> None:
-        self._fresh = rates[0] < 0.0
-        self._first_rate, self.rate = max(0.0, rates[0]), rates[1]
-
-    def update(self) -> None:
-        """Take over new values of the matrix (collective)."""
-        slow = self._first_rate > STEPS_A_DIGIT_LIMIT and not self.grid.gradual
-        if slow or (self._first_rate and self.rate > KEPT_HIERARCHY_RATIO * self._first_rate):
-            self._make(self.grid.gradual or slow)
-        else:
-            self.grid.update()
-
-    def _make(self, gradual: bool) -> None:
-        self.grid.gradual = gradual
-        self.grid.make()
-        self._fresh = True
+    def update(self, K: Scaled) -> None:
+        """Take another design, see `interior.Solver`."""
+        whole = self._box.comm.gather(K.scale)
+        if whole is not None:
+            values = np.empty(len(self._box.cells))
+            values[self._box.cells] = np.concatenate(whole)
+            self._grids.update(values)
 
     def solve(
-        self,
-        right: np.ndarray,
-        guess: np.ndarray | None = None,
-        tolerance: float | None = None,
-        held: np.ndarray | None = None,
+        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return the solution (n,) or (n, k), see `BlockConjugateGradients` (collective)."""
-        if right.ndim == 1:
-            return self.solve(right[:, None], guess, tolerance)[:, 0]
-        out = self._solver.solve(right, guess, tolerance, held)
-        if self.failed and not self.grid.gradual:
-            self._make(True)
-            out = self._solver.solve(right, guess, tolerance, held)
-        self.rate = self.steps / self._solver.digits
-        if self._fresh and guess is None:
-            self._first_rate, self._fresh = self.rate, False
+        """Return the solution of the owned rows, see `block_conjugate_gradients`."""
+        B = self._whole(right)
+
+        def solved() -> tuple[np.ndarray, int]:
+            X, most = np.empty_like(B), 0
+            if not self._grids.works:
+                return X, SOLVER_ITERATIONS
+            for first in range(0, B.shape[1], RIGHT_SIDES_CHUNK):
+                part = slice(first, first + RIGHT_SIDES_CHUNK)
+                X[:, part], steps = block_conjugate_gradients(
+                    self._grids.times,
+                    self._grids.cycle,
+                    B[:, part],
+                    tolerance or self.tolerance,
+                    None if held is None else held[part],
+                )
+                most = max(most, steps)
+            return X, most
+
+        X, self.steps = on_root(self._box.comm, solved)
+        self.failed = self.steps == SOLVER_ITERATIONS
+        return X[self._mine]
+
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """Return an approximation of the solution of the owned rows, by one cycle."""
+        B = self._whole(right)
+        return on_root(self._box.comm, lambda: self._grids.cycle(B))[self._mine]
+
+    def _whole(self, X: np.ndarray) -> np.ndarray:
+        """Return all ranks' rows in the multigrid's order, on the root; elsewhere its own."""
+        parts = self._box.comm.gather(X)
+        if parts is None:
+            return X
+        out = np.empty((len(self._place), X.shape[1]), order="F")
+        out[self._place] = np.concatenate(parts)
         return out
-
-    def times(self, X: np.ndarray) -> np.ndarray:
-        """Return K X of the owned rows (rows, k)."""
-        return self.grid.times(X)
-
-    def cycle(self, B: np.ndarray) -> np.ndarray:
-        """Return an approximation of K^-1 B of the owned rows (rows, k)."""
-        return self.grid.cycle(B)

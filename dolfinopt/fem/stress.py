@@ -27,7 +27,6 @@ from dolfinopt.fem.geometric_stiffness import (
     accelerations,
     by_inertia,
     interface_fields,
-    static_response,
 )
 from dolfinopt.fem.laws import VON_MISES
 from dolfinopt.fem.measured import FEWER_DIRECTIONS, MOTION_RANK_SHARE, SUMS_RANK_SHARE
@@ -207,9 +206,9 @@ class LoadFields:
             by_w, loads = combine(by_u, sums), directions @ self.loads
         mu = np.empty_like(by_w)
         # Conjugate gradients have one space for all right sides; ranks have fields of other sizes.
-        together = arm.substructure.interior.is_iterative or arm.comm.size > 1
+        together = arm.is_iterative or arm.comm.size > 1
         for part in [slice(None)] if together else runs_of_columns(by_w):
-            mu[:, :, part] = static_response(arm, *arm.restrict(by_w[:, :, part]))
+            mu[:, :, part] = arm.static_response(*arm.restrict(by_w[:, :, part]))
         _, frame, _, elastic = self.split(loads)
         by_V, by_loads = combine(by_u, modes), []
         for part in runs_of_columns(mu):
@@ -315,8 +314,7 @@ def load_fields(
         if directions[0].shape[1] <= FEWER_DIRECTIONS * len(solved):
             into, out_of = directions
     right = moved(MV) if known is not None else np.concatenate([forces, moved(MV)], axis=2)
-    purpose = "elastic motion" if moving is None else "motion"
-    Z = static_response(arm, *arm.restrict(combine(right, out_of)), purpose)
+    Z = arm.static_response(*arm.restrict(combine(right, out_of)))
     to_columns = np.zeros((size, len(others) + into.shape[1]))
     to_columns[others, np.arange(len(others))] = 1.0
     loads = to_columns.T.copy()

@@ -42,7 +42,7 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     small = SMALL_MESH_CELLS
     if sum(size.values()) <= small and sum(least.values()) <= small * CELL_BYTES:
         return
-    partition = partition_arms(world, scene.cell_counts)
+    partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
     shared = {k: SHARED_BYTES_RATIO if scene.arms[k].is_solid else 1.0 for k in partition.arms}
     if partition.comm.size == 1:
         shared = dict.fromkeys(shared, 1.0)
@@ -51,7 +51,6 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
         + RANK_BYTES
     )
     seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
-    partition.comm.Free()
     ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
     needed: dict[str, float] = defaultdict(float)
     free: dict[str, float] = {}

@@ -22,11 +22,10 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.fem.interior import Guesses
 
 
-# Solutions, and of every arm eigenvectors and what iterative solves set out from.
-Start = tuple[tuple[Solution, ...], dict[int, list[np.ndarray]], dict[int, "Guesses | None"]]
+# Solutions, and eigenvectors of every arm.
+Start = tuple[tuple[Solution, ...], dict[int, list[np.ndarray]]]
 
 
 class Evaluator:
@@ -37,8 +36,8 @@ class Evaluator:
         variables, projection: how x makes designs.
         trajectory: of the design evaluated last; None without a motion and off the root.
         solutions: its motions; the next evaluation sets out from them.
-        initial_solutions, initial_vectors, initial_guesses: from where that of the last x set out,
-            so that it can be repeated in the same bits.
+        initial_solutions, initial_vectors: from where that of the last x set out, so that it can be
+            repeated in the same bits.
     """
 
     def __init__(
@@ -51,7 +50,6 @@ class Evaluator:
         self.solutions: tuple[Solution, ...] = ()
         self.initial_solutions: tuple[Solution, ...] = ()
         self.initial_vectors: dict[int, list[np.ndarray]] = {}
-        self.initial_guesses: dict[int, Guesses | None] = {}
 
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
         """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
@@ -74,7 +72,6 @@ class Evaluator:
         """
         self.initial_solutions = self.solutions
         self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
-        self.initial_guesses = {k: arm.guesses for k, arm in self.arms.items()}
         *others, nominal = self.physical_designs(x)
         found = []
         for design in others:
@@ -105,16 +102,15 @@ class Evaluator:
         self.solutions = self.initial_solutions
         for k, vectors in self.initial_vectors.items():
             self.arms[k].initial_vectors = vectors
-            self.arms[k].guesses = self.initial_guesses[k]
 
     @property
     def start(self) -> Start:
         """From where the evaluation of the last x set out, for `restart`."""
-        return self.initial_solutions, self.initial_vectors, self.initial_guesses
+        return self.initial_solutions, self.initial_vectors
 
     def restart(self, start: Start) -> None:
         """Let the next evaluation set out from there (collective)."""
-        self.initial_solutions, self.initial_vectors, self.initial_guesses = start
+        self.initial_solutions, self.initial_vectors = start
         self.undo()
 
     def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:

@@ -292,7 +292,6 @@ class Iterate:
             gradient=self.evaluator.gradient,
             cells=self.variables.split(np.column_stack(columns)),
             modes=self.evaluator.initial_vectors,
-            guesses={k: one for k, one in self.evaluator.initial_guesses.items() if one},
             multipliers=state.multipliers,
             best=self.best,
             progress=self.progress,
@@ -311,7 +310,6 @@ class Iterate:
         self.evaluator.solutions = memory.solutions
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
-            arm.guesses = memory.guesses.get(k)
         self.iteration, self.change, self.reach = memory.iteration, memory.change, memory.reach
         self.returned_to = memory.returned_to
         self.projection.restore((memory.beta, memory.thresholds))

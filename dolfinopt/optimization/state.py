@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.responses.order_selection import OrderSelection
 
@@ -181,7 +180,6 @@ class IterateMemory:
         multipliers: MMA's, on all ranks.
         best: the best design so far; its variables are the last column of `cells`.
         progress: the course of the iterations.
-        guesses: per arm what this design's iterative solves set out from, of arms that have them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
         thresholds: per arm its eta.
@@ -195,7 +193,6 @@ class IterateMemory:
     gradient: str
     cells: Mapping[int, np.ndarray]
     modes: Mapping[int, Sequence[np.ndarray]]
-    guesses: Mapping[int, Guesses]
     multipliers: np.ndarray
     best: Best
     progress: Progress

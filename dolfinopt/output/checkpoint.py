@@ -13,7 +13,6 @@ import numpy as np
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.collocation import Solution, Strategy
 from dolfinopt.errors import InputError
-from dolfinopt.fem.interior import Guesses
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Memory, Progress
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
@@ -21,6 +20,7 @@ from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, to
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, program, with_digests
+from dolfinopt.solver import user_options
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -48,7 +48,11 @@ def begin(folder: Path, scene: Scene) -> None:
 
 def _stamp(scene: Scene) -> dict[str, np.ndarray]:
     """Return what a run must share with a checkpoint to go on from it."""
-    return {"scene": np.array(_scene_text(scene)), "program": np.array(json.dumps(program()))}
+    return {
+        "scene": np.array(_scene_text(scene)),
+        "program": np.array(json.dumps(program())),
+        "options": np.array(user_options()),
+    }
 
 
 def reopen(folder: Path) -> None:
@@ -176,6 +180,11 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
             f"{path}: --resume: another version of dolfinopt wrote this checkpoint and would go on "
             "to another design; start without --resume"
         )
+    if str(arrays["options"]) != user_options():
+        raise InputError(
+            f"{path}: --resume: PETSc options were {str(arrays['options'])!r} there, and are "
+            f"{user_options()!r} here; set PETSC_OPTIONS as it was, or start without --resume"
+        )
     difference = _difference(theirs, json.loads(_scene_text(scene)))
     if difference:
         raise InputError(
@@ -211,7 +220,6 @@ def _difference(theirs: Any, ours: Any, key: str = "") -> str:
 
 # -- one design of an optimisation as arrays of whole arms, for the checkpoint, and back ---------
 
-GUESS = "guess/"  # before what iterative solves set out from
 # A solution's arrays: name in the file, field.
 SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
 
@@ -241,7 +249,6 @@ def arrays_of(
         columns[f"outboard{j}"] = gather_cells(
             partition, {k: last for k, (_, last) in by_arm.items()}
         )
-    columns |= _guesses(partition, arms, memory)
     if partition.world.rank != 0:
         return {}
     arrays: dict[str, Any] = {
@@ -263,31 +270,10 @@ def arrays_of(
     return arrays
 
 
-def _guesses(
-    partition: Partition, arms: Mapping[int, Arm], memory: IterateMemory
-) -> dict[str, dict[int, np.ndarray]]:
-    """Return what iterative solves set out from, by its name and arm (collective)."""
-    known = {k: memory.guesses[k] for k in arms if k in memory.guesses}
-    every = partition.world.allgather({name for one in known.values() for name in one.fields})
-    found = {
-        f"{GUESS}{name}": gather_cells(
-            partition, {k: one.fields[name] for k, one in known.items() if name in one.fields}
-        )
-        for name in sorted(set().union(*every))
-    }
-    if any(partition.world.allgather(bool(known))):
-        young = {k: one.young for k, one in known.items()}
-        found["hierarchy"] = gather_cells(partition, young)
-        solver = {k: np.array([one.gradual, *one.progress]) for k, one in known.items()}
-        found["solver"] = gather_arms(partition, solver)
-    return found
-
-
 def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
     """Return the fields of `IterateMemory`."""
     cells: dict[int, np.ndarray] = {}
     modes: dict[int, list[np.ndarray]] = {}
-    guesses: dict[int, Guesses] = {}
     for k, arm in arms.items():
         if f"arm{k}/cells" in arrays:  # an arm that repeats another's design has no variables
             rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
@@ -295,13 +281,6 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
         rows = (arm.mesh.dim * rows[:, None] + np.arange(arm.mesh.dim)).ravel()
         last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
-        if f"arm{k}/hierarchy" in arrays:
-            names = [key for key in arrays if key.startswith(f"arm{k}/{GUESS}")]
-            fields = {name.removeprefix(f"arm{k}/{GUESS}"): arrays[name][rows] for name in names}
-            own = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
-            gradual, *rates = arrays[f"arm{k}/solver"].tolist()
-            young = arrays[f"arm{k}/hierarchy"][own]
-            guesses[k] = Guesses(fields, young, bool(gradual), (rates[0], rates[1]))
         modes[k] = []
         for j in range(len(arm.initial_vectors)):
             interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
@@ -329,7 +308,6 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         "gradient": str(arrays["gradient"]),
         "cells": cells,
         "modes": modes,
-        "guesses": guesses,
         "multipliers": arrays["multipliers"],
         "best": Best(x=np.empty(0), thresholds=thresholds, **best),
         "progress": Progress(objectives, excesses, int(arrays["since"])),

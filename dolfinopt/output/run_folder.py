@@ -182,7 +182,7 @@ def _optimize(
 
     profile = Profile()
     if built is None:
-        partition = partition_arms(world, scene.cell_counts)
+        partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
         built = partition, build_arms(scene, partition, profile)
     partition, arms = built
     if folder is not None and overwrite:  # not before: a mesh that fails leaves the old results

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +9,15 @@ import numpy as np
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
-from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
 from dolfinopt.parallel import on_root
-from dolfinopt.reduction.eigenproblem import Operators, Pencil, by_column, interior_operators
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
-    INDEPENDENT_ENERGY_RATIO,
+    EXACT_TOLERANCE,
     ORTHONORMAL_ROUNDS_LIMIT,
-    ORTHONORMALITY_ERROR,
     ROUNDING_LENGTH_SHARE,
+    ROUNDING_SHARE,
 )
 
 
@@ -91,53 +89,22 @@ def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
     return np.where(mean < 0.0, -1.0, 1.0)
 
 
-# -- the clamped-free arm, outboard interface rigid: its operators, inverse and inputs ---------
+# -- the inputs of the clamped-free arm, its outboard interface rigid --------------------------
 
 
 # Of `frame_fields` among the rigid motions, by the number of directions.
 FRAME_ORDER = {2: [1, 2, 0], 3: [1, 2, 5, 4, 3, 0]}
 
-Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
-
-class FreeArm:
-    """Inverse of T'KT by block elimination with the factorisation of the interior.
-
-    With constraint modes Psi and Schur complement S, (T'KT) z = f is solved by
-    z_b = S^-1 (f_b + Psi' f_I),  z_I = K_II^-1 f_I + Psi z_b.
-
-    Attributes:
-        arm: with its design set.
-        psi: (num_interior, b) interior rows of the constraint modes.
-        schur_inverse: (b, b) compliance of the outboard interface.
-    """
-
-    def __init__(self, arm: ElasticArm):
-        self.arm = arm
-        modes = arm.constraint_modes()
-        self.coupling, self.corner, self.psi = modes.coupling, modes.corner, modes.interior
-        self.schur_inverse = np.linalg.inv(modes.stiffness)
-
-    def solve(self, right: Rows) -> np.ndarray:
-        """Return (T'KT)^-1 right as a nodal field (n_nodes, d, k); no solve for zero rows."""
-        interior, outboard = right
-        if self.arm.comm.allreduce(int(interior.any())):
-            lift = self.arm.comm.allreduce(self.psi.T @ interior)
-            z = self.schur_inverse @ (outboard + lift)
-            return self.arm.expand(self.arm.solve(interior) + self.psi @ z, z)
-        z = self.schur_inverse @ outboard
-        return self.arm.expand(self.psi @ z, z)
-
-
-def interface_loads(free: FreeArm) -> Rows:
+def interface_loads(arm: ElasticArm) -> Rows:
     """Return unit forces and moments (N, N m) at the outboard interface."""
-    b = len(free.corner)
-    return np.zeros((free.arm.num_interior, b)), np.eye(b)
+    b = arm.rigid.shape[2]
+    return np.zeros((arm.num_interior, b)), np.eye(b)
 
 
-def frame_loads(free: FreeArm) -> Rows:
+def frame_loads(arm: ElasticArm) -> Rows:
     """Return M times `frame_fields`: inertia loads of unit accelerations of the frame."""
-    return free.arm.restrict(free.arm.mass_times(frame_fields(free.arm)))
+    return arm.restrict(arm.mass_times(frame_fields(arm)))
 
 
 def frame_fields(arm: ElasticArm) -> np.ndarray:
@@ -152,90 +119,6 @@ def frame_fields(arm: ElasticArm) -> np.ndarray:
 def by_frame_fields(by: np.ndarray) -> np.ndarray:
     """Return the derivatives (n_nodes, d) by the nodes, given those by `frame_fields`."""
     return by_rigid_motions(by[:, :, np.argsort(FRAME_ORDER[by.shape[1]])])
-
-
-class FreeOperators:
-    """T'KT, T'MT and the inverse of the former as operators that are never assembled.
-
-    Vectors are the owned interior dofs; the b outboard coordinates follow those of the last
-    rank.
-    """
-
-    def __init__(self, arm: ElasticArm, carried: np.ndarray | None = None):
-        """Set up; `carried` (b, b) is the inertia of what is fixed to the outboard interface."""
-        self.arm = arm
-        self.last = arm.comm.rank == arm.comm.size - 1
-        self.free = FreeArm(arm)
-        self._m_coupling, m_corner = arm.restrict(arm.mass_times(arm.rigid))
-        self._m_corner = m_corner if carried is None else m_corner + carried
-        self.rows = arm.num_interior + (len(self.free.corner) if self.last else 0)
-        iterative = arm.substructure.interior.is_iterative
-        operators = self._operators(interior_operators(arm)) if iterative else None
-        self.pencil = Pencil(
-            arm, self.solve, self.mass_times, self.stiffness_times, self.rows, operators
-        )
-
-    def _operators(self, inner: Operators) -> Operators:
-        """Return those for columns, with what the interior's approximate inverse gives."""
-
-        def stiffness(V: np.ndarray) -> np.ndarray:
-            product = inner.stiffness(self.split(V)[0])
-            return self._bordered(product, V, self.free.coupling, self.free.corner)
-
-        def precondition(R: np.ndarray) -> np.ndarray:
-            return self._eliminated(inner.precondition, R)
-
-        return Operators(
-            self.rows,
-            stiffness,
-            lambda V: by_column(self.mass_times, V),
-            precondition,
-            inner.total,
-            inner.comm,
-        )
-
-    def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the interior rows and the outboard coordinates (b, ...), the latter everywhere."""
-        outboard = rows[self.arm.num_interior :] if self.last else None
-        if self.arm.comm.size > 1:
-            outboard = self.arm.comm.bcast(outboard, root=self.arm.comm.size - 1)
-        assert outboard is not None
-        return rows[: self.arm.num_interior], outboard
-
-    def joined(self, interior: np.ndarray, outboard: np.ndarray) -> np.ndarray:
-        """Return the vector of interior rows and outboard coordinates."""
-        return np.concatenate([interior, outboard]) if self.last else interior
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return (T'KT)^-1 right."""
-        return self._eliminated(self.arm.interior_inverse, right)
-
-    def _eliminated(
-        self, inverse: Callable[[np.ndarray], np.ndarray], right: np.ndarray
-    ) -> np.ndarray:
-        """Return (T'KT)^-1 right, given what stands for the inverse of the interior."""
-        interior, outboard = self.split(right)
-        lift = self.arm.comm.allreduce(self.free.psi.T @ interior)
-        tip = self.free.schur_inverse @ (outboard + lift)
-        return self.joined(inverse(interior) + self.free.psi @ tip, tip)
-
-    def stiffness_times(self, rows: np.ndarray) -> np.ndarray:
-        """Return T'KT times a vector."""
-        inner = self.arm.interior_stiffness_times(self.split(rows)[0])
-        return self._bordered(inner, rows, self.free.coupling, self.free.corner)
-
-    def mass_times(self, rows: np.ndarray) -> np.ndarray:
-        """Return T'MT times a vector."""
-        inner = self.arm.interior_mass_times(self.split(rows)[0])
-        return self._bordered(inner, rows, self._m_coupling, self._m_corner)
-
-    def _bordered(
-        self, inner: np.ndarray, rows: np.ndarray, coupling: np.ndarray, corner: np.ndarray
-    ) -> np.ndarray:
-        """Return [A_II, A_Ib; A_Ib', A_bb] times a vector, given A_II times its interior."""
-        interior, outboard = self.split(rows)
-        lower = self.arm.comm.allreduce(coupling.T @ interior)
-        return self.joined(inner + coupling @ outboard, lower + corner @ outboard)
 
 
 # -- subspaces orthonormal in the mass matrix: block Gram-Schmidt, block Arnoldi, Ritz vectors -
@@ -296,14 +179,14 @@ def orthonormalise(
         return Expansion(Q, Q, by_V, kept)
     for _ in range(ORTHONORMAL_ROUNDS_LIMIT):
         # Differences of nearly equal fields have lost the rigid motion of the interface.
-        Q = arm.expand(_interior(arm, Q), interface_coordinates(arm, Q))
+        Q = arm.expand(_interior(arm, Q), arm.coordinates(Q))
         h = dot(arm, MV, Q)
         Q, again, still = _qr(arm, Q - combine(V, h), np.full(len(kept), ROUNDING_LENGTH_SHARE))
         by_V, R, kept = by_V + h @ R, again @ R, kept[still]
         MQ = arm.mass_times(Q)
         overlap = dot(arm, MQ, np.concatenate([V, Q], axis=2))
         goal = np.eye(V.shape[2] + len(kept))[V.shape[2] :]
-        if np.abs(overlap - goal).max(initial=0.0) <= ORTHONORMALITY_ERROR:
+        if np.abs(overlap - goal).max(initial=0.0) <= EXACT_TOLERANCE:
             return Expansion(Q, MQ, np.vstack([by_V, R]), kept)
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the vectors of the reduction do not become orthonormal; ask for "
@@ -347,11 +230,11 @@ class InverseSpace:
         start: (r_0, k) coefficients of the first fields in the first r_0 columns.
     """
 
-    def __init__(self, free: FreeArm, first: np.ndarray, deflation: float):
+    def __init__(self, arm: ElasticArm, first: np.ndarray, deflation: float):
         """Begin with the fields `first` (n_nodes, d, k)."""
-        self.free, self.deflation = free, deflation
+        self.arm, self.deflation = arm, deflation
         none = np.empty((*first.shape[:2], 0))
-        expansion = orthonormalise(free.arm, first, none, none, deflation)
+        expansion = orthonormalise(arm, first, none, none, deflation)
         self.V, self.MV, self.start = expansion.Q, expansion.MQ, expansion.coefficients
         self.H = np.empty((self.V.shape[2], 0))
 
@@ -360,8 +243,8 @@ class InverseSpace:
         done = self.H.shape[1]
         if done == self.V.shape[2]:
             return
-        W = self.free.solve(self.free.arm.restrict(self.MV[:, :, done:]))
-        new = orthonormalise(self.free.arm, W, self.V, self.MV, self.deflation)
+        W = self.arm.static_response(*self.arm.restrict(self.MV[:, :, done:]))
+        new = orthonormalise(self.arm, W, self.V, self.MV, self.deflation)
         self.V = np.concatenate([self.V, new.Q], axis=2)
         self.MV = np.concatenate([self.MV, new.MQ], axis=2)
         H = np.zeros((self.V.shape[2], done + W.shape[2]))
@@ -393,7 +276,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > INDEPENDENT_ENERGY_RATIO * shares[-1]:  # not a number included
+            if not shares[0] > ROUNDING_SHARE * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:
@@ -409,7 +292,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     # Stiffnesses differ by up to ten powers of ten, and y are as far from orthonormal as that.
     none = np.empty((*V.shape[:2], 0))
     V = orthonormalise(arm, combine(V, y), none, none).Q
-    outboard = interface_coordinates(arm, V)
+    outboard = arm.coordinates(V)
     V = arm.expand(_interior(arm, V), outboard)
     MV = arm.mass_times(V)
     sign = orient(arm, V, MV)
@@ -423,21 +306,7 @@ def _interior(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
     return field[arm.interior_nodes].reshape(arm.num_interior, field.shape[2])
 
 
-def interface_coordinates(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
-    """Return the coordinates (b, k) of the outboard interface in nodal fields that keep it rigid.
-
-    Args:
-        arm: the field's.
-        field: (n_nodes, d, k).
-    """
-    rigid = arm.rigid[arm.outboard].reshape(-1, arm.rigid.shape[2])
-    moved = field[arm.outboard].reshape(len(rigid), field.shape[2])
-    # A node that several ranks know counts several times: the fit is exact all the same.
-    normal, right = arm.comm.allreduce(rigid.T @ rigid), arm.comm.allreduce(rigid.T @ moved)
-    return np.linalg.solve(normal, right)
-
-
-def solve_at(free: FreeArm, omega: float, right: Rows, tolerance: float, most: int) -> np.ndarray:
+def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most: int) -> np.ndarray:
     """Solve (T'KT - omega^2 T'MT) z = right for all columns at once; a field (n_nodes, d, k).
 
     Block GMRES preconditioned with the factor of K at hand, in the inner product of M. Above the
@@ -447,19 +316,19 @@ def solve_at(free: FreeArm, omega: float, right: Rows, tolerance: float, most: i
     its constraint modes are infinite at the natural frequencies of the arm held at both ends.
 
     Args:
-        free: the arm with its factor.
+        arm: with its design set.
         omega: rad/s; 0 needs one solve.
-        right: see `FreeArm.solve`.
+        right: loads of interior and outboard rows.
         tolerance: of the residual, relative, after multiplication by K^-1, norm of M.
         most: steps.
 
     Raises:
         ConvergenceError: omega is too close to a natural frequency.
     """
-    first = free.solve(right)
+    first = arm.static_response(*right)
     if omega == 0.0:
         return first
-    space = InverseSpace(free, first, 1e-13)
+    space = InverseSpace(arm, first, 1e-13)
     for _ in range(most):
         space.extend()
         rows, columns = space.H.shape
@@ -473,7 +342,7 @@ def solve_at(free: FreeArm, omega: float, right: Rows, tolerance: float, most: i
         if rows == columns:
             break
     raise ConvergenceError(
-        f"arm {free.arm.mesh.name!r}: the response at {omega / (2.0 * np.pi):g} Hz does not "
+        f"arm {arm.mesh.name!r}: the response at {omega / (2.0 * np.pi):g} Hz does not "
         "converge: too close to a natural frequency, or too far above the first ones; move or "
         "lower reduction.shifts"
     )

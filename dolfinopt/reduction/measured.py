@@ -1,36 +1,30 @@
-"""Constants of the room that were chosen by measurement or trial, by the file that uses them.
+"""Constants of the room that were chosen by measurement or trial, by the files that use them.
 
 Each stands with its unit, what it rules, and what was measured.
 """
 
-# -- eigenproblem: the modes' derivatives ----------------------------------------------------
+# -- all ---------------------------------------------------------------------------------------
 
-# Relative residual of the modes' adjoints, in the energy of K^-1; gradients are then right to it,
-# which leaves more digits than an optimiser can use.
-ADJOINT_TOLERANCE = 1e-8
-ADJOINT_ITERATIONS = 500  # of conjugate gradients for one mode
+# Relative residual of solutions and eigenpairs that are to be right to nearly all digits. Vectors
+# are then right to about 1e-10, which keeps designs equal to 1e-8 on any number of ranks; each
+# further digit costs a fraction of a step. Two rounds of Gram and Schmidt leave 1e-15 to 1e-14.
+EXACT_TOLERANCE = 1e-12
+# Part of a length or energy, of the largest, below which what is left of a vector beside others is
+# rounding: that leaves 1e-16 of dependent ones, independent ones have 1e-2.
+ROUNDING_SHARE = 1e-12
+# Relative, in energy, of what needs fewer digits: modes without a factor and their adjoints, from
+# which gradients are right to it, more than an optimiser can use.
+VECTOR_TOLERANCE = 1e-8
+ITERATIONS_LIMIT = 500  # of conjugate gradients for modes and their adjoints
 
-# -- eigenproblem: modes where no factor is at hand ------------------------------------------
+# -- eigenproblem --------------------------------------------------------------------------------
 
 GUARD_VECTORS = 3  # beyond those that are wanted: the last ones converge slowly
-LOBPCG_ITERATIONS = 200
-LOBPCG_TOLERANCE = 1e-8  # of the vectors in energy
-# Part of a direction's length, squared, below which it is the others'.
-LOBPCG_INDEPENDENT_SHARE = 1e-12
-
-# -- eigenproblem: modes by a factor ---------------------------------------------------------
-
-# Relative residual of the eigenpairs. Vectors are then right to about 1e-10, which keeps designs
-# equal to 1e-8 on any number of ranks; each further digit costs a fraction of a step.
-EIGEN_TOLERANCE = 1e-12
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 EIGENVALUE_GAP = 1e-6
 # Part of a nearby mode, in M, beyond which the modes that were found do not contain it.
 LOST_MODE_SHARE = 1e-2
-# Ratio of eigenvalues from which on vectors that are right to their tolerance are not orthogonal
-# to 1e-10 by themselves; in a hundred modes from 0.2 Hz to 30 kHz they are to 1e-6.
-WIDE_SPECTRUM_RATIO = 1e6
 # Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
 # finds modes of another symmetry, up to 1e-4 it is not slower.
 RAMP_SHARE = 1e-6
@@ -40,27 +34,13 @@ RAMP_SHARE = 1e-6
 # more.
 WARM_STEPS = 16
 
-# -- methods: Krylov subspaces, Gramians -----------------------------------------------------
+# -- basis, methods: Krylov subspaces, Gramians --------------------------------------------------
 
 # Blocks of a Krylov space: for a shift up to 40 times the first frequency 5 to 10 are the rule.
 KRYLOV_BLOCKS_LIMIT = 60
-# Relative residual of solutions at a shift, in the norm of M after multiplication by K^-1.
-SHIFT_TOLERANCE = 1e-12
-# Relative residual of the responses in the band, after multiplication by K^-1, in energy.
-RESPONSE_TOLERANCE = 1e-10
-# Directions whose response is below this part of the largest are lost in that.
-RESPONSE_RANK_SHARE = 1e-10
-# Part of the length of a vector of their Krylov space, below which its remainder is rounding.
-RESPONSE_DEFLATION_SHARE = 1e-12
-
-# -- basis -----------------------------------------------------------------------------------
-
-DEFLATION_SHARE = 1e-10  # of a column's length: a remainder below adds nothing but rounding
+# Of a column's length: a remainder below adds nothing but rounding. Relative residual of responses
+# in a band, in energy; directions whose response is below this part of the largest are lost in it.
+DEFLATION_SHARE = 1e-10
 # A second round leaves columns their length; what shrinks below this was rounding in the first.
 ROUNDING_LENGTH_SHARE = 0.1
-ORTHONORMALITY_ERROR = 1e-12  # largest entry of V' M V - I: two rounds leave 1e-15 to 1e-14
 ORTHONORMAL_ROUNDS_LIMIT = 4  # two are the rule
-# Least eigenvalue of the vectors' energies, scaled to one each, by the largest: rounding leaves
-# 1e-16 of dependent vectors, independent ones have 1e-2. Whether Cholesky's method notices depends
-# on the sign of that rounding.
-INDEPENDENT_ENERGY_RATIO = 1e-12

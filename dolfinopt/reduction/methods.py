@@ -10,17 +10,14 @@ import numpy as np
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
-from dolfinopt.fem.elasticity import ElasticArm
+from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.parallel import on_root
 from dolfinopt.reduction.basis import (
     AdjointFields,
     Basis,
     Expansion,
-    FreeArm,
-    FreeOperators,
     InverseSpace,
     Options,
-    Rows,
     dot,
     frame_fields,
     frame_loads,
@@ -30,13 +27,12 @@ from dolfinopt.reduction.basis import (
     ritz,
     solve_at,
 )
-from dolfinopt.reduction.eigenproblem import complement_solve, interior_pencil, lowest_eigenpairs
+from dolfinopt.reduction.eigenproblem import Pencil, complement_solve, lowest_eigenpairs
 from dolfinopt.reduction.measured import (
+    DEFLATION_SHARE,
+    EXACT_TOLERANCE,
     KRYLOV_BLOCKS_LIMIT,
-    RESPONSE_DEFLATION_SHARE,
-    RESPONSE_RANK_SHARE,
-    RESPONSE_TOLERANCE,
-    SHIFT_TOLERANCE,
+    ROUNDING_SHARE,
 )
 
 # -- by modes: Craig-Bampton (constraint and fixed-interface modes), modes of a free arm ----------
@@ -61,7 +57,7 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
     normal = options.coordinates - b
     modes = np.empty((arm.num_interior, 0))
     if normal > 0:
-        _, modes = lowest_eigenpairs(interior_pencil(arm), normal, start)
+        _, modes = lowest_eigenpairs(Pencil(arm), normal, start)
     outboard = np.hstack([np.eye(b), np.zeros((b, normal))])
     V = arm.expand(np.hstack([static.interior, modes]), outboard)
     MV = arm.mass_times(V)
@@ -93,11 +89,10 @@ def craig_bampton_adjoint(
         outboard: (b, q) cotangents of its outboard rows; without effect here.
     """
     b = len(basis.outboard)
-    mu = arm.solve(interior[:, :b], "adjoint of constraint modes")
+    mu = arm.solve(interior[:, :b])
     values = np.concatenate([np.zeros(b), np.diag(basis.stiffness)[b:]])
     if interior.shape[1] > b:
-        pencil = interior_pencil(arm)
-        normal = complement_solve(pencil, basis.start, values[b:], interior[:, b:])
+        normal = complement_solve(Pencil(arm), basis.start, values[b:], interior[:, b:])
         mu = np.hstack([mu, normal])
     field = arm.expand(mu, np.zeros_like(outboard))
     return AdjointFields(field, field * values)
@@ -115,9 +110,9 @@ def modal(arm: ElasticArm, options: Options, start: np.ndarray | None = None) ->
         start: `Basis.start` of a nearby design, or None.
     """
     arm.profile.counts.reductions += 1
-    operator = FreeOperators(arm)
-    _, vectors = lowest_eigenpairs(operator.pencil, options.coordinates, start)
-    interior, outboard = operator.split(vectors)
+    pencil = Pencil(arm, is_free=True)
+    _, vectors = lowest_eigenpairs(pencil, options.coordinates, start)
+    interior, outboard = pencil.split(vectors)
     V = arm.expand(interior, outboard)
     MV = arm.mass_times(V)
     sign = orient(arm, V, MV)
@@ -139,11 +134,9 @@ def modal_adjoint(
         interior: (num_interior, q) cotangents of the owned interior rows of V.
         outboard: (b, q) cotangents of its outboard rows.
     """
-    operator = FreeOperators(arm)
-    values = np.diag(basis.stiffness)
-    right = np.vstack([interior, outboard]) if operator.last else interior
-    mu = complement_solve(operator.pencil, basis.start, values, right)
-    field = arm.expand(*operator.split(mu))
+    pencil, values = Pencil(arm, is_free=True), np.diag(basis.stiffness)
+    right = pencil.joined(interior, outboard)
+    field = pencil.field(complement_solve(pencil, basis.start, values, right))
     return AdjointFields(field, field * values)
 
 
@@ -213,7 +206,7 @@ def krylov_adjoint(
         cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
         interior[:, old] -= cotangents[0] @ H[old].T
         outboard[:, old] -= cotangents[1] @ H[old].T
-        mu = solve_at(recursion.free, block.omega, cotangents, SHIFT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
+        mu = solve_at(arm, block.omega, cotangents, EXACT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired
@@ -228,7 +221,7 @@ def krylov_adjoint(
     return AdjointFields(combine(stiffness, turn), combine(mass, turn), frame)
 
 
-_Group = Callable[[FreeArm], Rows]
+_Group = Callable[[ElasticArm], Rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +238,6 @@ class _Block:
 class _Recursion:
     """M-orthonormal V (n_nodes, d, q), M V, and the blocks that made them, in their order."""
 
-    free: FreeArm
     V: np.ndarray
     MV: np.ndarray
     blocks: list[_Block]
@@ -253,14 +245,13 @@ class _Recursion:
 
 def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
     """Build exactly q columns."""
-    free = FreeArm(arm)
     V = MV = np.empty((*arm.points.shape, 0))
     blocks: list[_Block] = []
     omegas = [2.0 * np.pi * shift for shift in options.shifts]
     chains: list[tuple[float, _Group | None, np.ndarray]] = [
         (omega, group, np.arange(columns))
         for group, columns in (
-            (interface_loads, len(free.corner)),
+            (interface_loads, arm.rigid.shape[2]),
             (frame_loads, 3 if arm.mesh.dim == 2 else 6),
         )
         for omega in omegas
@@ -277,16 +268,16 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
             while len(columns) and V.shape[2] < options.coordinates:
                 # No more than are missing; further ones where some of them are dependent.
                 now, columns = np.split(columns, [options.coordinates - V.shape[2]])
-                right = group(free) if group else arm.restrict(MV)
+                right = group(arm) if group else arm.restrict(MV)
                 right = right[0][:, now], right[1][:, now]
-                raw = solve_at(free, omega, right, SHIFT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
+                raw = solve_at(arm, omega, right, EXACT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
                 new = orthonormalise(arm, raw, V, MV)
                 blocks.append(_Block(omega, group, now, new))
                 V, MV = np.concatenate([V, new.Q], axis=2), np.concatenate([MV, new.MQ], axis=2)
             if V.shape[2] > first:
                 longer.append((omega, None, np.arange(first, V.shape[2])))
         chains = longer
-    return _Recursion(free, V, MV, blocks)
+    return _Recursion(V, MV, blocks)
 
 
 # -- by Gramians: the directions that inputs within a frequency band move most --------------------
@@ -317,15 +308,15 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
         ConvergenceError: no convergence in the band, or fewer than q directions in it.
     """
     arm.profile.counts.reductions += 1
-    free = FreeArm(arm)
-    space = InverseSpace(free, free.solve(_inputs(free)), RESPONSE_DEFLATION_SHARE)
+    first = arm.static_response(*_inputs(arm))
+    space = InverseSpace(arm, first, ROUNDING_SHARE)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
     for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()
         reduced = _Reduced.of(space, options.damping)
         omega, weights = quadrature(low, high, reduced.theta, options.damping)
         responses = reduced.responses(omega)
-        if reduced.residual(omega, responses) <= RESPONSE_TOLERANCE:
+        if reduced.residual(omega, responses) <= DEFLATION_SHARE:
             break
     else:
         raise ConvergenceError(
@@ -339,7 +330,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     upper = np.linalg.cholesky(arm.energy_matrix(V)).T
     _, triangle = np.linalg.qr((upper @ reduced.vectors @ factor).T)
     U, sigma, _ = on_root(arm.comm, partial(np.linalg.svd, triangle.T, full_matrices=False))
-    found = int((sigma > RESPONSE_RANK_SHARE * sigma[0]).sum())
+    found = int((sigma > DEFLATION_SHARE * sigma[0]).sum())
     if found < options.coordinates:
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: responses between {options.band[0]:g} and "
@@ -349,17 +340,16 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     return ritz(arm, combine(V, np.linalg.solve(upper, U[:, : options.coordinates])))
 
 
-def _inputs(free: FreeArm) -> Rows:
+def _inputs(arm: ElasticArm) -> Rows:
     """Return the inputs (.., 2 b), all for the same unit of acceleration."""
-    arm = free.arm
     fields = frame_fields(arm)
     mass = dot(arm, fields, arm.mass_times(fields))[0, 0]  # of the arm
     length = float(np.linalg.norm(arm.mesh.outboard_point))
-    loads, inertia = interface_loads(free), frame_loads(free)
+    loads, inertia = interface_loads(arm), frame_loads(arm)
     turns = [1.0, 1.0 / length, 1.0] if arm.mesh.dim == 2 else [1.0, 1.0, *(1.0 / length,) * 3, 1.0]
     shift = arm.mesh.dim
     by_load = mass * np.array([*(1.0,) * shift, *(length,) * (len(turns) - shift)])
-    by_load = np.tile(by_load, len(free.corner) // len(turns))
+    by_load = np.tile(by_load, arm.rigid.shape[2] // len(turns))
     by_frame = np.array(turns)
     return (
         np.hstack([loads[0] * by_load, inertia[0] * by_frame]),
@@ -384,12 +374,12 @@ class _Reduced:
         """Diagonalise the part of the space that K^-1 M was applied to."""
         r = space.H.shape[1]
         T = space.H[:r]
-        theta, vectors = on_root(space.free.arm.comm, np.linalg.eigh, 0.5 * (T + T.T))
+        theta, vectors = on_root(space.arm.comm, np.linalg.eigh, 0.5 * (T + T.T))
         theta = np.maximum(theta, np.finfo(float).eps * theta[-1])  # positive but for rounding
         inputs = vectors[: len(space.start)].T @ space.start
         beyond = space.H[r:] @ vectors
         if len(beyond):  # none where the space is invariant
-            energy = space.free.arm.energy_matrix(space.V[:, :, r:])
+            energy = space.arm.energy_matrix(space.V[:, :, r:])
             beyond = np.linalg.cholesky(energy).T @ beyond
         return cls(theta, vectors, inputs, beyond, damping)
 

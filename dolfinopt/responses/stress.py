@@ -14,7 +14,6 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.load_gradient import load_counts, load_gradient
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import LoadFields
 from dolfinopt.fem.tensors import element_centre
 from dolfinopt.multibody.dimension import DIMENSIONS
@@ -586,7 +585,7 @@ def _esl_gradient(part: _ArmGradient, state: DesignState, cells: PointStress, by
         return by(state, part.beside)
     with arm.profile.phase("gradient"):
         u = cells.fields.displacements(part.a)
-        adjoint = static_response(arm, *arm.restrict(part.by_u))
+        adjoint = arm.static_response(*arm.restrict(part.by_u))
         pairs = ((-adjoint, u),)
         interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((part.by_u, u),))
         return by(state, part.beside + Products(stiffness=pairs, interfaces=interfaces))

@@ -14,10 +14,10 @@ from dolfinopt.bench import run as benches
 from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, curves, figure_of, fitted_power, least_x
 from dolfinopt.bench.run import Goal, goal_table
+from dolfinopt.bench.solid import ITERATIVE
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.scene import INERTIA
-from dolfinopt.fem.interior import ITERATIVE
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import rigid_spatial_body

@@ -9,8 +9,8 @@ from runs import TWO_ARM, overrides, refusal, run
 from solids import solid_scene
 
 from dolfinopt.arms.arm import build_arms
+from dolfinopt.errors import InputError
 from dolfinopt.fem import interior
-from dolfinopt.fem.interior import InteriorSystem
 from dolfinopt.mesh import budget
 from dolfinopt.mesh.budget import check_budget, free_memory
 from dolfinopt.parallel import partition_arms
@@ -114,10 +114,10 @@ def test_free_memory(tmp_path):
 
 @pytest.mark.serial
 def test_arms_on_several_ranks_share_the_memory(monkeypatch):
-    """A factor of 1.5 GB where 4 GB are free: by factors on one rank, beside five others not."""
-    arm = object.__new__(InteriorSystem)
-    arm._T = SimpleNamespace(comm=MPI.COMM_SELF, num_dofs=100_000)
+    """A factor of 1.5 GB where 4 GB are free: fits on one rank, beside five others not."""
+    layout = SimpleNamespace(comm=MPI.COMM_SELF, num_rows=100_000, name="link")
     monkeypatch.setattr(interior, "free_memory", lambda: 4e9)
-    for ranks, short in ((1, False), (6, True)):
-        monkeypatch.setenv("OMPI_COMM_WORLD_LOCAL_SIZE", str(ranks))
-        assert arm._memory_is_short() is short
+    interior._check_factor(layout)
+    monkeypatch.setenv("OMPI_COMM_WORLD_LOCAL_SIZE", "6")
+    with pytest.raises(InputError, match=r"takes about 1\.5 GB"):
+        interior._check_factor(layout)

@@ -17,7 +17,6 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics.load_gradient import ProbedSystem
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.fem.geometric_stiffness import static_response
 from dolfinopt.fem.stress import places_of, rotated, stress_operator
 from dolfinopt.multibody.newton_euler import outward_pass
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
@@ -164,7 +163,7 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
     worst = 0.0
     for arm, cells, _, q, found, right in analysed_arms(built):
         for n in (300, 1200, 2500):
-            full = lengths(cells, static_response(arm.current.elastic, *right(n))[:, :, 0])
+            full = lengths(cells, arm.current.elastic.static_response(*right(n))[:, :, 0])
             assert np.abs(found(n) - full).max() < 1e-6 * full.max()
             modal = lengths(cells, arm.current.basis.V @ q[n])
             worst = max(worst, float(np.abs(modal - full).max() / full.max()))
@@ -182,11 +181,11 @@ def test_static_solution_of_the_stiffened_arm() -> None:
     for arm, cells, c, _, found, right in analysed_arms(built):
         elastic, n = arm.current.elastic, int(np.argmax(np.abs(c[:, 5])))
         interior, end = right(n)
-        linear = static_response(elastic, interior, end)[:, :, 0]
+        linear = elastic.static_response(interior, end)[:, :, 0]
         Kg, u = geometric_matrix(arm, c[n]), linear
         for _ in range(6):  # K u = f + sum_p p K0_p u
             more = elastic.restrict((Kg @ u.ravel()).reshape(-1, 2, 1))
-            u = static_response(elastic, interior + more[0], end + more[1])[:, :, 0]
+            u = elastic.static_response(interior + more[0], end + more[1])[:, :, 0]
         full = lengths(cells, u)
         assert np.abs(found(n) - full).max() < 3.5e-3 * full.max()
         effect = max(effect, float(np.abs(lengths(cells, linear) - full).max() / full.max()))
@@ -341,7 +340,7 @@ def test_gradient_with_frozen_loads() -> None:
             arm.set_design(x[k] + h * d[k])
             cells = cell_stress_of_fields(arm)
             for interior, end in right:
-                u = static_response(arm.current.elastic, interior, end)[:, :, 0]
+                u = arm.current.elastic.static_response(interior, end)[:, :, 0]
                 total += float(cells.weights @ (lengths(cells, u) / found.largest) ** p)
         return found.largest * (total / found.weight) ** (1.0 / p)
 
