@@ -95,6 +95,7 @@ def mma_step(
     state: MMAState,
     *,
     move: float = 0.2,
+    first: float = FIRST_ASYMPTOTE_DISTANCE,
     widest: float = LARGEST_ASYMPTOTE_DISTANCE,
     prices: npt.ArrayLike | None = None,
     comm: MPI.Comm | None = None,
@@ -116,7 +117,8 @@ def mma_step(
         xmin, xmax: (n,) or scalar bounds; a variable with xmin == xmax stays.
         state: what the step before returned, or `initial_state(x)`.
         move: largest step of a variable, in units of its range.
-        widest: largest distance of the asymptotes, in these units. Wide ones make the approximation
+        first, widest: distance of the asymptotes in the first two steps, and the largest one, in
+            these units. Wide ones make the approximation
             nearly linear, which lets curved constraints be left again and again.
         prices: (m,) of a unit of every f_i, in units of f0: with them the approximation is that of
             f0 + sum_i price_i max(0, f_i). By default c_i = 1000.
@@ -146,6 +148,7 @@ def mma_step(
         xmax if xmax.ndim else np.full(x.shape, xmax),
         state,
         move,
+        first,
         widest,
         None if prices is None else np.asarray(prices, dtype=np.float64),
         {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
@@ -172,6 +175,7 @@ class _Given:
     xmax: Array
     state: MMAState
     move: float
+    first: float
     widest: float
     prices: Array | None
     pieces: Mapping[int, int]
@@ -217,8 +221,8 @@ def _fault(given: _Given) -> str:
             return f"state.{name} does not hold {n} finite numbers"
     if sum(given.pieces.values()) != n:
         return f"pieces hold {sum(given.pieces.values())} variables, x {n}"
-    if given.widest < FIRST_ASYMPTOTE_DISTANCE:
-        return f"widest is {given.widest}, expected at least {FIRST_ASYMPTOTE_DISTANCE}"
+    if given.widest < given.first:
+        return f"widest is {given.widest}, expected at least {given.first}"
     if not 0.0 < given.move <= 1.0:
         return f"move is {given.move}, expected 0 < move <= 1"
     outside = (given.x < given.xmin) | (given.x > given.xmax)
@@ -257,7 +261,7 @@ def _asymptote_distance(given: _Given, columns: slice, width: Array) -> Array:
     """Return the distance of the asymptotes from x in units of the range `width`."""
     state = given.state
     if state.iteration < 2:
-        return np.full(width.shape, FIRST_ASYMPTOTE_DISTANCE)
+        return np.full(width.shape, given.first)
     last = (given.x[columns] - state.x_old1[columns]) / width
     before = (state.x_old1[columns] - state.x_old2[columns]) / width
     moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE

@@ -50,7 +50,7 @@ ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh s
 HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
-WIDEST = 1.0  # largest distance of the asymptotes, ranges of a variable
+FIRST, WIDEST = 0.5, 1.0  # first and largest distance of the asymptotes, ranges of a variable
 TRIALS = 30  # struts of an arm that are left out in trial, at most
 GAIN = 1e-4  # relative, of the objective, that leaving out a strut must promise
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
@@ -849,6 +849,7 @@ class Search:
             self.x + np.concatenate(high),
             self.mma,
             move=1.0,
+            first=FIRST,
             widest=WIDEST,
             prices=np.full(len(values) - 1, price),
         )

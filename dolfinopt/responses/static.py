@@ -138,7 +138,7 @@ def _rows(analysis: Analysis) -> dict[int, int]:
 # -- what static loads do to single arms: compliance, deflection, stiffness ------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoadedArm:
     """What has one value of static loads: one arm, clamped at its inboard interface.
 

@@ -172,6 +172,8 @@ def posed(scene: Scene, kind: str) -> Scene:
     """
     tree = scene.to_tree()
     tree["objective"] |= {"kind": kind, "direction": None}
+    if kind not in DECLARED:
+        return scene_from_dict(tree, scene.source)  # which refuses it
     if not DECLARED[kind].lighter:
         tree["constraints"] = {"settling_after": scene.constraints.settling_after}
     elif not scene.objective.response.lighter or "volume_fraction" not in tree["design"]:
@@ -184,7 +186,8 @@ def posed(scene: Scene, kind: str) -> Scene:
 
 def _drop_unused(tree: dict[str, Any]) -> None:
     """Take out of a scene's data what its objective and its limits do not use."""
-    limited = [key for key, limit in tree["constraints"].items() if limit is not None]
+    keys = {one.key for one in DECLARED.values()}
+    limited = [k for k, limit in tree["constraints"].items() if limit is not None and k in keys]
     for key in unused_options(list(tree["objective"]), tree["objective"]["kind"], limited):
         tree["objective"].pop(key, None)
 

@@ -1,7 +1,7 @@
 """Pieces that share faces, contacts that do not, and designs rated without these."""
 
 import json
-from dataclasses import replace
+from copy import copy
 from types import SimpleNamespace
 
 import numpy as np
@@ -218,7 +218,8 @@ def compliance(arm, solid, split):
             cells[at[1]] = np.where(cells[at[1]] == node, len(points), cells[at[1]])
             points.append(points[node])
     elastic = arm.state(solid * 1.0).elastic
-    own = replace(operators, cells=cells, points=np.array(points))
+    own = copy(operators)
+    own.cells, own.points = cells, np.array(points)
     K, _ = dense_matrices(SimpleNamespace(operators=own, mesh=arm.mesh), elastic.young, solid)
     inverse = np.linalg.inv(K)
     return inverse[-2, -2] + inverse[-1, -1]  # a force across, a moment

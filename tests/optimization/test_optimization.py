@@ -154,7 +154,9 @@ def test_a_step_without_a_motion_is_made_shorter(monkeypatch):
     assert result.iterations == 1
     start = np.full_like(lengths[0], 0.5)
     longest = [np.abs(x - start).max() for x in lengths[:3]]
-    assert longest == pytest.approx([0.2 * 0.999 / 4**k for k in range(3)])  # of the range
+    assert longest == pytest.approx(
+        [0.999 * move for move in (0.18, 0.05, 0.0125)]
+    )  # 0.9 of the first asymptotes
     lengths.clear()
     fails[0] = 4
     ended = do.optimize(small(*SMALLEST, iterations=5))

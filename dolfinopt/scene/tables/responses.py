@@ -433,7 +433,9 @@ def users_of(option: str) -> tuple[list[str], list[str]]:
 
 def unused_options(scene_options: Iterable[str], kind: str, limited: Iterable[str]) -> list[str]:
     """Return those options that some responses use, but not this objective nor these limits."""
-    used = {*DECLARED[kind].options, *(o for key in limited for o in limited_by(key).limit_options)}
+    used = {*DECLARED[kind].options}
+    for key in limited:
+        used |= {*limited_by(key).limit_options}
     return [one for one in scene_options if any(users_of(one)) and one not in used]
 
 
