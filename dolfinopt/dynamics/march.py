@@ -203,7 +203,7 @@ class March:
 
     def _keep(self, ends: np.ndarray, a: np.ndarray, state: State) -> None:
         """Go on from the end of some steps."""
-        self._ends += ends.tolist()
+        self._ends += map(float, ends)
         self._pieces.append(a)
         self.state, self.t = state, self._ends[-1]
 

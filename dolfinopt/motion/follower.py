@@ -80,7 +80,7 @@ class Follower:
         task, q, t = self.task, self.start.q, 0.0
         self._regularity.check((np.zeros(1), q[None], q[None]))
         qd, qdd, G = task.rates(q[None], task.target(np.zeros(1)))
-        samples, ahead = [(t, q, qd[0])], self._instants[:0:-1].tolist()
+        samples, ahead = [(t, q, qd[0])], list(map(float, self._instants[:0:-1]))
         while ahead:
             h = ahead[-1] - t
             found = self._reached(q + h * qd[0] + 0.5 * h * h * qdd[0], ahead[-1], G)

@@ -101,7 +101,7 @@ class Curve:
 def moves(rows: np.ndarray) -> list[tuple[int, int]]:
     """Return the first and last row of every move; rows in succession that are equal are a stop."""
     moving = [False, *(np.diff(rows, axis=0) != 0.0).any(axis=1), False]
-    ends = np.flatnonzero(np.diff(moving)).tolist()
+    ends = list(map(int, np.flatnonzero(np.diff(moving))))
     return list(zip(ends[::2], ends[1::2], strict=True))
 
 
