@@ -22,7 +22,7 @@ from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import checkpoint, design, run_folder, summary
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
-from dolfinopt.responses import evaluation, frequency, motion, static
+from dolfinopt.responses import evaluation, frequency, motion, reductions, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import load_scene
 from dolfinopt.study import cases as computing
@@ -241,8 +241,8 @@ PLACES = [
     (gradients, LONE, static, "tip_gradient", TIP),
     (gradients, LONE, frequency, "period_gradient", FREQUENCY),
     (choosing, LONE, arm.Arm, "set_design"),
-    (choosing, LONE, coordinates, "shape_integrals"),
-    (choosing, LONE, coordinates, "_leading"),
+    (choosing, LONE, reductions, "shape_integrals"),
+    (choosing, LONE, reductions, "_leading"),
     (choosing, 0, coordinates, "_largest"),
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes

@@ -92,6 +92,11 @@ def run(
     return run_.go(memory)
 
 
+def begins_with_frozen_loads(scene: Scene) -> bool:
+    """Return whether the exact gradient takes over from one with frozen loads."""
+    return scene.objective.gradient == "exact" and scene.objective.has_esl_gradient
+
+
 class _Run:
     """One optimisation under way."""
 
@@ -135,7 +140,7 @@ class _Run:
         if memory is not None:
             self._restore(memory)
         else:
-            if scene.objective.gradient == "exact" and scene.objective.has_esl_gradient:
+            if begins_with_frozen_loads(scene):
                 self.evaluator.use_gradient("esl")
             elif scene.objective.gradient == "exact":
                 self.exact_from = 0

@@ -116,7 +116,8 @@ def test_a_resting_design_is_a_stationary_one():
     result = do.optimize(quick("objective.kind=static", iterations=200))
     assert result.converged and result.kkt < 1e-2 and not result.violated
     if WORLD.rank == 0:
-        assert result.history[0].kkt > 0.1 and result.history[-1].kkt == result.kkt
+        best = result.history[result.best_iteration]
+        assert result.history[0].kkt > 0.1 and best.kkt == pytest.approx(result.kkt, rel=1e-3)
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")

@@ -180,7 +180,7 @@ def test_compliance_falls_at_no_more_volume(form):
     shape, link = figures["optimize"], figures["arms"]["link1"]
     assert shape["after"] <= shape["before"]
     if part.flat is None:  # the plate's window is as good as two steps make it
-        assert shape["iterations"] == 2 and shape["after"] < 0.98 * shape["before"]
+        assert shape["iterations"] == 2 and shape["after"] < 0.985 * shape["before"]
     assert link["watertight"] and link["volume"] <= 1.01 * part.domain.volume
     assert do.load_scene(folder / "part" / "part.toml").arms[1].mesh is not None
 

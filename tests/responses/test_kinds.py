@@ -324,7 +324,7 @@ def test_lightest_arm_keeps_its_end_straight(tmp_path):
         assert found.value == results[-1].trajectory.max_rotation
     kept, broken = results
     assert kept.converged and not kept.violated
-    assert kept.limits[0].value == pytest.approx(2.5e-3, rel=EXCESS)  # active
+    assert kept.limits[0].value == pytest.approx(2.5e-3, rel=5e-3)  # active: 0.4 % within
     solid = 1e-3 * LENGTH * HEIGHT * THICKNESS  # kg
     assert 0.3 * solid < kept.evaluation.objective < 0.5 * solid  # 0.39
     assert "no design near this one meets orientation <= 0.001 rad" in broken.stop_reason

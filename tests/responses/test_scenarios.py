@@ -131,7 +131,7 @@ def test_weights_scale_the_worst_case():
 @pytest.mark.serial  # ranks have no part in it
 def test_robust_against_two_payloads():
     """The worst case of a light and a heavy payload is better than that of the nominal design."""
-    fast = ["optimizer.max_iterations=25", "arms.cells=[30,4]", "simulation.tolerance=1e-3"]
+    fast = ["optimizer.max_iterations=60", "arms.cells=[30,4]", "simulation.tolerance=1e-3"]
     uses = scenarios(("payload.mass=2",), ("payload.mass=8",), weights=[8, 1])
     scene = do.load_scene(TWO_ARM, [*fast, uses, "objective.scenarios=worst"])
     robust = do.optimize(scene)

@@ -126,7 +126,7 @@ def test_repeated_frequencies(apart: float) -> None:
 @pytest.mark.serial
 def test_payload_demo(shared_tmp_path, capsys) -> None:
     """Runs, tables and draws on few cells; a light payload gains by the exact gradient."""
-    rows = demo("demo_payload").main(shared_tmp_path, (20, 2), (0.2,), 15)
+    rows = demo("demo_payload").main(shared_tmp_path, (20, 2), (0.2,), 60)
     frozen, exact = rows
     assert (frozen["gradient"], exact["gradient"]) == ("esl", "exact")
     assert exact["compliance [N m]"] < 0.8 * frozen["compliance [N m]"]  # 0.70

@@ -323,8 +323,9 @@ def test_objective(folder):
     for name in possible:
         if "eigenfrequency" not in name:
             assert compliance[name] < compliance["initial design"]
-    # One iteration from the same start: at most two objectives may agree.
-    assert len({*compliance.values()}) >= len(names) - 2
+    # One iteration from the same start: of three pairs, among them frozen loads and the exact
+    # gradient, which begins with them, objectives may agree.
+    assert len({*compliance.values()}) >= len(names) - 3
     assert is_drawn(folder / "objective_designs.png")
 
 
