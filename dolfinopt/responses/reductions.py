@@ -45,7 +45,8 @@ class Reductions:
             return self._reduce(method, count)
         if count > self._count:
             self._richest, self._count = self._reduce(method, count), count
-        return {k: _leading(basis, count) for k, basis in self._richest.items()}
+        with together(self.partition.world):
+            return {k: _leading(basis, count) for k, basis in self._richest.items()}
 
     def _reduce(self, method: str, count: int) -> dict[int, Basis]:
         reduce = METHODS[method].reduce
