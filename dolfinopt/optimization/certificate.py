@@ -39,7 +39,8 @@ class Certificate:
             frozen, or no variable is free.
         missing: why there is no exact gradient, "" if there is one.
         violated: the constraints that the design does not keep, "" if it keeps all.
-        seconds: that the exact gradient took, without further iterations, s; the root's.
+        stationary: whether the residual is at most `optimizer.kkt_tolerance`.
+        seconds: that the exact gradient took, s; the root's.
     """
 
     kkt: float = np.nan
@@ -48,6 +49,7 @@ class Certificate:
     missing: str = ""
     violated: str = ""
     seconds: float = 0.0
+    stationary: bool = False
 
     @property
     def sentence(self) -> str:
@@ -68,6 +70,7 @@ class Certificate:
             "gradient_ratio": _known(self.ratio),
             "feasible": not self.violated,
             "missing": self.missing,
+            "stationary": self.stationary,
             "seconds": self.seconds,
             "sentence": self.sentence,
         }
@@ -167,7 +170,9 @@ def certify(
     variables, total = evaluator.variables, partial(sum_over_arms, evaluator.partition)
     bounds = variables.xmin, variables.xmax
     found = judge(x, *bounds, exact, frozen, variables.slices, total)
-    return replace(found, seconds=comm.bcast(time.perf_counter() - begun, root=0))
+    seconds = comm.bcast(time.perf_counter() - begun, root=0)
+    stationary = bool(found.kkt <= scene.optimizer.kkt_tolerance)
+    return replace(found, seconds=seconds, stationary=stationary)
 
 
 def _problem_by(
