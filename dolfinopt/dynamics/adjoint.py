@@ -25,6 +25,7 @@ from dolfinopt.dynamics.collocation import (
     tangent_at,
     vector_jacobian_product,
 )
+from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
     ADJOINT_CORRECTIONS_LIMIT,
@@ -63,15 +64,27 @@ class Adjoint:
             t: (m,) ascending instants at which J looks at the coordinates, s.
             by_q: (m, N) dJ/dq there; or (k, m, N), k <= 3, by q, qd and qdd in this order.
         """
+        return self.by_bodies(*self.multipliers(t, by_q))
+
+    def multipliers(self, t: np.ndarray, by_q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return those of the residual at all stages (n s, N), and dJ by the first state (N,)."""
         by_rates = by_q if by_q.ndim == 3 else by_q[None]
         by_a, by_y = _sampled(self.solution, t, self._modes.gradient_to_modes(by_rates))
         multipliers, first = self._backwards(by_a, by_y)
         # Rows in z are T' times those in q: their multipliers turn like coordinates.
         turned = self._modes.from_modes(multipliers).reshape(self._rates[0].shape)
-        gradient = self._instants.state(*self._rates).body_gradient(turned)
-        by_start = self._modes.gradient_from_modes(first)
+        return turned, self._modes.gradient_from_modes(first)
+
+    def by_bodies(self, multipliers: np.ndarray, by_start: np.ndarray) -> list[ShapeIntegrals]:
+        """Return dJ/d(constants) of every body by these multipliers."""
+        gradient = self.state.body_gradient(multipliers)
         through_start = self.system.start_gradient(self.solution.q[0], by_start)
         return add_gradients(gradient, through_start) if through_start else gradient
+
+    @property
+    def state(self) -> MachineState:
+        """The system at all stages."""
+        return self._instants.state(*self._rates)
 
     def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,)."""

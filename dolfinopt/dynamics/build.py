@@ -82,20 +82,32 @@ def _kept_motion(scene: Scene, _: int, instants: bytes) -> RigidMotion:
 
 def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
     """Return the equations of a scene and its bodies, from the base outwards."""
-    motion = desired_motion(scene)
+    motion, lead = desired_motion(scene), scene.lead
     mechanism, instants = build_mechanism(scene, bodies), breakpoints(scene)
-    loads, rows = loads_of(scene), table_rows(scene)
+    loads, rows = loads_of(scene), table_rows(scene) + lead
+    if scene.horizon > scene.motion.horizon:
+        motion = partial(_begun_at, lead, motion)
+        instants = tuple(np.unique([0.0, *(t + lead for t in instants), scene.horizon]))
     if loads or len(rows):
         mechanism = replace(mechanism, forces=forces_of(scene))
         motion = LoadedMotion(motion, loads, rows)
         tables = [load.table for load in loads if load.table is not None]
-        instants = with_ends(instants, tables, scene.motion.horizon)
+        instants = with_ends(instants, tables, scene.horizon)
     if not is_machine(scene):
         return MachineSystem(mechanism, motion, instants)
     drives = _drives(scene)
     if drives.table is not None:
         instants = with_ends(instants, [drives.table], scene.motion.horizon)
     return MachineSystem(mechanism, motion, instants, drives, loops_of(scene))
+
+
+def _begun_at(
+    lead: float, motion: Callable[[np.ndarray], RigidMotion], t: np.ndarray
+) -> RigidMotion:
+    """Return a motion that begins after `lead`, s, and rests before, at instants t (n,), s."""
+    moved = motion(np.maximum(t - lead, 0.0))
+    begun = (t >= lead)[:, None]
+    return replace(moved, qd=moved.qd * begun, qdd=moved.qdd * begun)
 
 
 def largest_stiffness_change(scene: Scene, bodies: list[ShapeIntegrals], t: np.ndarray) -> float:
@@ -205,16 +217,17 @@ def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
 
 def loads_of(scene: Scene) -> tuple[LoadHistory, ...]:
     """Return the scene's forces and moments over time, N and N m."""
-    return tuple(_load(force, scene.dimension) for force in scene.forces)
+    return tuple(_load(force, scene.dimension, scene.lead) for force in scene.forces)
 
 
-def _load(force: Force, dimension: int) -> LoadHistory:
+def _load(force: Force, dimension: int, lead: float) -> LoadHistory:
     """Return force and moment, (3,) or in space (6,), and the table's."""
     constant = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
     if force.table is None:
         return LoadHistory(force.factor * constant)
     table = _table(force.table, FORCE_COLUMNS[dimension])
-    return LoadHistory(force.factor * constant, Table(table.t, force.factor * table.values))
+    values = force.factor * table.values
+    return LoadHistory(force.factor * constant, Table(table.t + lead, values))
 
 
 def _table(file: str, columns: tuple[str, ...]) -> Table:

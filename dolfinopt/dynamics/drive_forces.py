@@ -36,20 +36,22 @@ class DriveForces:
         self.system, self.t, self.rates = system, t, rates
         self._kept: _Chunk | None = None
 
-    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+    def gradient(
+        self, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
         """Return the derivative of sum_n weights_n . forces_n, instants and coordinates held apart.
 
         Args:
             weights: (n, 1 + arms) of the forces of cart and joints, see `Trajectory.joint_forces`.
 
         Returns:
-            By coordinates, rates and accelerations (3, n, S); and by every body's integrals, the
-            coordinates held.
+            By coordinates, rates and accelerations (3, n, S); by those of the rigid motion that is
+            prescribed (3, n, R); and by every body's integrals, the coordinates held.
         """
         parts = [self._chunk(part).gradient(weights[part]) for part in self._parts]
-        by_rates, bodies = zip(*parts, strict=True)
+        by_rates, by_motion, bodies = zip(*parts, strict=True)
         total = [sum(own[1:], own[0]) for own in zip(*bodies, strict=True)]
-        return np.concatenate(by_rates, axis=1), total
+        return np.concatenate(by_rates, axis=1), np.concatenate(by_motion, axis=1), total
 
     @cached_property
     def _parts(self) -> list[slice]:
@@ -81,7 +83,9 @@ class _Chunk:
         every = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))
         return linearise(mechanism, motion, *self.state.elastic, None, every)
 
-    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+    def gradient(
+        self, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`."""
         state, system = self.state, self.state.machine
         drives, joints = system.drives, system.mechanism.motor_joints
@@ -89,33 +93,41 @@ class _Chunk:
         given[:, drives.free] = 0.0
         if not len(drives.springs.joints):
             given[:, weights.shape[1] :] = weights[:, joints]
-        by, bodies = self._of_inverse_dynamics(given)
+        by, by_motion, bodies = self._of_inverse_dynamics(given)
         passed = state.passing * weights[:, drives.free]
         by[0][:, system.drive_columns] -= passed * drives.stiffness
         by[1][:, system.drive_columns] -= passed * drives.damping
-        return by, state.with_feed_forward(bodies, weights[:, drives.free])
+        return by, by_motion, state.with_feed_forward(bodies, weights[:, drives.free])
 
-    def _of_inverse_dynamics(self, weights: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+    def _of_inverse_dynamics(
+        self, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
         """Return the part of drives on a given motion: inverse dynamics, less the closure's."""
         state, system = self.state, self.state.machine
         mechanism, none = system.mechanism, np.zeros_like(state.elastic[0])
         bodies = body_gradient(mechanism, state.motion, *state.elastic, none, weights)
         by = np.zeros((3, *state.rates[0].shape))
+        by_motion = np.zeros((3, len(weights), mechanism.num_rigid))
         if not weights.any():
-            return by, bodies
+            return by, by_motion, bodies
         rows = np.concatenate([weights, none], axis=1)
         every = np.stack(self.tangent.transposed(rows))
         by[:, :, system.motor_columns] = every[:, :, system.motor_coordinates]
         rigid, moving = mechanism.num_rigid, system.ends[1]
+        by_motion += every[:, :, :rigid]
+        by_motion[:, :, mechanism.motor_joints] += every[:, :, rigid : weights.shape[1]]
         every = np.delete(every, np.s_[rigid : weights.shape[1]], axis=2)
         by[:, :, :moving] = every[:, :, system.columns]
         if state.closed is None:
-            return by, bodies
+            return by, by_motion, bodies
         weights, multipliers = weights[:, :rigid], state.multipliers
-        H = state.closed.hessian(multipliers)[:, :rigid, system.columns]
+        hessian = state.closed.hessian(multipliers)[:, :rigid]
+        H = hessian[:, :, system.columns]
+        by_motion[0] -= np.einsum("ni,nic->nc", weights, hessian[:, :, :rigid])
         J = state.closed.jacobian[:, :, :rigid]
         by[0][:, :moving] -= np.einsum("ni,nic->nc", weights, H)
         by[2][:, system.constraint_columns] -= np.einsum("nmi,ni->nm", J, weights)
         moved = np.concatenate([weights, none], axis=1)
         parts = state.closed.gradient(np.zeros_like(multipliers), multipliers, -moved)
-        return by, [add_integrals(a, part) for a, part in zip(bodies, parts, strict=True)]
+        bodies = [add_integrals(a, part) for a, part in zip(bodies, parts, strict=True)]
+        return by, by_motion, bodies

@@ -52,7 +52,7 @@ def load_counts(body: ShapeIntegrals) -> LoadCounts:
 
 def load_gradient(
     system: MachineSystem, t: np.ndarray, rates: Rates, by_coefficients: Sequence[np.ndarray]
-) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
     """Differentiate a function of `load_coefficients`, given its derivatives by them.
 
     Args:
@@ -62,7 +62,8 @@ def load_gradient(
         by_coefficients: (n, 7 + 2 q or 18 + 9 q) of every body.
 
     Returns:
-        By the unknowns and their derivatives (3, n, S); by every body's integrals, unknowns held.
+        By the unknowns and their derivatives (3, n, S); by the rigid coordinates that the motion
+        prescribes and theirs (3, n, R); by every body's integrals, unknowns held.
     """
     probed = ProbedSystem(system)
     multipliers = np.zeros((len(t), probed.system.num_coordinates))
@@ -71,12 +72,15 @@ def load_gradient(
     y, yd, ydd = (probed.spread(x) for x in rates)
     instants = probed.system.at(t)
     by_rates = np.stack(instants.linearise(y, yd, ydd).transposed(multipliers))
-    wide = instants.state(y, yd, ydd).body_gradient(multipliers)
+    state = instants.state(y, yd, ydd)
+    by_command = state.by_command(np.arange(system.mechanism.num_rigid))
+    by_motion = np.einsum("ns,nsrk->knr", multipliers, by_command)
+    wide = state.body_gradient(multipliers)
     by_bodies = [
         by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])
         for by, body in zip(wide, system.mechanism.bodies, strict=True)
     ]
-    return by_rates[:, :, probed.own], by_bodies
+    return by_rates[:, :, probed.own], by_motion, by_bodies
 
 
 class ProbedSystem:

@@ -258,6 +258,31 @@ class MachineState:
         if self.instants.redundant is not None:
             matrix[:, rows, rows, 2] += CLOSURE_COMPLIANCE_SHARE * self.instants.redundant[0]
 
+    def by_command(self, joints: np.ndarray) -> np.ndarray:
+        """Return the residual's derivative by desired coordinates (n, S, F, 3) and their rates.
+
+        Rotors that are not unknown turn with their joints.
+        """
+        machine, mechanism = self.machine, self.machine.mechanism
+        rigid = mechanism.num_rigid
+        every = np.arange(rigid + len(mechanism.motor_joints))
+        tangent = linearise(mechanism, self.motion, *self.elastic, None, every)
+        columns = tangent.matrix[:, :, tangent.order]
+        by = columns[:, :, joints]
+        for k, joint in enumerate(mechanism.motor_joints):
+            by[:, :, joints == joint, 1:] += columns[:, :, [rigid + k], 1:]
+        out = np.zeros((len(by), machine.num_coordinates, len(joints), 3))
+        out[:, : machine.ends[0]] = by[:, machine.drives.free]
+        out[:, machine.elastic_columns] = by[:, len(every) :]
+        out[:, machine.motor_columns] = by[:, machine.motor_coordinates]
+        if self.closed is not None:
+            moving = machine.columns
+            hessian = self.closed.hessian(self.multipliers)
+            out[:, : machine.ends[1], :, 0] -= hessian[:, moving[:, None], joints]
+            gaps = machine.gap_scale * self.closed.jacobian[:, :, joints]
+            out[:, machine.constraint_columns, :, 0] += gaps
+        return out
+
     # -- derivatives by the bodies -----------------------------------------------------------
 
     def body_gradient(self, multipliers: np.ndarray) -> list[ShapeIntegrals]:

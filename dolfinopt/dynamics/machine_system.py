@@ -32,7 +32,7 @@ from dolfinopt.dynamics.machine_instants import MachineInstants
 from dolfinopt.dynamics.measured import DEFLECTION_LIMIT, EXACT
 from dolfinopt.dynamics.modes import Modes, modes_of
 from dolfinopt.dynamics.system import State, Unchanged
-from dolfinopt.dynamics.tables import motion_at_stages
+from dolfinopt.dynamics.tables import motion_at_stages, stage_instants
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.loads import is_loaded_at_rest
@@ -69,6 +69,7 @@ class MachineSystem:
     breakpoints: tuple[float, ...]
     drives: Drives = PRESCRIBED
     loops: Loops | None = None
+    path: Callable[[np.ndarray], RigidMotion] | None = None
 
     # -- unknowns ----------------------------------------------------------------------------
 
@@ -138,19 +139,23 @@ class MachineSystem:
     def at(self, t: np.ndarray) -> MachineInstants:
         """Return the machine at instants t (n,), s."""
         table = self.drives.table
-        return self._along(self.motion(t), None if table is None else table(t))
+        return self._along(t, self.motion(t), None if table is None else table(t))
 
     def at_stages(self, time_grid: np.ndarray, nodes: np.ndarray) -> MachineInstants:
         """Return it at the stages of the steps of a grid, see `System.at_stages`."""
         table = self.drives.table
         given = None if table is None else table.at_stages(time_grid, nodes)
-        return self._along(motion_at_stages(self.motion, time_grid, nodes), given)
+        desired = motion_at_stages(self.motion, time_grid, nodes)
+        return self._along(stage_instants(time_grid, nodes), desired, given)
 
-    def _along(self, desired: RigidMotion, given: np.ndarray | None) -> MachineInstants:
+    def _along(
+        self, t: np.ndarray, desired: RigidMotion, given: np.ndarray | None
+    ) -> MachineInstants:
         """Return the machine on a desired motion, with a table's forces (n, R) of its drives."""
         ahead, winding = known_forces(self, desired)
         ahead = ahead if given is None else ahead + given
-        return MachineInstants(self, desired, ahead, winding, self.redundant_at(desired))
+        closing = desired if self.path is None else self.path(t)
+        return MachineInstants(self, desired, ahead, winding, self.redundant_at(closing))
 
     @cached_property
     def rigid(self) -> Mechanism:
@@ -284,6 +289,16 @@ class MachineSystem:
         multipliers = np.zeros((1, len(y)))
         multipliers[0, some] = np.linalg.solve(self._stiffness(instants, rates).T, right[some])
         return instants.state(*rates).body_gradient(multipliers)
+
+    def start_by_command(self, y: np.ndarray, joints: np.ndarray) -> np.ndarray:
+        """Return the derivative (S, F) of the state y (S,) at t = 0 by desired coordinates."""
+        instants, some = self.at(np.zeros(1)), self._at_start
+        rates = self._rest(y[None])
+        by = instants.state(*rates).by_command(joints)[0, :, :, 0]
+        out = np.zeros_like(by)
+        out[some] = -np.linalg.solve(self._stiffness(instants, rates), by[some])
+        out[self.constraint_columns] = 0.0
+        return out
 
     # -- what integrators measure by ---------------------------------------------------------
 

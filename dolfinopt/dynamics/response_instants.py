@@ -16,12 +16,13 @@ def response_instants(
     solution: Solution,
     stiffness: np.ndarray,
     elastic: np.ndarray | slice,
+    begin: float,
     horizon: float,
     least: int,
 ) -> np.ndarray:
     """Return the instants (n,) of all extremes and integrals over time, s.
 
-    They lie evenly from 0 to the horizon, both included, at most 1 ms apart (of a horizon above
+    They lie evenly from the path's beginning to the horizon, both included, at most 1 ms apart (of a horizon above
     1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
     that it could exceed two neighbouring instants by more than
     `EXTREME_EXCESS_SHARE` of its largest value: between instants d apart by max |qdd| d^2 / 8 at
@@ -31,10 +32,11 @@ def response_instants(
         solution: the integrator's.
         stiffness: (N, N) of the elastic coordinates; its energy is the norm.
         elastic: their columns in the solution.
-        horizon: s.
+        begin, horizon: s.
         least: number of intervals that are wanted at least.
     """
-    count = max(1, int(np.ceil(horizon / RESPONSE_INTERVAL * (1.0 - 1e-9))))
+    length = horizon - begin
+    count = max(1, int(np.ceil(length / RESPONSE_INTERVAL * (1.0 - 1e-9))))
     if count > RESPONSE_INSTANTS_LIMIT:
         count = RESPONSE_INSTANTS_LIMIT // 10
     largest = _largest(solution.q[:, elastic], stiffness)
@@ -43,9 +45,9 @@ def response_instants(
         bend = _largest(solution.a[..., elastic], stiffness)
         known = 2.0 * solution.a.shape[0] * solution.a.shape[1]
         wanted = max(
-            wanted, min(horizon * np.sqrt(bend / (8.0 * EXTREME_EXCESS_SHARE * largest)), known)
+            wanted, min(length * np.sqrt(bend / (8.0 * EXTREME_EXCESS_SHARE * largest)), known)
         )
-    return np.linspace(0.0, horizon, count * max(1, int(np.ceil(wanted / count))) + 1)
+    return np.linspace(begin, horizon, count * max(1, int(np.ceil(wanted / count))) + 1)
 
 
 def _largest(q: np.ndarray, stiffness: np.ndarray) -> float:

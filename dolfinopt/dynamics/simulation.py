@@ -13,6 +13,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.march import BEYOND, REMEDY
 from dolfinopt.dynamics.measured import DEFLECTION_LIMIT
 from dolfinopt.dynamics.response_instants import response_instants
+from dolfinopt.dynamics.tip_feed_forward import FeedForward, corrected, feed_forward_of
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
@@ -22,7 +23,11 @@ from dolfinopt.scene.load import Scene
 
 
 def simulate(
-    scene: Scene, bodies: list[ShapeIntegrals], profile: Profile, start: Solution | None = None
+    scene: Scene,
+    bodies: list[ShapeIntegrals],
+    profile: Profile,
+    start: Solution | None = None,
+    feed_forward: FeedForward | None = None,
 ) -> Trajectory:
     """Integrate the elastic coordinates over the horizon to `simulation.tolerance`.
 
@@ -31,6 +36,7 @@ def simulate(
         bodies: from the cart outwards.
         profile: counts the simulation.
         start: solution of a nearby design, or None.
+        feed_forward: of another machine, whose corrections this one moves with; None: its own.
 
     Raises:
         ConvergenceError: the integrator gave up, or an arm bends by more than `DEFLECTION_LIMIT`
@@ -38,9 +44,15 @@ def simulate(
     """
     problem, options = build_system(scene, bodies), scene.simulation
     with profile.phase("simulation"):
-        solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
+        if feed_forward is not None:
+            problem = corrected(problem, feed_forward.corrections)
+        if scene.feed_forward.on and feed_forward is None:
+            feed_forward = feed_forward_of(problem, scene, profile, start)
+            problem, solution = feed_forward.machine, feed_forward.solution
+        else:
+            solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
     profile.counts.simulations += 1
-    trajectory = _trajectory(problem, scene, solution)
+    trajectory = _trajectory(problem, scene, solution, feed_forward)
     _check_deflections(trajectory)
     return trajectory
 
@@ -86,13 +98,19 @@ def _check_deflections(trajectory: Trajectory) -> None:
     )
 
 
-def _trajectory(problem: MachineSystem, scene: Scene, solution: Solution) -> Trajectory:
+def _trajectory(
+    problem: MachineSystem,
+    scene: Scene,
+    solution: Solution,
+    feed_forward: FeedForward | None = None,
+) -> Trajectory:
     """Return a solution with the instants at which responses look at it."""
     t = response_instants(
         solution,
         problem.mechanism.stiffness(),
         problem.elastic_columns,
-        scene.motion.horizon,
+        scene.lead,
+        scene.horizon,
         scene.objective.load_cases,
     )
-    return Trajectory(problem, scene, solution, t)
+    return Trajectory(problem, scene, solution, t, feed_forward=feed_forward)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from dolfinopt.dynamics.drive_forces import DriveForces
 from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import FILE_ROUNDING
+from dolfinopt.dynamics.tip_feed_forward import FeedForward, by_coefficients
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import (
@@ -25,7 +26,7 @@ from dolfinopt.multibody.kinematics import (
 )
 from dolfinopt.multibody.loads import load_coefficients
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import Rates
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.scene.load import Scene
 
@@ -56,6 +57,35 @@ class JointLimit:
     met: bool
 
 
+class MotionGradient(NamedTuple):
+    """Derivatives of a function of a motion at n instants.
+
+    Attributes:
+        unknowns: by the system's coordinates (n, S), or by them, their rates and accelerations
+            (3, n, S).
+        bodies: by every body, under the names of `ShapeIntegrals`, unknowns held.
+        motion: (3, n, R) by the rigid coordinates that the motion prescribes, and their rates; None
+            where it does not depend on them.
+    """
+
+    unknowns: np.ndarray
+    bodies: list[dict[str, np.ndarray]]
+    motion: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """Derivatives of a function J of a motion.
+
+    Attributes:
+        bodies: by every body, corrections of joints held.
+        by_coefficients: (p, F) by these corrections; None without.
+    """
+
+    bodies: list[ShapeIntegrals]
+    by_coefficients: np.ndarray | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """A simulated motion; values at instants are those of the integrator's own interpolant.
@@ -67,6 +97,7 @@ class Trajectory:
         t: (n,) instants at which responses look at the motion, see `response_instants`, s. Files
             have those of `sampled`.
         scenarios: the same design under the scene's scenarios.
+        feed_forward: what corrects its joints: its own, of a scenario the scene's; or None.
     """
 
     problem: MachineSystem
@@ -74,6 +105,7 @@ class Trajectory:
     solution: Solution
     t: np.ndarray
     scenarios: tuple[Trajectory, ...] = ()
+    feed_forward: FeedForward | None = None
 
     def at(self, t: np.ndarray) -> Self:
         """Return the same motion, without scenarios, seen at other instants (n,), s."""
@@ -82,7 +114,7 @@ class Trajectory:
     @cached_property
     def sampled(self) -> Self:
         """The same motion every `simulation.sample`, as files have it."""
-        horizon, sample = self.scene.motion.horizon, self.scene.simulation.sample
+        horizon, sample = self.scene.horizon, self.scene.simulation.sample
         t = np.arange(round(horizon / sample) + 1) * sample
         t = t[t <= horizon * (1 + 1e-12)]
         return self if np.array_equal(t, self.t) else self.at(t)
@@ -251,17 +283,44 @@ class Trajectory:
         joints = self.problem.motor_joints
         if not len(joints):
             return None
-        return self.desired.q[:, joints] + self.unknowns[0][:, self.problem.motor_columns]
+        return self.commanded.q[:, joints] + self.unknowns[0][:, self.problem.motor_columns]
 
     @cached_property
     def motion(self) -> RigidMotion:
         """Rigid coordinates at the instants, as they move."""
-        return self.state.motion if self.is_machine else self.desired
+        return self.state.motion if self.is_machine else self.commanded
 
     @cached_property
     def desired(self) -> RigidMotion:
         """Rigid coordinates at the instants as the scene asks for them."""
+        return (self.problem.path or self.problem.motion)(self.t)
+
+    @cached_property
+    def commanded(self) -> RigidMotion:
+        """What the drives are asked for at the instants: the desired ones and their corrections."""
         return self.problem.motion(self.t)
+
+    def followed(
+        self, t: np.ndarray, by_rates: np.ndarray, by_motion: np.ndarray | None = None
+    ) -> Followed:
+        """Return how J follows the bodies through this motion, and the corrections of its joints.
+
+        Args:
+            t: (m,) ascending instants at which J looks at the motion, s.
+            by_rates: (m, S) dJ by the unknowns, or (3, m, S) by them and their rates.
+            by_motion: (3, m, R) dJ by rigid coordinates and their rates, unknowns held; needed with
+                feed-forward alone.
+        """
+        multipliers = self.adjoint.multipliers(t, by_rates)
+        bodies = self.adjoint.by_bodies(*multipliers)
+        if self.feed_forward is None:
+            return Followed(bodies)
+        if by_motion is None:
+            by_motion = np.zeros((3, len(t), self.mechanism.num_rigid))
+        corrections = self.feed_forward.corrections
+        return Followed(
+            bodies, by_coefficients(corrections, self.adjoint, multipliers, t, by_motion)
+        )
 
     def by_unknowns(self, by_q: np.ndarray) -> np.ndarray:
         """Return derivatives by the system's coordinates (n, S) from those by the elastic ones."""
@@ -271,7 +330,7 @@ class Trajectory:
 
     def by_end_effector(
         self, indices: np.ndarray, weights: np.ndarray, moments: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+    ) -> MotionGradient:
         """Return the gradient of sum_n weights_n . end_effector_n + moments_n . spin_n.
 
         Args:
@@ -280,14 +339,17 @@ class Trajectory:
             moments: (n, 1), in space (n, 3), or None: what its virtual rotation counts.
 
         Returns:
-            By the system's coordinates (n, S), and by every body, see `end_effector_gradient`.
+            By the system's coordinates, by the motion, and by every body, see
+            `end_effector_gradient`.
         """
         motion, q = self.motion[indices], self.q_e[indices]
         every = end_effector_gradient(self.mechanism, motion, q, weights, moments)
         by_q, by_rigid, by_bodies = every
         by, free = self.by_unknowns(by_q), self.problem.drives.free
         by[:, : len(free)] = by_rigid[:, free]
-        return by, by_bodies
+        by_motion = np.zeros((3, *by_rigid.shape))
+        by_motion[0] = by_rigid
+        return MotionGradient(by, by_bodies, by_motion)
 
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.
@@ -354,10 +416,10 @@ class Trajectory:
     @property
     def at_rest(self) -> np.ndarray:
         """Which instants are in a rest (n,); the last one is in any case."""
-        rounding = 1e-9 * self.scene.motion.horizon
-        found = np.zeros(len(self.t), dtype=bool)
+        rounding, t = 1e-9 * self.scene.horizon, self.t - self.scene.lead
+        found = np.zeros(len(t), dtype=bool)
         for begin, end in rests(self.scene):
-            found |= (self.t >= begin - rounding) & (self.t <= end + rounding)
+            found |= (t >= begin - rounding) & (t <= end + rounding)
         found[-1] = True
         return found
 

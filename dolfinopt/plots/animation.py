@@ -198,7 +198,7 @@ def make_film(
 ) -> Film:
     """Choose frames evenly from the instants and magnify the deformation; see `draw_motion`."""
     mechanism, closure, q_e = trajectory.mechanism, trajectory.closure, trajectory.q_e
-    ideal = trajectory.desired.q if trajectory.is_machine else trajectory.q_r
+    ideal = trajectory.desired.q
     rigid = chain(mechanism, ideal, np.zeros_like(q_e))[0]
     if magnification is None:
         magnification = _magnification(trajectory, ideal, rigid)

@@ -319,7 +319,7 @@ def make_solid_film(
     mechanism = replace(given, bodies=tuple(map(linear_part, given.bodies)))
     machine = assemble(views, mechanism, modes=True)
     q_r, q_e = trajectory.q_r, trajectory.q_e
-    ideal = trajectory.desired.q if trajectory.is_machine else q_r
+    ideal = trajectory.desired.q
     loops = trajectory.loops
     rigid = body_frames(mechanism, ideal, np.zeros_like(q_e), loops)
     if magnification is None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.trajectory import Followed, MotionGradient, Trajectory
 from dolfinopt.motion.build import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together
@@ -57,9 +57,10 @@ def worst_instants(trajectory: Trajectory, count: int, worst: WorstBy = "complia
         badness = trajectory.compliance.sum(axis=1)
     else:
         badness = trajectory.distance
-    horizon = trajectory.scene.motion.horizon
+    scene = trajectory.scene
+    share = (trajectory.t - scene.lead) / (scene.horizon - scene.lead)
     # The tolerance keeps an instant on an interval's end in that interval, whatever the rounding.
-    interval = np.ceil(trajectory.t / horizon * count - 1e-9).astype(int) - 1
+    interval = np.ceil(share * count - 1e-9).astype(int) - 1
     order = np.lexsort((-badness, interval))
     order = order[interval[order] >= 0]
     first = np.unique(interval[order], return_index=True)[1]
@@ -73,7 +74,6 @@ def all_instants(trajectory: Trajectory) -> LoadCases:
     return LoadCases(np.arange(len(weights)), weights)
 
 
-By = tuple[np.ndarray, list[dict[str, np.ndarray]]]
 
 
 class MotionResponse(Response):
@@ -113,7 +113,7 @@ class MotionResponse(Response):
         """Return the derivative of `value` by y (n, k)."""
 
     @abstractmethod
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
         """Follow derivatives by the quantity at held instants (n, k) to the motion and the bodies.
 
         Returns:
@@ -130,21 +130,19 @@ class MotionResponse(Response):
         """Return the value of one motion at given instants."""
         return self.value(self.quantity(trajectory)[cases.indices], cases.weights)
 
-    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> By:
+    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> MotionGradient:
         """Return the derivatives of `value` at held instants, see `followed`."""
         y = self.quantity(trajectory)[cases.indices]
-        return self.followed(trajectory, cases, self.gradient(y, cases.weights))
+        return MotionGradient(*self.followed(trajectory, cases, self.gradient(y, cases.weights)))
 
-    def cotangents(self, trajectory: Trajectory) -> list[ShapeIntegrals]:
+    def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion.
 
         Its own, with the coordinates held, and the trajectory's, whose coordinates follow. The
         choice of instants is held: where two of an interval are equally bad there is a kink.
         """
         cases = self.load_cases(trajectory)
-        by_q, own = self.derivatives(trajectory, cases)
-        followed = trajectory.adjoint.gradient(trajectory.t[cases.indices], by_q)
-        return [add_integrals(a, fields) for a, fields in zip(followed, own, strict=True)]
+        return followed_by(trajectory, trajectory.t[cases.indices], self.derivatives(trajectory, cases))
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
@@ -153,7 +151,8 @@ class MotionResponse(Response):
         dJ = -lambda_j . dK q_j with K lambda_j = dJ/dq_j, which joints of a loop follow.
         """
         cases = self.load_cases(trajectory)
-        by_q = trajectory.by_elastic(cases.indices, self.derivatives(trajectory, cases)[0])
+        by = self.derivatives(trajectory, cases).unknowns
+        by_q = trajectory.by_elastic(cases.indices, by)
         mechanism, q = trajectory.mechanism, trajectory.q_e[cases.indices]
         return [
             np.linalg.solve(body.K, by_q[:, part].T) @ q[:, part]
@@ -225,22 +224,45 @@ class MotionResponse(Response):
     def _over_scenarios(self, trajectory: Trajectory, frozen: bool) -> list[Any]:
         """Return `load_case_moments`, or `cotangents` by the scene's bodies, of all scenarios."""
         scene, others = trajectory.scene, trajectory.scenarios
-        of_one: Callable[[Trajectory], list[Any]] = self.cotangents
-        if frozen:
-            of_one = self.load_case_moments
         if not others:
-            return of_one(trajectory)
+            if frozen:
+                return self.load_case_moments(trajectory)
+            return with_feed_forward(trajectory, self.cotangents(trajectory))
         _, weights = self.combine(scene, [self.of_motion(one) for one in others])
         total: list[Any] = []
+        by_coefficients = None
         for weight, one in zip(weights, others, strict=True):
+            if frozen:
+                found = self.load_case_moments(one)
+            else:
+                followed = self.cotangents(one)
+                found, by = followed.bodies, followed.by_coefficients
+                if by is not None:
+                    by_coefficients = weight * by + (0.0 if by_coefficients is None else by_coefficients)
             parts: list[Any] = []
             # Rigid arms and bodies from files have no gradient.
-            for index, part in enumerate(of_one(one)[: len(scene.arms)]):
+            for index, part in enumerate(found[: len(scene.arms)]):
                 f = factors(scene, one.scene, index)
                 whole = weight * f.stiffness
                 parts.append(whole * part if frozen else cotangents_of_scene(part, f, weight))
             total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
-        return total
+        return with_feed_forward(trajectory, Followed(total, by_coefficients))
+
+
+def followed_by(trajectory: Trajectory, t: np.ndarray, by: MotionGradient) -> Followed:
+    """Return how a function of a motion at instants t (n,), s, follows the bodies."""
+    found = trajectory.followed(t, by.unknowns, by.motion)
+    bodies = [add_integrals(a, own) for a, own in zip(found.bodies, by.bodies, strict=True)]
+    return replace(found, bodies=bodies)
+
+
+def with_feed_forward(trajectory: Trajectory, followed: Followed) -> list[ShapeIntegrals]:
+    """Return derivatives by the bodies, corrections of the joints following them."""
+    bodies, by = followed.bodies, followed.by_coefficients
+    if by is None or trajectory.feed_forward is None:
+        return bodies
+    through = trajectory.feed_forward.gradient(by)
+    return [a + b for a, b in zip(bodies, through, strict=False)]
 
 
 class ComplianceResponse(MotionResponse):
@@ -258,12 +280,13 @@ class ComplianceResponse(MotionResponse):
         """Return the weights."""
         return np.broadcast_to(weights[:, None], y.shape)
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
         """Return 2 w_j K q_j, and the second moments of q by K."""
         q = trajectory.q_e[cases.indices]
         by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
         by_q[:, trajectory.mechanism.bearing_columns] = 0.0
-        return trajectory.by_unknowns(by_q), [{"K": Q} for Q in second_moments(trajectory, cases)]
+        own = [{"K": Q} for Q in second_moments(trajectory, cases)]
+        return MotionGradient(trajectory.by_unknowns(by_q), own)
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return the second moments: lambda_j = w_j q_j with the loads frozen."""
@@ -308,7 +331,7 @@ class Deviation(MotionResponse):
         """Return that of the p-mean."""
         return p_norm_of_lengths(y, self.options.exponent, weights / weights.sum())[1]
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
         """Return the derivatives through the outboard interfaces' modes."""
         return trajectory.by_end_effector(cases.indices, by_y)
 
@@ -345,7 +368,7 @@ class Orientation(Deviation):
         """Return theta, rad."""
         return trajectory.rotation
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
         """Return its derivatives; they are along theta, where a spin changes theta by itself."""
         no_force = np.zeros_like(trajectory.deviation[cases.indices])
         return trajectory.by_end_effector(cases.indices, no_force, by_y)
@@ -403,12 +426,13 @@ class DriveResponse(MotionResponse):
         scene = trajectory.scene
         return trajectory.joint_forces[:, self._columns(scene)] * self._weights(scene)
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
         by, scene = np.zeros_like(trajectory.joint_forces), trajectory.scene
         by[np.ix_(cases.indices, self._columns(scene))] = by_y * self._weights(scene)
-        by_rates, bodies = trajectory.drive_forces.gradient(by)
-        return by_rates[:, cases.indices], [integrals_of(one) for one in bodies]
+        by_rates, by_motion, bodies = trajectory.drive_forces.gradient(by)
+        own = [integrals_of(one) for one in bodies]
+        return MotionGradient(by_rates[:, cases.indices], own, by_motion[:, cases.indices])
 
     def counted(self, scene: Scene) -> tuple[int, ...]:
         """Return the numbers of the drives that count."""

@@ -15,10 +15,10 @@ import numpy as np
 
 from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
-from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
+from dolfinopt.dynamics.trajectory import Followed, MotionGradient, Trajectory
+from dolfinopt.multibody.shape_integrals import integrals_of
 from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
-from dolfinopt.responses.motion import By, LoadCases, MotionResponse, all_instants
+from dolfinopt.responses.motion import LoadCases, MotionResponse, all_instants, followed_by
 from dolfinopt.responses.response import Analysis, Measured, p_norm, response
 from dolfinopt.scene.load import Scene
 
@@ -74,14 +74,12 @@ class PoleResponse(MotionResponse):
         true, smooth = np.array(measured.values), np.array(measured.smooth)
         return np.asarray(self.badness(limits) * smooth / self.badness(true))
 
-    def cotangents(self, trajectory: Trajectory) -> list[ShapeIntegrals]:
+    def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion."""
         seen = _seen(trajectory)
-        by_rates, own = self.derivatives(seen, self.load_cases(seen))
-        followed = trajectory.adjoint.gradient(seen.t, by_rates)
-        return [add_integrals(a, fields) for a, fields in zip(followed, own, strict=True)]
+        return followed_by(trajectory, seen.t, self.derivatives(seen, self.load_cases(seen)))
 
-    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> By:
+    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> MotionGradient:
         """Return those by coordinates, rates and accelerations at the scene's instants, and bodies.
 
         Whatever the cases are.
@@ -103,9 +101,10 @@ class PoleResponse(MotionResponse):
         total = bodies[0]
         for own in bodies[1:]:
             total = [a + b for a, b in zip(total, own, strict=True)]
-        return np.concatenate(by_rates, axis=1), [integrals_of(one) for one in total]
+        by = np.concatenate(by_rates, axis=1)
+        return MotionGradient(by, [integrals_of(one) for one in total])
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> By:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
         """Return `derivatives`, which follow poles instant by instant."""
         return self.derivatives(trajectory, cases)
 

@@ -238,7 +238,7 @@ def load_matrix(body: ShapeIntegrals) -> np.ndarray:
 
 def loads_gradient(
     scene: Scene, motion: Trajectory, by_arm: Mapping[int, tuple[np.ndarray, np.ndarray]]
-) -> dict[int, ShapeIntegrals]:
+) -> tuple[dict[int, ShapeIntegrals], np.ndarray | None]:
     """Differentiate a function of one motion's `ArmLoads.coefficients` by all designs' bodies.
 
     Args:
@@ -247,7 +247,7 @@ def loads_gradient(
         by_arm: by place in the chain, instants (k,) and derivatives (k, q + 7 + 2 q) there.
 
     Returns:
-        By the index of the arm that owns the design.
+        By the index of the arm that owns the design; by the coefficients of the feed-forward.
     """
     mechanism, problem = motion.mechanism, motion.problem
     instants = np.unique(np.concatenate([where for where, _ in by_arm.values()]))
@@ -269,16 +269,16 @@ def loads_gradient(
         own.append(_integrals(body, by_P, by_K))
     t = motion.t[instants]
     y, yd, ydd = (x[instants] for x in motion.unknowns)
-    by_rates, by_bodies = load_gradient(problem, t, (y, yd, ydd), by_c)
+    by_rates, by_motion, by_bodies = load_gradient(problem, t, (y, yd, ydd), by_c)
     by_rates[0] += motion.by_unknowns(by_q)
-    followed = motion.adjoint.gradient(t, by_rates)
-    total = add_gradients(add_gradients(followed, by_bodies), own)
+    followed = motion.followed(t, by_rates, by_motion)
+    total = add_gradients(add_gradients(followed.bodies, by_bodies), own)
     if motion.scene is not scene:
         total = [
             cotangents_of_scene(by, factors(scene, motion.scene, index), 1.0)
             for index, by in enumerate(total[: len(scene.arms)])
         ]
-    return by_owner(scene, total)
+    return by_owner(scene, total), followed.by_coefficients
 
 
 def _coefficients(scene: Scene, motion: Trajectory, place: int) -> np.ndarray:
@@ -558,6 +558,7 @@ def bodies_by_loads(
     def followed() -> dict[int, ShapeIntegrals]:
         assert analysis.trajectory is not None
         total: dict[int, ShapeIntegrals] = {}
+        by_coefficients: list[np.ndarray] = []
         for number, motion in enumerate(motions_of(analysis.trajectory)):
             own = {
                 place: (where, by)
@@ -569,8 +570,14 @@ def bodies_by_loads(
                 continue
             profile.counts.adjoints += 1
             with profile.phase("adjoint"):
-                found = loads_gradient(analysis.scene, motion, own)
+                found, by = loads_gradient(analysis.scene, motion, own)
+            if by is not None:
+                by_coefficients.append(by)
             total = {k: total[k] + by if k in total else by for k, by in found.items()}
+        nominal = analysis.trajectory.feed_forward
+        if by_coefficients and nominal is not None:
+            through = by_owner(analysis.scene, nominal.gradient(np.sum(by_coefficients, axis=0)))
+            total = {k: by + through[k] for k, by in total.items()}
         return total
 
     by_body: dict[int, ShapeIntegrals] = on_root(partition.world, followed)

@@ -23,6 +23,7 @@ from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
+from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
 from dolfinopt.scene.tables.joints import interface_number
 from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
 from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
@@ -58,6 +59,9 @@ class Scene(Table):
         default=None,
         description="feedback control; without this table the rigid coordinates follow the desired "
         "motion exactly",
+    )
+    feed_forward: FeedForward = Field(
+        default=FeedForward(), description="corrections of joints that keep the tip on its path"
     )
     closures: tuple[Closures, ...] = Field(
         default=(),
@@ -129,6 +133,19 @@ class Scene(Table):
                 f"{self.source}: arms.rigid: nothing to design, as no arm is flexible or all come "
                 "from files; simulate, sweep, plot and export run such a machine"
             )
+
+    @property
+    def lead(self) -> float:
+        """Instant at which the path begins, before which joints may be corrected already, s."""
+        given = self.feed_forward
+        if not given.on:
+            return 0.0
+        return LEAD_SHARE * self.motion.duration if given.lead is None else given.lead
+
+    @property
+    def horizon(self) -> float:
+        """What is simulated, s: the motion's horizon, and what corrections need around it."""
+        return self.lead + max(self.motion.horizon, self.motion.duration + self.lead)
 
     @property
     def has_walls(self) -> bool:

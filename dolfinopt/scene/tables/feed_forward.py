@@ -1,0 +1,69 @@
+"""`[feed_forward]`: joint motions under which the bending arms carry the tip along its path."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from dolfinopt.scene.tables.base import Duration, Loc, Refusal, Table, shown
+
+if TYPE_CHECKING:
+    from dolfinopt.scene.schema import Scene
+
+LEAD_SHARE = 0.05  # of the motion's duration: pre-actuation fades within milliseconds
+
+
+class FeedForward(Table):
+    """Corrections of joints that keep the tip of the flexible machine on the rigid one's path."""
+
+    kind: Literal["none", "tip"] = Field(
+        default="none",
+        description='"tip": joints move so that the tip of the bending arms follows the path [-]',
+    )
+    joints: tuple[str, ...] | None = Field(
+        default=None,
+        description="names of the driven joints that are corrected; default: as many as the path "
+        "has components, those that move the tip best [-]",
+    )
+    spacing: Duration | None = Field(
+        default=None,
+        description="largest distance between the knots of the corrections' splines; default: as "
+        "small as it takes to leave a ten thousandth of the deviation [s]",
+    )
+    lead: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e5,
+        description="time before and after the motion in which joints may already, or still, be "
+        "corrected; the path begins after it; default: 5 % of motion.duration [s]",
+    )
+
+    @property
+    def on(self) -> bool:
+        """Whether joints are corrected."""
+        return self.kind != "none"
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse what nothing uses, joints that are no drives, and motions without a free tip."""
+        if not self.on:
+            for key in ("joints", "spacing", "lead"):
+                if getattr(self, key) is not None:
+                    raise Refusal('expected none without feed_forward.kind = "tip"', (*at, key))
+            return
+        if scene.control is not None:
+            raise Refusal('expected "none" with [control]', (*at, "kind"), ("control",))
+        if scene.is_pinned:
+            raise Refusal(
+                'expected "none": a pin holds the end-effector, which has no path', (*at, "kind")
+            )
+        if scene.motion.table_ends == "moving":
+            raise Refusal(
+                'expected "rest" with feed_forward.kind = "tip", whose corrections begin at rest',
+                ("motion", "table_ends"),
+                (*at, "kind"),
+            )
+        for name in self.joints or ():
+            if name not in scene.driven:
+                known = ", ".join(scene.driven)
+                raise Refusal(f"expected drives, of {known}; {shown(name)} is none", (*at, "joints"))
