@@ -36,9 +36,7 @@ class DriveForces:
         self.system, self.t, self.rates = system, t, rates
         self._kept: _Chunk | None = None
 
-    def gradient(
-        self, weights: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
+    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
         """Return the derivative of sum_n weights_n . forces_n, instants and coordinates held apart.
 
         Args:
@@ -83,9 +81,7 @@ class _Chunk:
         every = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))
         return linearise(mechanism, motion, *self.state.elastic, None, every)
 
-    def gradient(
-        self, weights: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
+    def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`."""
         state, system = self.state, self.state.machine
         drives, joints = system.drives, system.mechanism.motor_joints

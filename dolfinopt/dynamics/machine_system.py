@@ -62,6 +62,8 @@ class MachineSystem:
             motion is smooth; steps end there. s.
         drives: of the R free rigid coordinates; the others follow the desired motion exactly.
         loops: closures, m equations; or None.
+        path: motion along which rigid arms carry the end-effector, from which it deviates; None:
+            the desired one.
     """
 
     mechanism: Mechanism

@@ -22,9 +22,9 @@ def response_instants(
 ) -> np.ndarray:
     """Return the instants (n,) of all extremes and integrals over time, s.
 
-    They lie evenly from the path's beginning to the horizon, both included, at most 1 ms apart (of a horizon above
-    1000 s at most a hundred thousandth of it), and closer where the elastic deflection is so fast
-    that it could exceed two neighbouring instants by more than
+    They lie evenly from the path's beginning to the horizon, both included, at most 1 ms apart
+    (beyond 1000 s at most a hundred thousandth of that), and closer where the elastic deflection is
+    so fast that it could exceed two neighbouring instants by more than
     `EXTREME_EXCESS_SHARE` of its largest value: between instants d apart by max |qdd| d^2 / 8 at
     most. More than two for each stage of a step say nothing new of a polynomial.
 

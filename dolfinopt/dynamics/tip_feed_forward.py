@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations, pairwise
 
 import numpy as np
 
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.adjoint import Adjoint
+from dolfinopt.dynamics.adjoint import Adjoint, add_gradients
 from dolfinopt.dynamics.collocation import (
     Solution,
     end_gain,
@@ -32,6 +32,7 @@ from dolfinopt.dynamics.collocation import (
     stages_of,
 )
 from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.measured import EXACT
 from dolfinopt.dynamics.newton_matrix import matrix_of
 from dolfinopt.dynamics.system import Unchanged
 from dolfinopt.dynamics.tables import LoadedMotion, stage_instants
@@ -47,10 +48,14 @@ DEGREE = 5
 FINEST = 16.0  # times closer are knots beside breakpoints, where steps grow by
 GROWTH = 1.5
 FIRST_SPACING = 0.02  # of the motion's duration
-SPACINGS_LIMIT = 4
 AIM = 1e-4  # of the deviation without corrections
 STEPS = 2  # of Gauss-Newton: the first leaves 4e-3 of it on two_arm, the second 1e-5
-REGULARISATION = 1e-12  # of the mean of the normal matrix's diagonal
+# Of the mean of the normal matrix's diagonal: it leaves 3e-8 m of two_arm's 55 mm; of more joints
+# than needed the smallest corrections, 4e-7 m, whose gradient 1e-8 leaves 1e-4 off.
+REGULARISATION, OF_REDUNDANT = 1e-10, 1e-6
+CURVED = 1e-4  # of the deviation is left: second derivatives count
+CURVATURE_STEPS = 3
+DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
 SINGULAR = 1e-3  # least singular value of the tip's Jacobian, over the reach
 INSTANTS = 121  # at which it is looked at
 
@@ -143,7 +148,9 @@ def graded_knots(breakpoints: tuple[float, ...], spacing: float) -> np.ndarray:
     knots = [np.array(breakpoints[:1])]
     for begin, end in pairwise(breakpoints):
         half = 0.5 * (end - begin)
-        steps = np.minimum(spacing, spacing / FINEST * GROWTH ** np.arange(int(half / spacing) + 20))
+        steps = np.minimum(
+            spacing, spacing / FINEST * GROWTH ** np.arange(int(half / spacing) + 20)
+        )
         near = np.cumsum(steps)
         near = near[near < half]
         near = near * (half / near[-1]) if len(near) else np.array([half])
@@ -182,17 +189,10 @@ def off_path(machine: MachineSystem, solution: Solution, t: np.ndarray) -> np.nd
     return end_effector(machine.mechanism, state.motion, state.elastic[0]) - path_of(machine, t)
 
 
-def regular_joints(
-    machine: MachineSystem, candidates: np.ndarray, count: int | None
-) -> tuple[np.ndarray, float, float]:
-    """Return the joints that move the tip best, how well, and where they do it worst.
+def tip_by_joints(machine: MachineSystem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tip's Jacobian of rigid arms (n, d, R), over the reach, and its instants, s.
 
-    Of all sets of as many joints as the path has components, or of `count`, the one whose Jacobian
-    of the tip has the largest least singular value, over the reach, at the worst of some instants;
-    joints that follow in closed loops follow.
-
-    Returns:
-        Joints (F,), that value [-] and its instant, s.
+    Joints that follow in closed loops follow.
     """
     t = np.linspace(0.0, machine.breakpoints[-1], INSTANTS)
     motion, none = machine.motion(t), np.zeros((len(t), machine.mechanism.num_coordinates))
@@ -200,18 +200,8 @@ def regular_joints(
     if machine.loops is not None:
         dependent = machine.drives.dependent
         G = machine.loops.at(machine.rigid, motion.q, none[:, :0]).jacobian
-        follows = np.linalg.pinv(G[:, :, dependent]) @ G[:, :, : J.shape[2]]
-        J = J - J[:, :, dependent] @ follows
-    J = J / machine.mechanism.levers
-    rank = min(np.linalg.matrix_rank(J[:, :, candidates]).max(), len(candidates))
-
-    def values(joints: tuple[int, ...]) -> np.ndarray:
-        sizes = np.linalg.svd(J[:, :, list(joints)], compute_uv=False)
-        return sizes[:, min(rank, len(joints)) - 1]
-
-    best = max(combinations(candidates, count or rank), key=lambda one: values(one).min())
-    worst = int(values(best).argmin())
-    return np.array(best), float(values(best)[worst]), float(t[worst])
+        J = J - J[:, :, dependent] @ np.linalg.pinv(G[:, :, dependent]) @ G[:, :, : J.shape[2]]
+    return J / machine.mechanism.levers, t
 
 
 # -- linearised motion -----------------------------------------------------------------------
@@ -238,12 +228,13 @@ def tip_response(
     method, S = radau_iia(len(solution.nodes)), machine.num_coordinates
     stages = stages_of(Unchanged(machine), method, solution.time_grid)
     q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
-    state = stages.instants.state(*(x.reshape(-1, S) for x in (q, qd, solution.a)))
+    instants = machine.at_stages(solution.time_grid, method.c)
+    state = instants.state(*(x.reshape(-1, S) for x in (q, qd, solution.a)))
     n, s = solution.a.shape[:2]
     basis = splines.at(stage_instants(solution.time_grid, method.c))
     loads = np.einsum("nrfk,knp->nrpf", state.by_command(joints), basis)
     loads = np.concatenate([loads.reshape(n * s, S, -1), state.residual()[:, :, None]], axis=2)
-    matrix = matrix_of(stages, stages.instants.linearise(*state.rates), np.arange(S))
+    matrix = matrix_of(stages, instants.linearise(*state.rates), np.arange(S))
     forced = -(matrix.inverse @ loads.reshape(n, s * S, -1))
     gain = end_gain(stages, forced.reshape(n, s, S, -1))
     y = np.zeros((n, 2 * S, forced.shape[2]))
@@ -302,23 +293,29 @@ class FeedForward:
     """Corrections of a machine's joints, and its motion with them.
 
     Attributes:
+        plain: without them.
         machine: that moves with them.
         solution: its motion.
         corrections: of its joints.
+        share: regularisation of the least squares, see `REGULARISATION`.
+        has_curvature: whether the coefficients follow the bodies by second derivatives, too.
         regularity: least singular value of the tip's Jacobian by these joints, over the reach.
         before, left: largest distance of the tip from its path without and with them, m.
     """
 
+    plain: MachineSystem
     machine: MachineSystem
     solution: Solution
     corrections: Corrections
+    share: float
+    has_curvature: bool
     regularity: float
     before: float
     left: float
 
     @cached_property
     def _squares(self) -> LeastSquares:
-        return least_squares(self.machine, self.solution, self.corrections)
+        return least_squares(self.machine, self.solution, self.corrections, self.share)
 
     @cached_property
     def _adjoint(self) -> Adjoint:
@@ -327,17 +324,53 @@ class FeedForward:
     def gradient(self, by_coefficients: np.ndarray) -> list[ShapeIntegrals]:
         """Return the derivative by every body of J through the coefficients, dJ/dc (p, F).
 
-        The coefficients follow the bodies: J_c' W (J_c dc + dh) = 0, hence
-        dJ = -dJ/dc (J_c' W J_c)^-1 J_c' W dh, one adjoint of this motion.
+        The coefficients follow the bodies, as G = J_c' W e + rho c stays zero. With the multipliers
+        mu of (J_c' W J_c + rho + S) mu = dJ/dc, S = sum_i (W e)_i d2h_i/dc2,
+
+            dJ = -mu . dG = -(W J_c mu) . dh - d/d eps [ (W e) . dh(c + eps mu) ],
+
+        an adjoint of this motion and, where the tip is not exactly on its path or joints are more
+        than needed, those of two motions beside it.
         """
         squares = self._squares
         change = np.linalg.solve(squares.normal, by_coefficients.ravel())
-        moved = squares.weights * (squares.by_coefficients @ change)
-        weights = -moved.reshape(len(squares.t), -1)
-        by_q, _, by_bodies = tip_gradient(self.machine, self.solution, squares.t, weights)
-        multipliers = self._adjoint.multipliers(squares.t, by_q)
-        followed = self._adjoint.by_bodies(*multipliers)
-        return [add_integrals(a, own) for a, own in zip(followed, by_bodies, strict=True)]
+        beside: list[ShapeIntegrals] = []
+        if self.has_curvature:
+            for _ in range(CURVATURE_STEPS):
+                curved, beside = self._curvature(change)
+                change = np.linalg.solve(squares.normal, by_coefficients.ravel() + curved)
+        weights = -squares.weights * (squares.by_coefficients @ change)
+        found = self._follow(self.machine, self.solution, weights)[0]
+        return add_gradients(found, beside) if beside else found
+
+    def _curvature(self, change: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return -S mu (p F,) and -d/d eps of the bodies' derivative, by central differences."""
+        squares, corrections = self._squares, self.corrections
+        mu = change.reshape(corrections.coefficients.shape)
+        eps = DIFFERENCE / np.abs(corrections.splines.at(squares.t)[0] @ mu).max()
+        weights = squares.weights * squares.gap / (2.0 * eps)
+        sides = []
+        for sign in (1.0, -1.0):
+            moved_by = replace(corrections, coefficients=corrections.coefficients + sign * eps * mu)
+            moved = corrected(self.plain, moved_by)
+            grid, stages = self.solution.time_grid, len(self.solution.nodes)
+            solution = radau.on_grid(moved, grid, EXACT, stages, self.solution)
+            sides.append(self._follow(moved, solution, -sign * weights))
+        (plus, by_plus), (minus, by_minus) = sides
+        return (by_plus + by_minus).ravel(), add_gradients(plus, minus)
+
+    def _follow(
+        self, machine: MachineSystem, solution: Solution, weights: np.ndarray
+    ) -> tuple[list[ShapeIntegrals], np.ndarray]:
+        """Return the derivative of sum weights . tip (n d,) by bodies and coefficients (p, F)."""
+        t, corrections = self._squares.t, self.corrections
+        adjoint = self._adjoint if machine is self.machine else Adjoint(machine, solution)
+        by_q, by_rigid, own = tip_gradient(machine, solution, t, weights.reshape(len(t), -1))
+        multipliers = adjoint.multipliers(t, by_q)
+        bodies = adjoint.by_bodies(*multipliers)
+        by_motion = np.stack([by_rigid, *np.zeros((2, *by_rigid.shape))])
+        by = by_coefficients(corrections, adjoint, multipliers, t, by_motion)
+        return [add_integrals(a, b) for a, b in zip(bodies, own, strict=True)], by
 
 
 def by_coefficients(
@@ -390,6 +423,7 @@ class LeastSquares:
         by_coefficients: J (n d, p F).
         gap: (n d,) m.
         normal: J' W J + rho.
+        rho: of the coefficients, m2 s.
     """
 
     t: np.ndarray
@@ -407,9 +441,9 @@ class LeastSquares:
 
 
 def least_squares(
-    machine: MachineSystem, solution: Solution, corrections: Corrections
+    machine: MachineSystem, solution: Solution, corrections: Corrections, share: float
 ) -> LeastSquares:
-    """Return the linearised problem about a motion with corrections."""
+    """Return the linearised problem about a motion with corrections; `share` of REGULARISATION."""
     knots = corrections.splines.knots
     t = np.sort(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])]))
     answer = tip_response(machine, solution, corrections, t)
@@ -417,7 +451,7 @@ def least_squares(
     J = answer.by_coefficients.reshape(len(gap), -1)
     weights = np.repeat(np.gradient(t), len(gap) // len(t))
     normal = J.T @ (weights[:, None] * J)
-    rho = REGULARISATION * np.trace(normal) / len(normal)
+    rho = share * np.trace(normal) / len(normal)
     normal[np.diag_indices(len(normal))] += rho
     return LeastSquares(t, weights, J, gap, normal, rho)
 
@@ -441,30 +475,35 @@ def feed_forward_of(
         ConvergenceError: a motion with corrections cannot be simulated.
         InputError: at some instant no joints move the tip along its path.
     """
-    joints, regularity = joints_of(machine, scene)
+    joints, regularity, redundant = joints_of(machine, scene)
     options, asked = scene.simulation, scene.feed_forward.spacing
     spacing = asked or FIRST_SPACING * scene.motion.duration
+    share = OF_REDUNDANT if redundant else REGULARISATION
+    run = partial(
+        radau.integrate, tolerance=options.tolerance, stages=options.stages, profile=profile
+    )
     first = at_rest(machine, options.tolerance, options.stages)
-    before = tip_error_at_rest(machine, first)
-    found, last = None, None
-    for _ in range(1 if asked else SPACINGS_LIMIT):
+    before, last, guess = tip_error_at_rest(machine, first), np.inf, start
+    while True:
         splines = Splines(graded_knots(machine.breakpoints, spacing))
         none = np.zeros((splines.count, len(joints)))
         corrections, moved, solution = Corrections(joints, splines, none), machine, first
-        for _ in range(STEPS):
-            squares = least_squares(moved, solution, corrections)
-            coefficients = squares.step(corrections.coefficients)
-            corrections = replace(corrections, coefficients=coefficients)
+        for number in range(1 + STEPS):
+            if number < STEPS:
+                squares = least_squares(moved, solution, corrections, share)
+            else:  # what is left is answered by the same derivatives
+                squares = replace(squares, gap=off_path(moved, solution, squares.t).ravel())
+            corrections = replace(corrections, coefficients=squares.step(corrections.coefficients))
             moved = corrected(machine, corrections)
-            start = solution if np.isfinite(solution.error) else start
-            solution = radau.integrate(moved, options.tolerance, options.stages, profile, start)
+            solution = guess = run(moved, guess=guess)
         left = float(lengths(off_path(moved, solution, squares.t)).max())
-        found = FeedForward(moved, solution, corrections, regularity, before, left)
-        if left <= AIM * before or (last is not None and left > 0.5 * last):
+        if asked or left <= AIM * before or left > 0.5 * last:
             break
         spacing, last = 0.5 * spacing, left
-    assert found is not None
-    return found
+    curved = redundant or left > CURVED * before
+    return FeedForward(
+        machine, moved, solution, corrections, share, curved, regularity, before, left
+    )
 
 
 def tip_error_at_rest(machine: MachineSystem, solution: Solution) -> float:
@@ -475,20 +514,38 @@ def tip_error_at_rest(machine: MachineSystem, solution: Solution) -> float:
     return float(lengths(off_path(machine, solution, t) + answer.forced).max())
 
 
-def joints_of(machine: MachineSystem, scene: Scene) -> tuple[np.ndarray, float]:
-    """Return the rigid coordinates that are corrected, and how well they move the tip.
+def joints_of(machine: MachineSystem, scene: Scene) -> tuple[np.ndarray, float, bool]:
+    """Return the rigid coordinates that are corrected, how well they move the tip, and a surplus.
 
     Raises:
         InputError: they do not move it along every component of its path.
     """
-    names, driven = list(scene.rigid_units), scene.feed_forward.joints
-    candidates = [names.index(name) for name in driven or scene.driven]
-    joints, least, t = regular_joints(machine, np.sort(candidates), None if driven is None else len(driven))
-    if least < SINGULAR:
+    names, asked = list(scene.rigid_units), scene.feed_forward.joints
+    every = np.sort([names.index(name) for name in scene.driven])
+    J, t = tip_by_joints(machine)
+    needed = min(int(np.linalg.matrix_rank(J[:, :, every]).max()), len(every))
+    if asked is None:
+        joints = max(combinations(every, needed), key=lambda one: least(J, one, needed).min())
+    else:
+        joints = tuple(sorted(names.index(name) for name in asked))
+    if len(joints) < needed:
+        raise InputError(
+            f"{scene.source}: feed_forward.joints: expected at least {needed} joints, as many as "
+            "the tip has directions"
+        )
+    values = least(J, joints, needed)
+    worst = int(values.argmin())
+    if values[worst] < SINGULAR:
         moved = ", ".join(names[k] for k in joints)
         raise InputError(
             f"{scene.source}: feed_forward.joints: {moved} cannot move the tip along its path at "
-            f"t = {t - scene.lead:.4g} s; choose other joints, or a path that keeps away from "
-            "that position"
+            f"t = {t[worst] - scene.lead:.4g} s; choose other joints, or a path that keeps away "
+            "from that position"
         )
-    return joints, least
+    return np.array(joints), float(values[worst]), len(joints) > needed
+
+
+def least(J: np.ndarray, joints: tuple[int, ...], needed: int) -> np.ndarray:
+    """Return the least singular value (n,) of so many of the tip's Jacobian by some joints."""
+    sizes = np.linalg.svd(J[:, :, list(joints)], compute_uv=False)
+    return np.asarray(sizes[:, needed - 1])

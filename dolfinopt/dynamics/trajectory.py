@@ -57,7 +57,7 @@ class JointLimit:
     met: bool
 
 
-class MotionGradient(NamedTuple):
+class ByMotion(NamedTuple):
     """Derivatives of a function of a motion at n instants.
 
     Attributes:
@@ -330,7 +330,7 @@ class Trajectory:
 
     def by_end_effector(
         self, indices: np.ndarray, weights: np.ndarray, moments: np.ndarray | None = None
-    ) -> MotionGradient:
+    ) -> ByMotion:
         """Return the gradient of sum_n weights_n . end_effector_n + moments_n . spin_n.
 
         Args:
@@ -349,7 +349,7 @@ class Trajectory:
         by[:, : len(free)] = by_rigid[:, free]
         by_motion = np.zeros((3, *by_rigid.shape))
         by_motion[0] = by_rigid
-        return MotionGradient(by, by_bodies, by_motion)
+        return ByMotion(by, by_bodies, by_motion)
 
     def by_elastic(self, indices: np.ndarray, by: np.ndarray) -> np.ndarray:
         """Return derivatives by the elastic coordinates (n, N), which joints of a loop follow.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import Followed, MotionGradient, Trajectory
+from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
 from dolfinopt.motion.build import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together
@@ -74,8 +74,6 @@ def all_instants(trajectory: Trajectory) -> LoadCases:
     return LoadCases(np.arange(len(weights)), weights)
 
 
-
-
 class MotionResponse(Response):
     """A function of a quantity over time: one value of the machine, of all scenarios together.
 
@@ -113,7 +111,7 @@ class MotionResponse(Response):
         """Return the derivative of `value` by y (n, k)."""
 
     @abstractmethod
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Follow derivatives by the quantity at held instants (n, k) to the motion and the bodies.
 
         Returns:
@@ -130,10 +128,10 @@ class MotionResponse(Response):
         """Return the value of one motion at given instants."""
         return self.value(self.quantity(trajectory)[cases.indices], cases.weights)
 
-    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> MotionGradient:
+    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> ByMotion:
         """Return the derivatives of `value` at held instants, see `followed`."""
         y = self.quantity(trajectory)[cases.indices]
-        return MotionGradient(*self.followed(trajectory, cases, self.gradient(y, cases.weights)))
+        return ByMotion(*self.followed(trajectory, cases, self.gradient(y, cases.weights)))
 
     def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion.
@@ -142,7 +140,9 @@ class MotionResponse(Response):
         choice of instants is held: where two of an interval are equally bad there is a kink.
         """
         cases = self.load_cases(trajectory)
-        return followed_by(trajectory, trajectory.t[cases.indices], self.derivatives(trajectory, cases))
+        return followed_by(
+            trajectory, trajectory.t[cases.indices], self.derivatives(trajectory, cases)
+        )
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
@@ -230,15 +230,15 @@ class MotionResponse(Response):
             return with_feed_forward(trajectory, self.cotangents(trajectory))
         _, weights = self.combine(scene, [self.of_motion(one) for one in others])
         total: list[Any] = []
-        by_coefficients = None
+        by_coefficients: list[np.ndarray] = []
         for weight, one in zip(weights, others, strict=True):
             if frozen:
-                found = self.load_case_moments(one)
+                found: list[Any] = self.load_case_moments(one)
             else:
                 followed = self.cotangents(one)
-                found, by = followed.bodies, followed.by_coefficients
-                if by is not None:
-                    by_coefficients = weight * by + (0.0 if by_coefficients is None else by_coefficients)
+                found = followed.bodies
+                if followed.by_coefficients is not None:
+                    by_coefficients.append(weight * followed.by_coefficients)
             parts: list[Any] = []
             # Rigid arms and bodies from files have no gradient.
             for index, part in enumerate(found[: len(scene.arms)]):
@@ -246,10 +246,11 @@ class MotionResponse(Response):
                 whole = weight * f.stiffness
                 parts.append(whole * part if frozen else cotangents_of_scene(part, f, weight))
             total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
-        return with_feed_forward(trajectory, Followed(total, by_coefficients))
+        by = np.sum(by_coefficients, axis=0) if by_coefficients else None
+        return with_feed_forward(trajectory, Followed(total, by))
 
 
-def followed_by(trajectory: Trajectory, t: np.ndarray, by: MotionGradient) -> Followed:
+def followed_by(trajectory: Trajectory, t: np.ndarray, by: ByMotion) -> Followed:
     """Return how a function of a motion at instants t (n,), s, follows the bodies."""
     found = trajectory.followed(t, by.unknowns, by.motion)
     bodies = [add_integrals(a, own) for a, own in zip(found.bodies, by.bodies, strict=True)]
@@ -280,13 +281,13 @@ class ComplianceResponse(MotionResponse):
         """Return the weights."""
         return np.broadcast_to(weights[:, None], y.shape)
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return 2 w_j K q_j, and the second moments of q by K."""
         q = trajectory.q_e[cases.indices]
         by_q = 2.0 * cases.weights[:, None] * (q @ trajectory.mechanism.stiffness())
         by_q[:, trajectory.mechanism.bearing_columns] = 0.0
         own = [{"K": Q} for Q in second_moments(trajectory, cases)]
-        return MotionGradient(trajectory.by_unknowns(by_q), own)
+        return ByMotion(trajectory.by_unknowns(by_q), own)
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return the second moments: lambda_j = w_j q_j with the loads frozen."""
@@ -331,7 +332,7 @@ class Deviation(MotionResponse):
         """Return that of the p-mean."""
         return p_norm_of_lengths(y, self.options.exponent, weights / weights.sum())[1]
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return the derivatives through the outboard interfaces' modes."""
         return trajectory.by_end_effector(cases.indices, by_y)
 
@@ -368,7 +369,7 @@ class Orientation(Deviation):
         """Return theta, rad."""
         return trajectory.rotation
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return its derivatives; they are along theta, where a spin changes theta by itself."""
         no_force = np.zeros_like(trajectory.deviation[cases.indices])
         return trajectory.by_end_effector(cases.indices, no_force, by_y)
@@ -426,13 +427,13 @@ class DriveResponse(MotionResponse):
         scene = trajectory.scene
         return trajectory.joint_forces[:, self._columns(scene)] * self._weights(scene)
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
         by, scene = np.zeros_like(trajectory.joint_forces), trajectory.scene
         by[np.ix_(cases.indices, self._columns(scene))] = by_y * self._weights(scene)
         by_rates, by_motion, bodies = trajectory.drive_forces.gradient(by)
         own = [integrals_of(one) for one in bodies]
-        return MotionGradient(by_rates[:, cases.indices], own, by_motion[:, cases.indices])
+        return ByMotion(by_rates[:, cases.indices], own, by_motion[:, cases.indices])
 
     def counted(self, scene: Scene) -> tuple[int, ...]:
         """Return the numbers of the drives that count."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
-from dolfinopt.dynamics.trajectory import Followed, MotionGradient, Trajectory
+from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
 from dolfinopt.multibody.shape_integrals import integrals_of
 from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
 from dolfinopt.responses.motion import LoadCases, MotionResponse, all_instants, followed_by
@@ -79,7 +79,7 @@ class PoleResponse(MotionResponse):
         seen = _seen(trajectory)
         return followed_by(trajectory, seen.t, self.derivatives(seen, self.load_cases(seen)))
 
-    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> MotionGradient:
+    def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> ByMotion:
         """Return those by coordinates, rates and accelerations at the scene's instants, and bodies.
 
         Whatever the cases are.
@@ -102,9 +102,9 @@ class PoleResponse(MotionResponse):
         for own in bodies[1:]:
             total = [a + b for a, b in zip(total, own, strict=True)]
         by = np.concatenate(by_rates, axis=1)
-        return MotionGradient(by, [integrals_of(one) for one in total])
+        return ByMotion(by, [integrals_of(one) for one in total])
 
-    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> MotionGradient:
+    def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return `derivatives`, which follow poles instant by instant."""
         return self.derivatives(trajectory, cases)
 

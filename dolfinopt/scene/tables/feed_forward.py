@@ -66,4 +66,6 @@ class FeedForward(Table):
         for name in self.joints or ():
             if name not in scene.driven:
                 known = ", ".join(scene.driven)
-                raise Refusal(f"expected drives, of {known}; {shown(name)} is none", (*at, "joints"))
+                raise Refusal(
+                    f"expected drives, of {known}; {shown(name)} is none", (*at, "joints")
+                )
