@@ -66,6 +66,18 @@ def _choices(summary: Summary) -> Iterator[str]:
     if start := summary["loop_start"]:
         joints = ", ".join(f"{name} = {value:.4g}" for name, value in start.items())
         yield f"closures: loops start with {joints}; motion.initial_joints chooses the branch"
+    if moved := summary["feed_forward"]:
+        units = moved["units"]["corrections"].split(", ")
+        pairs = zip(moved["corrections"].items(), units, strict=True)
+        joints = ", ".join(f"{name} by up to {x:.3g} {unit}" for (name, x), unit in pairs)
+        rate = moved["slowest_unstable_rate"]
+        begins = f", begun about {3e3 / rate:.2g} ms before it moves" if rate else ""
+        yield (
+            f"feed-forward: joints {joints}{begins}; the tip stays "
+            f"{1e3 * moved['deviation_left']:.2g} mm off its path "
+            f"({1e3 * moved['deviation_without']:.4g} mm without, to first order); "
+            "feed_forward.csv has the joints"
+        )
     found = summary["reduction"]
     if found["error_estimate"] is not None:
         yield chosen(found["coordinates"], found["error_estimate"])

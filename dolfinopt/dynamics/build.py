@@ -97,7 +97,7 @@ def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
         return MachineSystem(mechanism, motion, instants)
     drives = _drives(scene)
     if drives.table is not None:
-        instants = with_ends(instants, [drives.table], scene.motion.horizon)
+        instants = with_ends(instants, [drives.table], scene.horizon)
     return MachineSystem(mechanism, motion, instants, drives, loops_of(scene))
 
 
@@ -161,7 +161,7 @@ def _drives(scene: Scene) -> Drives:
         damping=damping[rows],
         limits=limits[rows],
         driven=~dependent[rows],
-        rigid_feed_forward=control is not None and control.feed_forward != "none",
+        rigid_feed_forward=control is not None and control.feed_forward in ("rigid", "elastic"),
         winding=control is not None and control.feed_forward == "elastic",
         table=None if table is None else Table(table.t, table.values[:, rows]),
         springs=springs,
@@ -176,7 +176,7 @@ def _table_of_forces(scene: Scene) -> Table | None:
     table = _table(scene.control.forces, scene.driven)
     values = np.zeros((len(table.t), scene.num_rigid))
     values[:, np.arange(scene.num_rigid)[scene.driven_columns]] = table.values
-    return Table(table.t, values)
+    return Table(table.t + scene.lead, values)
 
 
 def check_forces(scene: Scene) -> None:

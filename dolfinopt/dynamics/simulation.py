@@ -13,7 +13,12 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.march import BEYOND, REMEDY
 from dolfinopt.dynamics.measured import DEFLECTION_LIMIT
 from dolfinopt.dynamics.response_instants import response_instants
-from dolfinopt.dynamics.tip_feed_forward import FeedForward, corrected, feed_forward_of
+from dolfinopt.dynamics.tip_feed_forward import (
+    FeedForward,
+    corrected,
+    feed_forward_of,
+    with_known_forces,
+)
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError
@@ -44,10 +49,15 @@ def simulate(
     """
     problem, options = build_system(scene, bodies), scene.simulation
     with profile.phase("simulation"):
+        own = scene.feed_forward.on and feed_forward is None
+        if own:
+            plain = build_system(scene.model_copy(update={"control": None}), bodies)
+            feed_forward = feed_forward_of(plain, scene, profile, start)
         if feed_forward is not None:
             problem = corrected(problem, feed_forward.corrections)
-        if scene.feed_forward.on and feed_forward is None:
-            feed_forward = feed_forward_of(problem, scene, profile, start)
+            if scene.control is not None:
+                problem = with_known_forces(problem, feed_forward)
+        if own and feed_forward is not None and scene.control is None:
             problem, solution = feed_forward.machine, feed_forward.solution
         else:
             solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)

@@ -35,7 +35,7 @@ from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import EXACT
 from dolfinopt.dynamics.newton_matrix import matrix_of
 from dolfinopt.dynamics.system import Unchanged
-from dolfinopt.dynamics.tables import LoadedMotion, stage_instants
+from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_instants
 from dolfinopt.dynamics.time_grid import first_grid
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import end_effector, end_effector_gradient, lengths
@@ -56,6 +56,7 @@ REGULARISATION, OF_REDUNDANT = 1e-10, 1e-6
 CURVED = 1e-4  # of the deviation is left: second derivatives count
 CURVATURE_STEPS = 3
 DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
+FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
 SINGULAR = 1e-3  # least singular value of the tip's Jacobian, over the reach
 INSTANTS = 121  # at which it is looked at
 
@@ -138,6 +139,17 @@ def corrected(machine: MachineSystem, corrections: Corrections) -> MachineSystem
         moved = replace(motion, motion=CorrectedMotion(motion.motion, corrections))
         return replace(machine, motion=moved, path=motion)
     return replace(machine, motion=CorrectedMotion(motion, corrections), path=motion)
+
+
+def with_known_forces(machine: MachineSystem, feed_forward: FeedForward) -> MachineSystem:
+    """Return a controlled machine whose drives know the forces of the prescribed, corrected one."""
+    drives, horizon = machine.drives, machine.breakpoints[-1]
+    t = np.linspace(0.0, horizon, int(np.ceil(horizon / FORCE_INTERVAL)) + 1)
+    rates = (feed_forward.solution.sample(t, k) for k in range(3))
+    forces = feed_forward.machine.at(t).state(*rates).forces()[:, drives.free]
+    if drives.table is not None:
+        forces = forces + drives.table(t)
+    return replace(machine, drives=replace(drives, table=Table(t, forces * drives.driven)))
 
 
 def graded_knots(breakpoints: tuple[float, ...], spacing: float) -> np.ndarray:
@@ -283,6 +295,29 @@ def _sampled(
         here = step == k
         out[here] = by_first[here] @ y[k] + by_a[here] @ a[k]
     return out
+
+
+def internal_rates(found: FeedForward) -> np.ndarray | None:
+    """Return the eigenvalues (2 N,) of what the arms may still do while the tip is held, 1/s.
+
+    At rest at t = 0, of a machine on a prescribed motion that closes no loop. With r_F = P q that
+    keep the tip, P = -H_F^-1 H_q, (K + K_F P) q + (D + D_F P) q' + (M + M_F P) q'' = 0: those with
+    positive real part are unstable, and begin before the motion.
+    """
+    machine, corrections = found.machine, found.corrections
+    if not machine.is_prescribed:
+        return None
+    y = machine.initial_state()[0]
+    none = np.zeros_like(y)
+    state = machine.at(np.zeros(1)).state(y, none, none)
+    by_q, by_rigid = tip_jacobians(machine, state.motion, y)
+    P = -np.linalg.pinv(by_rigid[0][:, corrections.joints]) @ by_q[0]
+    own = np.split(state.instants.linearise(*state.rates).dense()[0], 3, axis=1)
+    by_joints = state.by_command(corrections.joints)[0]
+    K, D, M = (x + by_joints[:, :, k] @ P for k, x in enumerate(own))
+    inverse, size = np.linalg.inv(M), len(M)
+    zero, one = np.zeros((size, size)), np.eye(size)
+    return np.asarray(np.linalg.eigvals(np.block([[zero, one], [-inverse @ K, -inverse @ D]])))
 
 
 # -- least squares ---------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from dolfinopt.multibody.build import loops_of, skeleton
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.rotations import roll_pitch_yaw
-from dolfinopt.scene.csv_table import TIME, Table, column_names, read_table
+from dolfinopt.scene.csv_table import BESIDE_JOINTS, TIME, Table, column_names, read_table
 from dolfinopt.scene.duration import (
     POINT,
     SAME_TIME,
@@ -250,7 +250,8 @@ def rows_of(scene: Scene) -> Rows:
         return Rows(Table(scene.source, (1, 2), None, ends), start, 3)
     assert motion.file is not None
     if motion.path == "joints":
-        return Rows(read_table(motion.file, _columns_of_joints(scene)))
+        columns = _columns_of_joints(scene)
+        return Rows(read_table(motion.file, columns, ignored=BESIDE_JOINTS))
     if not scene.is_spatial:
         return Rows(read_table(motion.file, POINT))
     kind = _orientation(scene)

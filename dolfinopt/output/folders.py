@@ -27,6 +27,7 @@ RUN_FILES = (
     "history.csv",
     "trajectory.npz",
     "trajectory.csv",
+    "feed_forward.csv",
     "budget.csv",
     "design.npz",
     "design.xdmf",

@@ -21,6 +21,7 @@ from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import ArmView, HistoryWriter, gather_views, write_design, write_fields
+from dolfinopt.output.feed_forward import write_feed_forward
 from dolfinopt.output.folders import (
     RUN_FILES,
     check_sources,
@@ -81,6 +82,7 @@ def write_result(
         if paraview:
             write_fields(folder, views)
         write_trajectory(folder, one.trajectory, one.initial_deviation)
+        write_feed_forward(folder, one.trajectory)
         write_budget(folder, summary["deflection_budget"])
         if pictures is not None:
             since = time.perf_counter()

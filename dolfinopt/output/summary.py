@@ -24,6 +24,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
+from dolfinopt.output.feed_forward import summary_of_feed_forward
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
     drive_units,
@@ -130,6 +131,9 @@ def summarise(
             "max_deviation_time": run.evaluation.max_deviation_time,
             **({} if run.trajectory is None else _machine(scene, run.trajectory)),
             "loop_start": loop_start(scene),
+            "feed_forward": None
+            if run.trajectory is None
+            else summary_of_feed_forward(scene, run.trajectory.feed_forward),
             "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),
@@ -708,8 +712,13 @@ def versions() -> dict[str, str]:
 
 
 def budget_of(trajectory: Trajectory | None) -> dict[str, Any] | None:
-    """Return the budget as summary.json has it; None without a motion or a deviation."""
-    found = None if trajectory is None else deflection_budget(trajectory)
+    """Return the budget as summary.json has it; None without a motion or a deviation.
+
+    With feed-forward the joints take the arms' part away: there is nothing to share out.
+    """
+    if trajectory is None or trajectory.feed_forward is not None:
+        return None
+    found = deflection_budget(trajectory)
     return None if found is None else {**asdict(found), "shares": found.shares}
 
 

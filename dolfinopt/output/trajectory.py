@@ -42,7 +42,7 @@ def write_trajectory(
     } | _of_machine(trajectory)
     scene = trajectory.scene
     if initial is not None and len(initial):
-        even = np.linspace(0.0, scene.motion.horizon, len(initial))
+        even = np.linspace(scene.lead, scene.horizon, len(initial))
         arrays["initial_deviation"] = _between(even, initial, trajectory.t)
     rigid, bearings = ", ".join(scene.rigid_units.values()), trajectory.mechanism.bearings
     units = {

@@ -149,9 +149,10 @@ def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
     """Return the limits of the deviation, m, with first and last instant of each, s."""
     found = []
     if (deviation := scene.constraints.limit("deviation")) is not None:
-        found.append((deviation, 0.0, scene.motion.horizon))
+        found.append((deviation, scene.lead, scene.horizon))
     if (settling := scene.constraints.limit("settling")) is not None:
-        found += [(settling, begin, end) for begin, end in rests(scene)]
+        lead = scene.lead
+        found += [(settling, lead + begin, lead + end) for begin, end in rests(scene)]
     return found
 
 

@@ -31,7 +31,13 @@ class Table:
     rows: np.ndarray
 
 
-def read_table(file: str, columns: Sequence[str], further: str = "") -> Table:
+# Beginnings of the names of columns that a table of joints may have, and that say nothing new.
+BESIDE_JOINTS = "rate_", "drive_"
+
+
+def read_table(
+    file: str, columns: Sequence[str], further: str = "", ignored: tuple[str, ...] = ()
+) -> Table:
     """Read a CSV file with a line of column names, UTF-8.
 
     Columns stand in any order, separated by commas; a column t may be there besides `columns`.
@@ -41,6 +47,7 @@ def read_table(file: str, columns: Sequence[str], further: str = "") -> Table:
         file: its path.
         columns: names of those asked for.
         further: what else may be there, for messages.
+        ignored: beginnings of the names of columns that are not read.
 
     Raises:
         InputError: no such file, other columns, fewer than two rows, no finite number, or t does
@@ -51,6 +58,8 @@ def read_table(file: str, columns: Sequence[str], further: str = "") -> Table:
     if not lines:
         raise InputError(f"{file}: no rows; a line of column names is needed: {allowed}")
     number, names = lines[0]
+    kept = [k for k, name in enumerate(names) if not (ignored and name.startswith(ignored))]
+    names = [names[k] for k in kept]
     for name in dict.fromkeys([*names, *columns]):
         wrong = {0: "missing", 1: ""}.get(names.count(name), "repeated")
         if wrong := wrong if name in (TIME, *columns) else "unknown":
@@ -59,7 +68,8 @@ def read_table(file: str, columns: Sequence[str], further: str = "") -> Table:
         found = len(lines) - 1
         raise InputError(f"{file}: {found} row(s) below the column names; expected at least 2")
     numbers = tuple(k for k, _ in lines[1:])
-    values = np.array([_row(f"{file}: line {k}", names, cells) for k, cells in lines[1:]])
+    every = lines[0][1]
+    values = np.array([_row(f"{file}: line {k}", every, cells) for k, cells in lines[1:]])[:, kept]
     t = values[:, names.index(TIME)] if TIME in names else None
     if t is not None:
         _check_times(file, numbers, t)

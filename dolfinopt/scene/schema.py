@@ -133,6 +133,11 @@ class Scene(Table):
                 f"{self.source}: arms.rigid: nothing to design, as no arm is flexible or all come "
                 "from files; simulate, sweep, plot and export run such a machine"
             )
+        if self.control is not None and self.feed_forward.on:
+            raise InputError(
+                f"{self.source}: feed_forward.kind with [control]: the drives' known forces have no "
+                "gradient; optimise without [control], then simulate with it"
+            )
 
     @property
     def lead(self) -> float:

@@ -51,8 +51,12 @@ class FeedForward(Table):
                 if getattr(self, key) is not None:
                     raise Refusal('expected none without feed_forward.kind = "tip"', (*at, key))
             return
-        if scene.control is not None:
-            raise Refusal('expected "none" with [control]', (*at, "kind"), ("control",))
+        if scene.control is not None and scene.control.feed_forward != "tip":
+            raise Refusal(
+                'expected "none" with [control], unless control.feed_forward = "tip"',
+                (*at, "kind"),
+                ("control", "feed_forward"),
+            )
         if scene.is_pinned:
             raise Refusal(
                 'expected "none": a pin holds the end-effector, which has no path', (*at, "kind")

@@ -316,7 +316,7 @@ def _check_joint_parts(scene: Scene) -> None:
 
 # -- `[control]` ---------------------------------------------------------------------------------
 
-FeedForward = Literal["rigid", "elastic", "none"]
+FeedForward = Literal["rigid", "elastic", "tip", "none"]
 Gain = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; N s/m, N m s/rad
 DriveForce = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 Factor = Annotated[float, Field(ge=0, le=1e6)]
@@ -329,7 +329,8 @@ class Control(Table):
         default="rigid",
         description="forces known in advance: inverse dynamics of the machine with rigid arms of "
         'the current design, its rotors and friction included; "elastic" also asks motors behind '
-        "gear_stiffness to turn ahead of their joints by what the gears give; or none [-]",
+        "gear_stiffness to turn ahead of their joints by what the gears give; "
+        '"tip": those of [feed_forward], with its joints as desired ones; or none [-]',
     )
     stiffness: tuple[Gain, ...] = Field(
         description="proportional gain of every driven coordinate, the cart first, then the joints "
@@ -360,6 +361,10 @@ class Control(Table):
             raise Refusal(
                 'expected "rigid": no joint has a gear that gives way; state gear_stiffness',
                 (*at, "feed_forward"),
+            )
+        if self.feed_forward == "tip" and not scene.feed_forward.on:
+            raise Refusal(
+                'expected "rigid" without feed_forward.kind = "tip"', (*at, "feed_forward")
             )
         names = scene.driven
         for key in ("stiffness", "damping", "limits"):

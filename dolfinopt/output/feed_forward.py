@@ -1,0 +1,69 @@
+"""feed_forward.csv: joints that carry the bending arms' tip along its path; its summary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.disk import write_text
+from dolfinopt.dynamics.tip_feed_forward import FeedForward, internal_rates
+from dolfinopt.scene.csv_table import BESIDE_JOINTS
+from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.dynamics.trajectory import Trajectory
+
+FILE = "feed_forward.csv"
+
+
+def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
+    """Write the corrected joints every `simulation.sample`: as `motion.file` it repeats the run.
+
+    Columns: t, s; every driven coordinate by its name, rad or m, of joints with gears that give way
+    the motor's angle over the gear ratio; its rate; the force of its drive, N m or N.
+    """
+    seen, scene = trajectory.sampled, trajectory.scene
+    if seen.feed_forward is None:
+        return
+    joints = np.arange(scene.num_rigid)[scene.driven_columns]
+    rate, drive = BESIDE_JOINTS
+    columns = [seen.t, seen.commanded.q[:, joints], seen.commanded.qd[:, joints]]
+    header = ["t", *scene.driven, *(f"{rate}{name}" for name in scene.driven)]
+    columns.append(seen.joint_forces[:, joints])
+    header += [f"{drive}{name}" for name in scene.driven]
+    table = np.column_stack(columns)
+    line = ",".join(["%.15g"] * len(header)) + "\n"
+    text = line * len(table) % tuple(table.ravel().tolist())
+    write_text(folder / FILE, ",".join(header) + "\n" + text)
+
+
+def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str, Any] | None:
+    """Return what summary.json tells of a feed-forward; None without."""
+    if found is None:
+        return None
+    names, units = list(scene.rigid_units), list(scene.rigid_units.values())
+    joints, splines = found.corrections.joints, found.corrections.splines
+    largest = np.abs(found.corrections.at(np.linspace(0.0, scene.horizon, 2001))[0]).max(axis=0)
+    rates = internal_rates(found)
+    unstable = rates.real[rates.real > 0.0] if rates is not None else np.zeros(0)
+    return {
+        "joints": [names[k] for k in joints],
+        "lead": scene.lead,
+        "knots": len(splines.knots),
+        "regularity": found.regularity,
+        "deviation_without": found.before,
+        "deviation_left": found.left,
+        "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
+        "slowest_unstable_rate": float(unstable.min()) if len(unstable) else None,
+        "units": {
+            "lead": "s",
+            "knots": "-",
+            "regularity": "-",
+            "deviation_without": "m",
+            "deviation_left": "m",
+            "corrections": ", ".join(units[k] for k in joints),
+            "slowest_unstable_rate": "1/s",
+        },
+    }
