@@ -85,6 +85,13 @@ class Followed:
     bodies: list[ShapeIntegrals]
     by_coefficients: np.ndarray | None = None
 
+    def through(self, feed_forward: FeedForward | None) -> list[ShapeIntegrals]:
+        """Return the derivatives by every body, these corrections following them."""
+        if feed_forward is None or self.by_coefficients is None:
+            return self.bodies
+        further = feed_forward.gradient(self.by_coefficients)
+        return [a + b for a, b in zip(self.bodies, further, strict=False)]
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:

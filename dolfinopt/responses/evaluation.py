@@ -356,7 +356,9 @@ def _simulated(
             if start is None and moved:
                 start = moved[0].solution
             bodies = chain_of(one, owned) if one is first else bodies_in(first, one, owned)
-            held = moved[0].feed_forward if moved else None
+            # The nominal machine's feed-forward is kept where the motion is the same.
+            same = bool(moved) and one.motion == scene.motion
+            held = moved[0].feed_forward if same else None
             moved.append(simulate(one, bodies, profile, start, held))
         kept.append(replace(moved[0], scenarios=tuple(moved[1:])))
         with profile.phase("objective"):

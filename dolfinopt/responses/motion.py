@@ -11,7 +11,7 @@ import numpy as np
 
 from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
 from dolfinopt.motion.build import CART
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
+from dolfinopt.multibody.shape_integrals import add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.response import (
     Analysis,
@@ -227,7 +227,7 @@ class MotionResponse(Response):
         if not others:
             if frozen:
                 return self.load_case_moments(trajectory)
-            return with_feed_forward(trajectory, self.cotangents(trajectory))
+            return self.cotangents(trajectory).through(trajectory.feed_forward)
         _, weights = self.combine(scene, [self.of_motion(one) for one in others])
         total: list[Any] = []
         by_coefficients: list[np.ndarray] = []
@@ -236,6 +236,8 @@ class MotionResponse(Response):
                 found: list[Any] = self.load_case_moments(one)
             else:
                 followed = self.cotangents(one)
+                if one.feed_forward is not trajectory.feed_forward:
+                    followed = Followed(followed.through(one.feed_forward))
                 found = followed.bodies
                 if followed.by_coefficients is not None:
                     by_coefficients.append(weight * followed.by_coefficients)
@@ -247,7 +249,7 @@ class MotionResponse(Response):
                 parts.append(whole * part if frozen else cotangents_of_scene(part, f, weight))
             total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
         by = np.sum(by_coefficients, axis=0) if by_coefficients else None
-        return with_feed_forward(trajectory, Followed(total, by))
+        return Followed(total, by).through(trajectory.feed_forward)
 
 
 def followed_by(trajectory: Trajectory, t: np.ndarray, by: ByMotion) -> Followed:
@@ -255,15 +257,6 @@ def followed_by(trajectory: Trajectory, t: np.ndarray, by: ByMotion) -> Followed
     found = trajectory.followed(t, by.unknowns, by.motion)
     bodies = [add_integrals(a, own) for a, own in zip(found.bodies, by.bodies, strict=True)]
     return replace(found, bodies=bodies)
-
-
-def with_feed_forward(trajectory: Trajectory, followed: Followed) -> list[ShapeIntegrals]:
-    """Return derivatives by the bodies, corrections of the joints following them."""
-    bodies, by = followed.bodies, followed.by_coefficients
-    if by is None or trajectory.feed_forward is None:
-        return bodies
-    through = trajectory.feed_forward.gradient(by)
-    return [a + b for a, b in zip(bodies, through, strict=False)]
 
 
 class ComplianceResponse(MotionResponse):

@@ -13,7 +13,8 @@ from mpi4py import MPI
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.dynamics.adjoint import add_gradients
 from dolfinopt.dynamics.load_gradient import load_counts, load_gradient
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.tip_feed_forward import FeedForward
+from dolfinopt.dynamics.trajectory import Followed, Trajectory
 from dolfinopt.fem.stress import LoadFields
 from dolfinopt.fem.tensors import element_centre
 from dolfinopt.multibody.dimension import DIMENSIONS
@@ -237,7 +238,10 @@ def load_matrix(body: ShapeIntegrals) -> np.ndarray:
 
 
 def loads_gradient(
-    scene: Scene, motion: Trajectory, by_arm: Mapping[int, tuple[np.ndarray, np.ndarray]]
+    scene: Scene,
+    motion: Trajectory,
+    by_arm: Mapping[int, tuple[np.ndarray, np.ndarray]],
+    nominal: FeedForward | None = None,
 ) -> tuple[dict[int, ShapeIntegrals], np.ndarray | None]:
     """Differentiate a function of one motion's `ArmLoads.coefficients` by all designs' bodies.
 
@@ -245,6 +249,7 @@ def loads_gradient(
         scene: nominal, whose bodies the derivatives are by.
         motion: of it, or of one of its scenarios.
         by_arm: by place in the chain, instants (k,) and derivatives (k, q + 7 + 2 q) there.
+        nominal: feed-forward whose part is left to whoever adds up the scenarios.
 
     Returns:
         By the index of the arm that owns the design; by the coefficients of the feed-forward.
@@ -272,6 +277,8 @@ def loads_gradient(
     by_rates, by_motion, by_bodies = load_gradient(problem, t, (y, yd, ydd), by_c)
     by_rates[0] += motion.by_unknowns(by_q)
     followed = motion.followed(t, by_rates, by_motion)
+    if motion.feed_forward is not nominal:
+        followed = Followed(followed.through(motion.feed_forward))
     total = add_gradients(add_gradients(followed.bodies, by_bodies), own)
     if motion.scene is not scene:
         total = [
@@ -558,7 +565,7 @@ def bodies_by_loads(
     def followed() -> dict[int, ShapeIntegrals]:
         assert analysis.trajectory is not None
         total: dict[int, ShapeIntegrals] = {}
-        by_coefficients: list[np.ndarray] = []
+        by_coefficients, nominal = [], analysis.trajectory.feed_forward
         for number, motion in enumerate(motions_of(analysis.trajectory)):
             own = {
                 place: (where, by)
@@ -570,11 +577,10 @@ def bodies_by_loads(
                 continue
             profile.counts.adjoints += 1
             with profile.phase("adjoint"):
-                found, by = loads_gradient(analysis.scene, motion, own)
+                found, by = loads_gradient(analysis.scene, motion, own, nominal)
             if by is not None:
                 by_coefficients.append(by)
             total = {k: total[k] + by if k in total else by for k, by in found.items()}
-        nominal = analysis.trajectory.feed_forward
         if by_coefficients and nominal is not None:
             through = by_owner(analysis.scene, nominal.gradient(np.sum(by_coefficients, axis=0)))
             total = {k: by + through[k] for k, by in total.items()}

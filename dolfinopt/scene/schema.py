@@ -135,8 +135,8 @@ class Scene(Table):
             )
         if self.control is not None and self.feed_forward.on:
             raise InputError(
-                f"{self.source}: feed_forward.kind with [control]: the drives' known forces have no "
-                "gradient; optimise without [control], then simulate with it"
+                f"{self.source}: feed_forward.kind with [control]: the drives' known forces have "
+                "no gradient; optimise without [control], then simulate with it"
             )
 
     @property

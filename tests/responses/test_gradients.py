@@ -135,6 +135,8 @@ TWO_GAINS = (
     '{changes=["control.stiffness_factor=0.1", "control.damping_factor=0.3"]}]'
 )
 TWO_SPEEDS = 'scenarios=[{changes=["closure.force=-50"]}, {changes=["motion.speed=75"]}]'
+FEED = "feed_forward.kind=tip"
+PAYLOADS = 'scenarios=[{changes=["payload.mass=5"]}, {changes=["payload.mass=7"]}]'
 # A force of the world over time between the arms, one of the arm's frame at the end.
 PUSHED = (
     'forces=[{arm="arm1", force=[30.0,-50.0], table="FOLDER/push.csv"}, '
@@ -327,6 +329,13 @@ CASES = [
     case("pin", "damping_ratio", CRANK, "constraints.poles_at=[0.03,0.08]"),
     case("boom", "damping_ratio", BOOM_HELD),
     case("loop", "damping_ratio", BENT, "control={stiffness=[100.0], damping=[0.1]}"),
+    # Joints that keep the tip on its path follow the design.
+    case("two_arm", "deviation", FEED, PAYLOADS, *FINER, ranks=True),
+    case("two_arm", "stress", FEED, PAYLOADS, *FINER),
+    case("two_arm", "integral_compliance", FEED, GRAVITY, "feed_forward.lead=0.0", *FINER),
+    case("two_arm", "peak_force", FEED, 'feed_forward.joints=["cart", "arm1", "arm2"]', *FINER),
+    case("two_arm", "effort", FEED, TWO, *FINER, slow=True),
+    case("space", "deviation", FEED, 'scenarios=[{changes=["payload.mass=2"]}]'),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", kind, "design.filter_radius=0.05", *FINER)
       for kind in objective_kinds() if "poles_at" not in DECLARED[kind].options),

@@ -1,0 +1,162 @@
+"""Feed-forward of the tip: what is left, against an independent integrator, tables, gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from runs import ROOT
+from scipy.integrate import solve_ivp
+
+from dolfinopt import Model
+from dolfinopt.dynamics.tip_feed_forward import (
+    Splines,
+    graded_knots,
+    internal_rates,
+    off_path,
+)
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.kinematics import end_effector
+
+pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
+
+TIP = 'feed_forward.kind="tip"'
+SMALL = "arms.cells=[40,4]", "design.filter_radius=0", "simulation.stiffening=false"
+
+
+def small(*changes: str, scene: str = "two_arm"):
+    """Return the simulated uniform design of a demo."""
+    changes = (*SMALL, *changes) if scene in ("two_arm", "three_arm") else changes
+    model = Model(ROOT / "demos" / f"{scene}.toml", *changes)
+    return model.simulate(model.uniform(0.5)).trajectory
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return small()
+
+
+@pytest.fixture(scope="module")
+def moved():
+    return small(TIP)
+
+
+def test_the_tip_stays_on_its_path(plain, moved) -> None:
+    """A ten thousandth of the deviation is left; joints bend back what the arms bend."""
+    found = moved.feed_forward
+    assert found.before == pytest.approx(plain.max_deviation[0], rel=0.05)  # to first order
+    assert moved.max_deviation[0] < 1e-4 * plain.max_deviation[0]
+    assert [moved.scene.driven[k] for k in found.corrections.joints] == ["arm1", "arm2"]
+    # As Seifried's servo constraints have it for this machine: 0.016 and 0.028 rad.
+    largest = np.abs(found.corrections.at(moved.t)[0]).max(axis=0)
+    assert largest == pytest.approx([0.016, 0.028], rel=0.1)
+    assert (moved.drives[0] < plain.drives[0]).all()
+
+
+def test_against_another_integrator(moved, plain) -> None:
+    """The reduced equations by SciPy under the same joints: the tip is as near."""
+    system, found = moved.problem, moved.feed_forward
+    rest = np.zeros((1, system.num_coordinates))
+
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
+        q, qd = np.split(y, 2)
+        at = system.at(np.array([t]))
+        mass = at.linearise(q[None], qd[None], rest).dense()[0, :, 2 * len(q) :]
+        force = at.residual(q[None], qd[None], rest)[0]
+        return np.concatenate([qd, -np.linalg.solve(mass, force)])
+
+    end, begin = 0.16, moved.scene.lead
+    start = np.zeros(2 * rest.shape[1])
+    t = np.linspace(begin, end, 31)
+    q = solve_ivp(rate, (0.0, end), start, "Radau", t, rtol=1e-5, atol=1e-9).y[: rest.shape[1]].T
+    tip = end_effector(system.mechanism, system.motion(t), q)
+    still = end_effector(system.mechanism, system.path(t), 0.0 * q)
+    assert np.abs(tip - still).max() < 1e-4 * plain.max_deviation[0]
+    # Of the largest in the whole motion the simulation leaves 1e-4.
+    assert np.abs(q - found.solution.sample(t)).max() < 1e-3 * np.abs(q).max()
+
+
+@pytest.mark.parametrize(
+    ("scene", "share", "changes"),
+    [
+        ("two_arm", 1e-4, ("motion.gravity=[0.0,-9.81]",)),
+        ("two_arm", 1e-4, ('feed_forward.joints=["cart","arm1","arm2"]',)),
+        ("two_arm", 1e-4, ("reduction.coordinates=8",)),
+        ("three_arm", 1e-4, ()),
+        ("two_arm", 1e-3, ("feed_forward.lead=0",)),
+    ],
+)
+def test_what_is_left(scene, share, changes) -> None:
+    """With gravity, joints in surplus, more coordinates, three arms, and without lead."""
+    found = small(TIP, *changes, scene=scene)
+    assert found.max_deviation[0] < share * found.feed_forward.before
+
+
+def test_more_coordinates_keep_the_tip(moved, plain) -> None:
+    """The corrections of four coordinates an arm, on the machine with eight."""
+    model = Model(ROOT / "demos" / "two_arm.toml", *SMALL, "reduction.coordinates=8")
+    finer = model.simulate(model.uniform(0.5)).trajectory.problem
+    from dolfinopt.dynamics import radau
+    from dolfinopt.dynamics.tip_feed_forward import corrected
+    from dolfinopt.profiling import Profile
+
+    own = moved.problem
+    machine = corrected(
+        type(own)(finer.mechanism, own.path, own.breakpoints), moved.feed_forward.corrections
+    )
+    solution = radau.integrate(machine, 1e-4, 3, Profile())
+    left = np.linalg.norm(off_path(machine, solution, moved.t), axis=1).max()
+    assert left < 1e-3 * plain.max_deviation[0]
+
+
+def test_table_repeats_the_run(moved, plain, tmp_path) -> None:
+    """feed_forward.csv as motion.file: the same path of the tip."""
+    from dolfinopt.output.feed_forward import FILE, write_feed_forward
+
+    write_feed_forward(tmp_path, moved)
+    horizon = moved.sampled.t[-1]
+    told = f"motion.file='{tmp_path / FILE}'", f"motion.duration={horizon}"
+    again = small('motion.path="joints"', *told, f"motion.horizon={horizon}")
+    t = np.linspace(moved.scene.lead, horizon, 301)
+    assert np.abs(again.at(t).end - moved.at(t).end).max() < 1e-4 * plain.max_deviation[0]
+
+
+def test_under_control(plain) -> None:
+    """Corrected joints as desired ones and their forces known ahead: what control leaves."""
+    told = 'control.feed_forward="tip"', "simulation.tolerance=1e-3", "motion.horizon=2.2"
+    found = small(TIP, "control.stiffness=[1e6,2e5,1e5]", "control.damping=[2e3,5e2,2e2]", *told)
+    assert found.max_deviation[0] < 1e-3 * plain.max_deviation[0]
+
+
+def test_internal_dynamics_mirror_without_damping() -> None:
+    """Undamped, what the arms do while the tip is held runs backwards as well as forwards."""
+    rates = internal_rates(small(TIP, "damping.stiffness_proportional=0").feed_forward)
+    mirrored = np.abs(rates[:, None] + rates).min(axis=1)
+    assert (mirrored < 1e-6 * np.abs(rates)).all()
+    assert (rates.real > 1.0).any()  # non-minimum phase
+
+
+def test_splines_rest_at_their_ends() -> None:
+    splines = Splines(graded_knots((0.0, 0.1, 1.0), 0.05))
+    values = splines.at(np.array([0.0, 1.0]))
+    assert np.abs(values[1:]).max() < 1e-9 * np.abs(splines.at(np.array([0.5]))[2]).max()
+    assert values[0].sum(axis=1) == pytest.approx([1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (("feed_forward.lead=0.1",), "expected none without feed_forward.kind"),
+        ((TIP, 'feed_forward.joints=["elbow"]'), "expected drives, of cart, arm1, arm2"),
+        ((TIP, 'feed_forward.joints=["arm1"]'), "expected at least 2 joints"),
+        ((TIP, "control.stiffness=[1,1,1]", "control.damping=[1,1,1]"), "unless control.feed"),
+    ],
+)
+def test_refusals(changes, words) -> None:
+    with pytest.raises(InputError, match=words):
+        small(*changes)
+
+
+def test_singular_positions_are_named() -> None:
+    """A slider-crank passes its dead centres: no joint moves the slider along the line there."""
+    with pytest.raises(InputError, match="cannot move the tip along its path at t = "):
+        small(TIP, scene="slider_crank")
