@@ -3,7 +3,9 @@
 Corrections r_F = sum_k B_k(t) c_k of some joints, splines of degree 5, are such that the tip h of
 the flexible machine stays on the path y of the rigid one:
 
-    min over c   1/2 sum_i w_i |h(t_i, c) - y(t_i)|^2 + rho/2 |c|^2,
+    min over c   1/2 sum_i w_i |h(t_i, c) - y(t_i)|^2 + c' R c / 2,
+
+R for the smoothest ones,
 
 by Gauss-Newton steps. The columns dh/dc follow from the linearised collocation equations, all
 right sides at once, so that nothing is integrated backwards in time: the internal dynamics of a
@@ -359,8 +361,8 @@ class FeedForward:
     def gradient(self, by_coefficients: np.ndarray) -> list[ShapeIntegrals]:
         """Return the derivative by every body of J through the coefficients, dJ/dc (p, F).
 
-        The coefficients follow the bodies, as G = J_c' W e + rho c stays zero. With the multipliers
-        mu of (J_c' W J_c + rho + S) mu = dJ/dc, S = sum_i (W e)_i d2h_i/dc2,
+        The coefficients follow the bodies, as G = J_c' W e + R c stays zero. With the multipliers
+        mu of (J_c' W J_c + R + S) mu = dJ/dc, S = sum_i (W e)_i d2h_i/dc2,
 
             dJ = -mu . dG = -(W J_c mu) . dh - d/d eps [ (W e) . dh(c + eps mu) ],
 
@@ -450,15 +452,15 @@ def tip_gradient(
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """The linearised problem of the corrections: min |W^1/2 (J c + gap)|^2 + rho |c|^2.
+    """The linearised problem of the corrections: min |W^1/2 (J c + gap)|^2 + c' R c.
 
     Attributes:
         t: (n,) instants at which the tip counts, s.
         weights: (n d,) W.
         by_coefficients: J (n d, p F).
         gap: (n d,) m.
-        normal: J' W J + rho.
-        rho: of the coefficients, m2 s.
+        normal: J' W J + R.
+        roughness: R (p F, p F): of the corrections' accelerations, in the mean square.
     """
 
     t: np.ndarray
@@ -466,12 +468,12 @@ class LeastSquares:
     by_coefficients: np.ndarray
     gap: np.ndarray
     normal: np.ndarray
-    rho: float
+    roughness: np.ndarray
 
     def step(self, coefficients: np.ndarray) -> np.ndarray:
         """Return coefficients (p, F) that are best by the linearised problem."""
         c = coefficients.ravel()
-        right = self.by_coefficients.T @ (self.weights * self.gap) + self.rho * c
+        right = self.by_coefficients.T @ (self.weights * self.gap) + self.roughness @ c
         return (c - np.linalg.solve(self.normal, right)).reshape(coefficients.shape)
 
 
@@ -486,9 +488,11 @@ def least_squares(
     J = answer.by_coefficients.reshape(len(gap), -1)
     weights = np.repeat(np.gradient(t), len(gap) // len(t))
     normal = J.T @ (weights[:, None] * J)
-    rho = share * np.trace(normal) / len(normal)
-    normal[np.diag_indices(len(normal))] += rho
-    return LeastSquares(t, weights, J, gap, normal, rho)
+    bends = corrections.splines.at(t)[2]
+    squares = bends.T @ (np.gradient(t)[:, None] * bends)
+    roughness = np.kron(squares, np.eye(len(corrections.joints)))
+    roughness *= share * np.trace(normal) / np.trace(roughness)
+    return LeastSquares(t, weights, J, gap, normal + roughness, roughness)
 
 
 def at_rest(machine: MachineSystem, tolerance: float, stages: int) -> Solution:
