@@ -156,7 +156,8 @@ class Iterate:
 
         A step whose motion cannot be simulated, or that makes the objective or a limit twice as
         bad, is made a quarter as long, three times; where that does not help, x stays and `stuck`
-        says why. The next steps are half as long where the merit rose, else longer again.
+        says why. The next steps are half as long where the merit rose, else longer again, but not
+        as long as the projection becomes steeper.
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.state, self.evaluator.start
@@ -169,18 +170,16 @@ class Iterate:
             designs = self._tried(new)
             if designs is not None:
                 self._go_on(new, after, designs, rises)
-                if not rises:
-                    self._adapt_reach(shorter, self.problem.merit(size) > merit + MERIT_RISE)
+                rose = self.problem.merit(size) > merit + MERIT_RISE
+                growth = 1.0 if rises else REACH_GROWTH
+                factor = shorter * (SHORTER_REACH if rose else growth)
+                self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
                 return
             self.projection.restore(before)
             rises = False  # the shorter step is one of the same projection
         self.evaluator.restart(start)
         self.evaluate_again()
         self.stuck = self.stuck or "every step, however short, makes it twice as bad"
-
-    def _adapt_reach(self, shorter: float, rose: bool) -> None:
-        factor = shorter * (SHORTER_REACH if rose else REACH_GROWTH)
-        self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
 
     def _tried(self, new: np.ndarray) -> list[EvaluatedDesign] | None:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
