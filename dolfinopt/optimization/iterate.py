@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
-from mpi4py import MPI
 
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
@@ -28,7 +25,7 @@ from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
 from dolfinopt.optimization.residual import Residual, kkt_residual
 from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Progress
-from dolfinopt.parallel import sum_over_arms
+from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.constraints import EXCESS, tightest
 from dolfinopt.responses.static import cell_volumes
 
@@ -37,7 +34,7 @@ class Iterate:
     """A design, evaluated, and what the method of moving asymptotes remembers.
 
     Attributes:
-        x, state: this rank's design variables (n,), and what MMA remembers.
+        x, state: design variables (n,), and what MMA remembers; the same on all ranks.
         problem, designs: at x; the designs that x stands for, the nominal one last.
         best, progress: the best design so far, and the course of the iterations.
         iteration, change: updates made, and the largest change of a variable in the last one.
@@ -52,11 +49,10 @@ class Iterate:
     designs: list[EvaluatedDesign]
 
     def __init__(self, evaluator: Evaluator, x: np.ndarray):
-        """Take what evaluates designs, and the variables (n,) of this rank."""
+        """Take what evaluates designs, and the variables (n,)."""
         self.evaluator, self.scene = evaluator, evaluator.scene
         self.variables, self.projection = evaluator.variables, evaluator.projection
         self.world = evaluator.partition.world
-        self.total = partial(sum_over_arms, evaluator.partition)
         self.x, self.state = x, initial_state(x)
         self.best, self.progress = Best.none(x), Progress()
         self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
@@ -184,8 +180,7 @@ class Iterate:
     def _tried(self, new: np.ndarray) -> list[EvaluatedDesign] | None:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
         self.stuck = ""
-        own = np.abs(new - self.x).max() if len(new) else 0.0
-        self.change = float(self.world.allreduce(own, op=MPI.MAX))
+        self.change = float(np.abs(new - self.x).max())
         steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
         try:
             with counted(STEP_NEWTON_ITERATIONS * steps if steps else np.inf):
@@ -211,21 +206,16 @@ class Iterate:
 
     def _proposed(self, move: float) -> tuple[np.ndarray, MMAState]:
         """Return MMA's next design, and what it remembers then (collective)."""
-        problem, curved = self.problem, self.curved
+        problem, bounds = self.problem, (self.variables.xmin, self.variables.xmax)
+        gradients = problem.df0dx, problem.f, problem.dfdx
+        widest = CURVED_ASYMPTOTE_DISTANCE if self.curved else LARGEST_ASYMPTOTE_DISTANCE
+
+        def stepped() -> tuple[np.ndarray, MMAState]:
+            return mma_step(self.x, *gradients, *bounds, self.state, move=move, widest=widest)
+
         with self.evaluator.profile.phase("mma"):
-            return mma_step(
-                self.x,
-                problem.df0dx,
-                problem.f,
-                problem.dfdx,
-                self.variables.xmin,
-                self.variables.xmax,
-                self.state,
-                move=move,
-                widest=CURVED_ASYMPTOTE_DISTANCE if curved else LARGEST_ASYMPTOTE_DISTANCE,
-                comm=self.world,
-                pieces=self.variables.pieces,
-            )
+            found: tuple[np.ndarray, MMAState] = on_root(self.world, stepped)
+        return found
 
     # -- measures ----------------------------------------------------------------------------
 
@@ -259,22 +249,16 @@ class Iterate:
             kind = arms[k].kind
             filled, x = kind.filled(x_phys[k]), kind.share(x_phys[k])
             parts[k] = np.array([volume.sum(), volume @ filled, volume @ (4.0 * x * (1.0 - x))])
-        total, volume, grey = self.total(parts)
+        total, volume, grey = sum_over_arms(self.evaluator.partition, parts)
         return float(total), float(volume / total), float(grey / total)
 
     def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
         variables, problem = self.variables, self.problem
-        return kkt_residual(
-            self.x,
-            variables.xmin,
-            variables.xmax,
-            problem.df0dx,
-            problem.f,
-            problem.dfdx,
-            variables.slices,
-            self.total,
-        )
+        bounds = variables.xmin, variables.xmax
+        gradients = problem.df0dx, problem.f, problem.dfdx
+        found: Residual = on_root(self.world, kkt_residual, self.x, *bounds, *gradients)
+        return found
 
     # -- memory ------------------------------------------------------------------------------
 
@@ -301,7 +285,7 @@ class Iterate:
 
     def restore(self, memory: IterateMemory) -> None:
         """Go back to what `memory` describes; `evaluate_again` is to follow."""
-        columns = self.variables.join(memory.cells).reshape(-1, 6)
+        columns = self.variables.join(memory.cells)
         self.x, x_old1, x_old2, low, upp, best = (column.copy() for column in columns.T)
         self.state = MMAState(memory.mma_steps, x_old1, x_old2, low, upp, memory.multipliers)
         self.best, self.progress = memory.best.with_variables(best), memory.progress
