@@ -43,7 +43,6 @@ from dolfinopt.responses.response import (
     objective_of,
 )
 from dolfinopt.scene.load import Scene, pose_scenarios
-from dolfinopt.scene.tables.responses import asked
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -141,63 +140,9 @@ def evaluate(
     if simulated or needs(scene, "motion"):
         decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
         owned = _reduced(partition, arms, x_phys)
-        motion, trajectory = _simulated(scene, scene, partition, owned, profile, start)
+        motion, trajectory = _simulated(scene, partition, owned, profile, start)
     analysis = analysis_of(scene, partition, arms, trajectory, profile)
     return _measured(analysis, motion), trajectory
-
-
-def evaluate_batch(
-    scenes: Sequence[Scene],
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Cells,
-    profile: Profile,
-) -> list[tuple[Evaluation, Trajectory | None] | ConvergenceError]:
-    """Evaluate one design in many scenes, whose motions are simulated in one batch (collective).
-
-    Args:
-        scenes: of one reduction, in which the arms are the same, see `Arm.under`; or, if nothing
-            but their motion is asked for, scaled, see `scenarios.factors`.
-        partition: which ranks do which arm.
-        arms: this rank's, in the first scene.
-        x_phys: their physical densities (n_cells,).
-        profile: of this rank.
-
-    Returns:
-        What `evaluate` does of every scene, or the error that it would raise.
-
-    Raises:
-        InputError: as `evaluate` does.
-    """
-    _check_densities(partition, arms, x_phys)
-    try:
-        with together(partition.world):
-            for k, arm in arms.items():
-                arm.set_design(x_phys[k])
-        decided = stiffening_of_each(
-            [(one, *pose_scenarios(one)) for one in scenes], partition, arms
-        )
-    except ConvergenceError as error:
-        return [error] * len(scenes)
-    found: dict[int, tuple[Evaluation, Trajectory | None] | ConvergenceError] = {}
-    bodies: dict[bool, Mapping[int, ShapeIntegrals]] = {}
-    for i in sorted(range(len(scenes)), key=lambda i: decided[i].on):  # bodies differ
-        scene, on = scenes[i], decided[i].on
-        try:
-            if on not in bodies:
-                for arm in arms.values():
-                    arm.set_stiffening(decided[i])
-                bodies[on] = _reduced(partition, arms, x_phys)
-            motion, trajectory = _simulated(scenes[0], scene, partition, bodies[on], profile)
-            under = arms
-            if any(one.needs and "motion" not in one.needs for one in asked(scene)):
-                with together(partition.world):
-                    under = {k: arm.under(scene) for k, arm in arms.items()}
-            analysis = analysis_of(scene, partition, under, trajectory, profile)
-            found[i] = _measured(analysis, motion), trajectory
-        except ConvergenceError as error:
-            found[i] = error
-    return [found[i] for i in range(len(scenes))]
 
 
 def analysis_of(
@@ -331,16 +276,13 @@ def _reduced(
 
 
 def _simulated(
-    first: Scene,
     scene: Scene,
     partition: Partition,
     owned: Mapping[int, ShapeIntegrals],
     profile: Profile,
-    starts: Sequence[Solution] = (),
+    starts: Sequence[Solution],
 ) -> tuple[Motion, Trajectory | None]:
-    """Simulate a scene and its scenarios, with the bodies of `first` (collective).
-
-    The trajectory is the root's.
+    """Simulate a scene and its scenarios (collective); the trajectory is the root's.
 
     Raises:
         ConvergenceError: on all ranks.
@@ -348,15 +290,12 @@ def _simulated(
     kept: list[Trajectory] = []
 
     def run() -> Motion:
-        moved: list[Trajectory] = []
-        known = list(starts)
-        for number, one in enumerate((scene, *pose_scenarios(scene))):
+        others = pose_scenarios(scene)
+        moved = [simulate(scene, chain_of(scene, owned), profile, *starts[:1])]
+        for number, one in enumerate(others, 1):
             # Scenarios begin with the scene's motion unless theirs is known.
-            start = known[number] if number < len(known) else None
-            if start is None and moved:
-                start = moved[0].solution
-            bodies = chain_of(one, owned) if one is first else bodies_in(first, one, owned)
-            moved.append(simulate(one, bodies, profile, start))
+            start = starts[number] if number < len(starts) else moved[0].solution
+            moved.append(simulate(one, bodies_in(scene, one, owned), profile, start))
         kept.append(replace(moved[0], scenarios=tuple(moved[1:])))
         with profile.phase("objective"):
             return _motion(kept[0])
@@ -412,7 +351,7 @@ def decide_stiffening(
     """
     if partition.world.allreduce(all(arm.stiffening is not None for arm in arms.values()), min):
         return
-    [found] = stiffening_of_each([scenes], partition, arms)
+    found = _stiffening(scenes, partition, arms)
     for arm in arms.values():
         arm.set_stiffening(found)
 
@@ -430,29 +369,23 @@ def reconsider_stiffening(
     known = partition.world.bcast(stiffening_of(arms), root=0)
     if scenes[0].simulation.stiffening != "auto" or known is None or known.on:
         return False
-    [found] = stiffening_of_each([scenes], partition, arms)
+    found = _stiffening(scenes, partition, arms)
     for arm in arms.values():
         arm.set_stiffening(found)
     return found.on
 
 
-def stiffening_of_each(
-    groups: Sequence[Sequence[Scene]], partition: Partition, arms: Mapping[int, Arm]
-) -> list[Stiffening]:
-    """Return what is decided for each group of scenes on its own (collective).
-
-    Args:
-        groups: scenes of the same arms; those of a group are decided together.
-        partition: which ranks do which arm.
-        arms: this rank's, with a design.
-    """
-    stated = not any(group[0].simulation.stiffening == "auto" for group in groups)
-    if stated and not groups[0][0].estimates_stiffening:
-        return [Stiffening(None, group[0].simulation.stiffening is True) for group in groups]
+def _stiffening(
+    scenes: Sequence[Scene], partition: Partition, arms: Mapping[int, Arm]
+) -> Stiffening:
+    """Return what is decided for scenes of the same arms together (collective)."""
+    stated = scenes[0].simulation.stiffening
+    if stated != "auto" and not scenes[0].estimates_stiffening:
+        return Stiffening(None, stated is True)
     with together(partition.world):
-        mine = {k: _static_body(arm, simulated=not stated) for k, arm in arms.items()}
+        mine = {k: _static_body(arm, simulated=stated == "auto") for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
-    found: list[Stiffening] = on_root(partition.world, _decided, groups, owned)
+    found: Stiffening = on_root(partition.world, _decided, scenes, owned)
     return found
 
 
@@ -471,29 +404,19 @@ def _static_body(arm: Arm, simulated: bool) -> ShapeIntegrals:
     return shape_integrals(elastic, basis, damping, loads)
 
 
-def _decided(
-    groups: Sequence[Sequence[Scene]], owned: Mapping[int, ShapeIntegrals]
-) -> list[Stiffening]:
-    """Return what is decided for each group."""
-    first, found = groups[0][0], []
-    for group in groups:
-        asked = group[0].simulation.stiffening
-        estimate = max(_change(one, bodies_in(first, one, owned)) for one in group)
-        if asked != "auto":
-            found.append(Stiffening(estimate, asked))
-            continue
-        if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
-            found.append(Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE))
-            continue
-        bodies = [bodies_in(first, one, owned) for one in group]
-        neglected = _neglected(group, bodies)
-        on = (
-            estimate >= STIFFENING_UNKNOWN_CHANGE
-            if neglected is None
-            else neglected > NEGLECTED_DEVIATION_SHARE
-        )
-        found.append(Stiffening(estimate, on, neglected))
-    return found
+def _decided(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> Stiffening:
+    """Return what is decided by the bodies of the arms' designs."""
+    stated = scenes[0].simulation.stiffening
+    bodies = [bodies_in(scenes[0], one, owned) for one in scenes]
+    estimate = max(map(_change, scenes, bodies))
+    if stated != "auto":
+        return Stiffening(estimate, stated)
+    if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
+        return Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE)
+    neglected = _neglected(scenes, bodies)
+    if neglected is None:
+        return Stiffening(estimate, estimate >= STIFFENING_UNKNOWN_CHANGE)
+    return Stiffening(estimate, neglected > NEGLECTED_DEVIATION_SHARE, neglected)
 
 
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
