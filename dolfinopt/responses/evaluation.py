@@ -15,7 +15,7 @@ import numpy as np
 from dolfinopt.arms.arm import chain_of, stiffening_of
 from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.simulation import simulate, simulate_all
+from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.loads import Stiffening
@@ -429,13 +429,12 @@ def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> fl
     """Return what share of the largest deviation linear bodies miss; None if one cannot move."""
     # Simulated beside the run: the comparison is none of its simulations.
     profile = Profile()
-    linear = [[linear_part(body) for body in chain] for chain in bodies]
     largest = 0.0
-    pairs = zip(
-        simulate_all(group, bodies, profile), simulate_all(group, linear, profile), strict=True
-    )
-    for stiffened, without in pairs:
-        if isinstance(stiffened, ConvergenceError) or isinstance(without, ConvergenceError):
+    for scene, chain in zip(group, bodies, strict=True):
+        try:
+            stiffened = simulate(scene, chain, profile)
+            without = simulate(scene, [linear_part(body) for body in chain], profile)
+        except ConvergenceError:
             return None
         moved, other = _displacements(stiffened), _displacements(without.at(stiffened.t))
         size = np.linalg.norm(moved, axis=-1).max(initial=0.0)

@@ -24,7 +24,6 @@ from dolfinopt.responses.measured import (
     CHUNK_INSTANTS,
     CHUNK_POINTS,
     COARSE_INSTANTS,
-    MAP_ERROR_SHARE,
     NEGLIGIBLE_COLUMNS_SHARE,
     NEGLIGIBLE_DIRECTION_SHARE,
     NEGLIGIBLE_POWER_SHARE,
@@ -662,33 +661,18 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
 
 
 def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`).
-
-    Right to `MAP_ERROR_SHARE` times the largest of all; of instants no more are looked at than that
-    takes.
-    """
+    """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`)."""
     few, count = _condense(comm, A, a), A.shape[1]
-    instants = every(len(a))
-    enough = MAP_ERROR_SHARE * float(few.lengths(comm, instants).max(initial=0.0))
-    while True:
-        apart = few.apart(instants)
-        crowded = np.unique(np.searchsorted(instants, np.flatnonzero(apart > enough)))
-        halves = (instants[crowded - 1] + instants[crowded]) // 2
-        wider = np.union1d(instants, halves)
-        if len(wider) == len(instants):
-            break
-        instants = wider
-    by_point, when = np.full(count, -1.0), np.zeros(count, dtype=int)
-    for first in range(0, len(instants), CHUNK_INSTANTS):
-        part = instants[first : first + CHUNK_INSTANTS]
+    squares, when = np.full(count, -1.0), np.zeros(count, dtype=int)
+    for part in _runs(len(a)):
         for start in range(0, count, CHUNK_POINTS):
             here = slice(start, start + CHUNK_POINTS)
-            squares = _squares(few.B[:, here], few.y[part])
-            worst = squares.argmax(axis=1)
-            values = squares[np.arange(len(worst)), worst]
-            larger = values > by_point[here]
-            by_point[here][larger], when[here][larger] = values[larger], part[worst[larger]]
-    return np.sqrt(np.maximum(by_point, 0.0)), when
+            found = _squares(few.B[:, here], few.y[part])
+            worst = found.argmax(axis=1)
+            values = found[np.arange(len(worst)), worst]
+            larger = values > squares[here]
+            squares[here][larger], when[here][larger] = values[larger], part.start + worst[larger]
+    return np.sqrt(np.maximum(squares, 0.0)), when
 
 
 def every(count: int, most: int = COARSE_INSTANTS) -> np.ndarray:
@@ -770,8 +754,7 @@ def _norms(comm: MPI.Comm, A: np.ndarray) -> np.ndarray:
 def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return max_e |A_e a_n| (n,) (collective)."""
     out = np.zeros(len(a))
-    for first in range(0, len(a), CHUNK_INSTANTS):
-        part = slice(first, first + CHUNK_INSTANTS)
+    for part in _runs(len(a)):
         for start in range(0, A.shape[1], CHUNK_POINTS):
             squares = _squares(A[:, start : start + CHUNK_POINTS], a[part])
             np.maximum(out[part], squares.max(axis=0), out=out[part])
