@@ -263,12 +263,12 @@ def test_light_payload_pays_for_frozen_loads():
 @pytest.mark.serial
 def test_the_exact_gradient_takes_over_where_frozen_loads_gain_no_more():
     """As soon as the best design gained at most 1 % in ten iterations; the better one stays."""
-    result = do.optimize(quick(LIGHT, "objective.gradient=exact", iterations=60))
+    result = do.optimize(quick(LIGHT, "objective.gradient=exact", iterations=36))
     k = result.exact_from
     best = np.minimum.accumulate([row.objective for row in result.history])
     gains = best[:-10] / best[10:] - 1.0
     assert k == 10 + int(np.argmax(gains <= 0.01)) < result.iterations
-    frozen = do.optimize(quick(LIGHT, iterations=60))
+    frozen = do.optimize(quick(LIGHT, iterations=36))
     assert [row.objective for row in result.history[: k + 1]] == [
         row.objective for row in frozen.history[: k + 1]
     ]
