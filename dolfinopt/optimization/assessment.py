@@ -18,7 +18,7 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, CRISP_NEWTON_ITERATIONS
+from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, NEWTON_ITERATIONS
 from dolfinopt.parallel import together
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import Evaluation, evaluate
@@ -106,7 +106,7 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
         return None
     cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
     steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
-    with suppress(ConvergenceError), counted(CRISP_NEWTON_ITERATIONS * steps):
+    with suppress(ConvergenceError), counted(NEWTON_ITERATIONS * steps):
         return evaluator.evaluate_densities(cut, simulated=True)
     return None
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.measured import AT_BOUND_SHARE
+from dolfinopt.optimization.measured import ROOM_SHARE
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
 from dolfinopt.optimization.residual import kkt_residual
 from dolfinopt.parallel import on_root
@@ -88,7 +88,7 @@ def judge(
     angle = ratio = np.nan
     if frozen is not None:
         width = xmax - xmin
-        scale = width * (np.minimum(x - xmin, xmax - x) > AT_BOUND_SHARE * width)
+        scale = width * (np.minimum(x - xmin, xmax - x) > ROOM_SHARE * width)
         angle, ratio = compared(exact.df0dx * scale, frozen * scale)
     return Certificate(residual, angle, ratio, violated=violated(exact.limits))
 

@@ -14,7 +14,6 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.certificate import compared
 from dolfinopt.optimization.measured import (
-    FORCE_ROUNDING,
     INSIDE_MARGIN,
     OBJECTIVE_ROUNDING,
     PASSING_RATE,
@@ -112,8 +111,6 @@ def taylor_test(
             frozen = slope_of(_with(scene, gradient="esl"))
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    of_forces = "effort_weights" in scene.objective.response.options
-    share = FORCE_ROUNDING if of_forces else OBJECTIVE_ROUNDING
     value = _fixed_objective(exact, variables, arms, patterns, profile, base)
     here = value(inside)
     rows = []
@@ -121,7 +118,7 @@ def taylor_test(
         d = variables.join(parts)
         along = float(slope @ d)
         remainders = tuple(abs(value(inside + h * d) - here - h * along) for h in STEPS)
-        rate = _rate(remainders, share * abs(here))
+        rate = _rate(remainders, OBJECTIVE_ROUNDING * abs(here))
         beside = np.nan if frozen is None else float(frozen @ d)
         rows.append(TaylorRow(name, along, beside, remainders, rate))
     angle, ratio = (np.nan, np.nan) if frozen is None else compared(slope, frozen)

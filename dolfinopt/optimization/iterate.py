@@ -14,12 +14,11 @@ from dolfinopt.optimization.measured import (
     LEAP_FACTOR,
     LEAST_REACH,
     MERIT_RISE,
+    NEWTON_ITERATIONS,
     REACH_GROWTH,
-    RETURNED_REACH,
     SHORTER_REACH,
     SHORTER_STEP,
     STEP_ATTEMPTS,
-    STEP_NEWTON_ITERATIONS,
 )
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
@@ -100,7 +99,7 @@ class Iterate:
             return False
         self.return_to_best()
         self.returned_to = self.best.iteration
-        self.state, self.reach = initial_state(self.x), RETURNED_REACH
+        self.state, self.reach = initial_state(self.x), SHORTER_STEP
         self.progress, self.stuck = self.progress.anew(), ""
         return True
 
@@ -183,7 +182,7 @@ class Iterate:
         self.change = float(np.abs(new - self.x).max())
         steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
         try:
-            with counted(STEP_NEWTON_ITERATIONS * steps if steps else np.inf):
+            with counted(NEWTON_ITERATIONS * steps if steps else np.inf):
                 designs = self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.stuck = str(error)

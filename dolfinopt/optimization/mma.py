@@ -27,16 +27,14 @@ from dolfinopt.optimization.measured import (
     ACTIVE_MULTIPLIER,
     BLOCK_ENTRIES,
     COMPLEMENTARITY_REST,
+    DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
-    DUAL_REGULARISATION,
     DUAL_ROUNDING,
     FIRST_ASYMPTOTE_DISTANCE,
     FIRST_DUAL_RADIUS,
     FLAT_GRADIENT_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
-    LARGEST_DUAL_RADIUS,
     LEAST_ASYMPTOTE_DISTANCE,
-    LEAST_DUAL_STEP,
     MULTIPLIER_FLOOR,
     PENALTY_LIMIT,
     REST_MOVE_SHARE,
@@ -270,7 +268,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     evaluations, kinked = 1, False
     while multipliers.size and evaluations < DUAL_EVALUATIONS:
         z = _newton_step(point, radius, dual.penalty)
-        if np.abs(z).max() <= LEAST_DUAL_STEP:
+        if np.abs(z).max() <= DUAL_ROUNDING:
             break
         trial = dual.at(_stepped(point.multipliers, z, dual.penalty))
         evaluations += 1
@@ -285,7 +283,6 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
                 trial = replace(trial, curvature=mean_curvature)
             point = trial
             radius = np.where(rise_there >= 0.0, np.maximum(radius, 4.0 * np.abs(z)), radius)
-            radius = np.minimum(radius, LARGEST_DUAL_RADIUS)
         else:
             # The multipliers that turned the derivative go less far. What was met on the way enters
             # the curvature: on a ridge between two kinks either side alone points off the ridge.
@@ -347,9 +344,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     m = gradient.size
     # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
     # is flat; the relative part is for equivalent constraints.
-    diagonal = (
-        DUAL_REGULARISATION * np.diag(curvature) + FLAT_GRADIENT_SHARE * np.abs(gradient) + _TINY
-    )
+    diagonal = DEPENDENT_SHARE * np.diag(curvature) + FLAT_GRADIENT_SHARE * np.abs(gradient) + _TINY
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)
     fixed = ((lower == 0.0) & (gradient <= 0.0)) | ((upper == 0.0) & (gradient >= 0.0))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.optimization.measured import (
-    DEPENDENT_EIGENVALUE_SHARE,
+    DEPENDENT_SHARE,
     FREE_SET_ROUNDS,
     ROOM_SHARE,
     TRIAL_STEP_SHARE,
@@ -117,7 +117,7 @@ def _multipliers(
     scale[scale == 0.0] = 1.0
     # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > DEPENDENT_EIGENVALUE_SHARE * values[-1]
+    kept = values > DEPENDENT_SHARE * values[-1]
     if not kept.any():
         return np.zeros(m)
     root = np.sqrt(values[kept])
