@@ -239,7 +239,6 @@ PLACES = [
     (choosing, 0, coordinates, "_largest"),
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes
-    (optimising, LONE, arm.Arm, "preserving_threshold"),
     (optimising, 0, run_folder, "HistoryWriter"),
     (optimising, 0, design.HistoryWriter, "append", 1),
     (optimising, 0, checkpoint, "write_arrays", 0),

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
@@ -458,7 +457,7 @@ def averages_of(mesh: ArmMesh, arm: Arm) -> list[AxisSymmetry | Extrusion]:
 # -- Heaviside projection of filtered designs: crisp at a threshold, with its exact derivative -
 
 
-MIDDLE_THRESHOLD = 0.5  # threshold where none is better than another
+MIDDLE_THRESHOLD = 0.5  # of the nominal design
 
 
 @dataclass(frozen=True, eq=False)
@@ -511,28 +510,3 @@ def robust_thresholds(erosion: float, dilation: float) -> tuple[float, float, fl
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
     """
     return MIDDLE_THRESHOLD + erosion, MIDDLE_THRESHOLD, MIDDLE_THRESHOLD - dilation
-
-
-def preserving_threshold(x: np.ndarray, area: np.ndarray, beta: float, comm: MPI.Comm) -> float:
-    """Return eta with sum area y = sum area x over all ranks (collective, equal on all).
-
-    y falls with eta in every cell, from at least x at eta = 0 to at most x at eta = 1: there is
-    one root, unless all cells are 0 or 1, which any threshold keeps; then it is 1/2.
-    Source: Xu, Cai & Cheng (2010), doi:10.1007/s00158-009-0452-7.
-
-    Args:
-        x: (n_cells,) in [0, 1], of this rank.
-        area: (n_cells,) m2; cells of area 0 do not count.
-        beta: sharpness >= 0.
-        comm: the ranks that share the design.
-    """
-
-    def gain(eta: float) -> float:
-        return float(comm.allreduce(area @ (project(x, beta, eta).value - x)))
-
-    if beta == 0.0 or not gain(0.0) > 0.0 > gain(1.0):
-        return MIDDLE_THRESHOLD
-    from scipy.optimize import brentq  # takes as long to import as NumPy
-
-    # As exact as eta can be: the volume is then right to about beta times its rounding.
-    return float(brentq(gain, 0.0, 1.0, xtol=1e-16, rtol=4.0 * np.finfo(float).eps))

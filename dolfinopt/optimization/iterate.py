@@ -122,7 +122,7 @@ class Iterate:
     def _restore_best(self) -> None:
         if self.best.iteration >= 0:
             self.x = self.best.x.copy()
-            self.projection.restore((self.best.beta, self.best.thresholds))
+            self.projection.beta = self.best.beta
 
     def _set(self, designs: list[EvaluatedDesign]) -> None:
         self.designs = designs
@@ -136,7 +136,7 @@ class Iterate:
         new = Best(
             self.x.copy(),
             self.iteration,
-            *self.projection.state,
+            self.projection.beta,
             float(self.problem.values[0]),
             self.problem.excess,
             crisp=projected and self._volumes()[2] <= GREY_SHARE,
@@ -155,13 +155,13 @@ class Iterate:
         as long as the projection becomes steeper.
         """
         size = abs(self.problem.f0) or 1.0
-        merit, before, start = self.problem.merit(size), self.projection.state, self.evaluator.start
+        merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
         rises = self.projection.rises(self.problem.excess)
         for attempt in range(STEP_ATTEMPTS):
             shorter = SHORTER_STEP**attempt
             new, after = self._proposed(shorter * self.reach * self.projection.move)
             if rises:
-                self.projection.advance(self.variables.split(new))
+                self.projection.advance()
             designs = self._tried(new)
             if designs is not None:
                 self._go_on(new, after, designs, rises)
@@ -170,7 +170,7 @@ class Iterate:
                 factor = shorter * (SHORTER_REACH if rose else growth)
                 self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
                 return
-            self.projection.restore(before)
+            self.projection.beta = before
             rises = False  # the shorter step is one of the same projection
         self.evaluator.restart(start)
         self.evaluate_again()
@@ -279,7 +279,6 @@ class Iterate:
             progress=self.progress,
             solutions=self.evaluator.initial_solutions,
             beta=self.projection.beta,
-            thresholds=self.projection.thresholds,
         )
 
     def restore(self, memory: IterateMemory) -> None:
@@ -294,7 +293,7 @@ class Iterate:
             arm.initial_vectors = memory.modes[k]
         self.iteration, self.change, self.reach = memory.iteration, memory.change, memory.reach
         self.returned_to = memory.returned_to
-        self.projection.restore((memory.beta, memory.thresholds))
+        self.projection.beta = memory.beta
 
 
 def leaps(before: np.ndarray, after: np.ndarray) -> bool:

@@ -362,9 +362,9 @@ def test_problems_are_scenes(name):
 
 @pytest.mark.slow
 def test_problems_are_solved_beside_members_drawn_by_hand():
-    """A bar at its limit of the stress is of steel, 6.90 mm high, 0.130 kg."""
+    """A bar at its limit of the stress is 6.9 mm high, 0.130 kg; cells that it cuts weigh more."""
     (hand,) = iterations.drawn_by_hand(iterations.ROD, "bar")
-    assert -0.05 < hand[6] < 1e-3 and hand[5] == pytest.approx(0.130, rel=0.05)
+    assert -0.05 < hand[6] < 1e-3 and 0.130 < hand[5] < 0.16
     (row,) = iterations.optimised("frozen loads", "half", 2)
     frame = iterations.OPTIMISER.frame([hand, row])
     assert frame["iterations"].tolist() == [0, 2] and frame["largest excess [-]"].max() < 1e-3

@@ -153,7 +153,7 @@ def test_gradient_by_the_variables_through_a_projection(kind: str, designs: int)
     x, d, arms = built.fields(wave), built.fields(uneven), built.arms
 
     def realised(h: float, variant: int):
-        moved = {k: arm.physical_designs(x[k] + h * d[k], 4.0, 0.45) for k, arm in arms.items()}
+        moved = {k: arm.physical_designs(x[k] + h * d[k], 4.0) for k, arm in arms.items()}
         return {k: found[variant] for k, found in moved.items()}
 
     values = []
