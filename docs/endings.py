@@ -22,7 +22,7 @@ from dolfinopt.bench.measure import mpirun
 DEMOS = Path(__file__).parent.parent / "demos"
 COARSE = {
     "two_arm.toml": ["arms.cells=[100,6]", "design.filter_radius=0.02"],
-    "lightest_two_arm.toml": ["arms.cells=[100,6]", "design.filter_radius=0.02"],
+    "lightest_two_arm.toml": ["arms.cells=[150,9]", "design.filter_radius=0.0135"],
     "scara.toml": ["arms.mesh_size=0.01", "design.filter_radius=0.02"],
     "spatial_arm.toml": ["arms.cells=[30,4,3]", "design.filter_radius=0.03"],
 }
