@@ -168,7 +168,9 @@ class Iterate:
                 rose = self.problem.merit(size) > merit + MERIT_RISE
                 growth = 1.0 if rises else REACH_GROWTH
                 factor = shorter * (SHORTER_REACH if rose else growth)
-                self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
+                # A sharp projection leaps however short the step: without a least one it settles.
+                sharp = self.scene.design.projection and self.projection.complete
+                self.reach = min(1.0, max(0.0 if sharp else LEAST_REACH, factor * self.reach))
                 return
             self.projection.beta = before
             rises = False  # the shorter step is one of the same projection
