@@ -236,7 +236,7 @@ PLACES = [
     (choosing, LONE, arm.Arm, "set_design"),
     (choosing, LONE, reductions, "shape_integrals"),
     (choosing, LONE, reductions, "_leading"),
-    (choosing, 0, coordinates, "_largest"),
+    (choosing, 0, coordinates, "_distance"),
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes
     (optimising, 0, run_folder, "HistoryWriter"),

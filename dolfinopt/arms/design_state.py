@@ -254,6 +254,16 @@ class DesignState:
             return shape_integrals(self.elastic, basis, damping, loads)
 
     @cached_property
+    def static_body(self) -> ShapeIntegrals:
+        """The body in the static modes of its interfaces, which need no eigenproblem."""
+        elastic, static = self.elastic, self.elastic.constraint_modes()
+        none = np.empty((len(static.interior), 0))
+        weighted = elastic.mass_times(static.field)
+        basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)
+        loads = self.unit_loads.with_modes(static.field, weighted)
+        return shape_integrals(elastic, basis, self.scene.damping.stiffness_proportional, loads)
+
+    @cached_property
     def unit_loads(self) -> UnitLoads:
         """The static fields of unit accelerations, forces and moment, see there."""
         return unit_loads(self.elastic)
@@ -316,11 +326,13 @@ class DesignState:
         )
         if self.scene.objective == scene.objective:
             other._loaded = dict(self._loaded)
+        shared = ["unit_loads"]
+        if self.scene.damping == scene.damping:
+            shared += ["static_body"]
         if self.num_modes == num_modes and same_basis(self.scene, scene):
             same = self.scene.damping == scene.damping and self.stiffened == stiffened
-            for name in ("basis", "body") if same else ("basis",):
-                if name in self.__dict__:
-                    other.__dict__[name] = self.__dict__[name]
+            shared += ["basis", "body"] if same else ["basis"]
+        other.__dict__.update({name: x for name, x in self.__dict__.items() if name in shared})
         return other
 
 

@@ -19,10 +19,9 @@ from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, shape_integrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import Basis
 from dolfinopt.responses.measured import (
     NEGLECTED_DEVIATION_SHARE,
     STIFFENING_INSTANTS,
@@ -383,25 +382,10 @@ def _stiffening(
     if stated != "auto" and not scenes[0].estimates_stiffening:
         return Stiffening(None, stated is True)
     with together(partition.world):
-        mine = {k: _static_body(arm, simulated=stated == "auto") for k, arm in arms.items()}
+        mine = {k: arm.current.static_body for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
     found: Stiffening = on_root(partition.world, _decided, scenes, owned)
     return found
-
-
-def _static_body(arm: Arm, simulated: bool) -> ShapeIntegrals:
-    """Return the body in the static modes of its outboard interface: they need no eigenproblem."""
-    # What the inertia of the modes stiffens is not needed for the estimate alone.
-    state = arm.current
-    elastic, static = state.elastic, state.elastic.constraint_modes()
-    none = np.empty((len(static.interior), 0))
-    weighted = elastic.mass_times(static.field)
-    basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)
-    damping = state.scene.damping.stiffness_proportional
-    loads = state.unit_loads
-    if simulated:
-        loads = loads.with_modes(static.field, weighted)
-    return shape_integrals(elastic, basis, damping, loads)
 
 
 def _decided(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> Stiffening:

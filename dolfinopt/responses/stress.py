@@ -24,6 +24,7 @@ from dolfinopt.responses.measured import (
     CHUNK_INSTANTS,
     CHUNK_POINTS,
     COARSE_INSTANTS,
+    MAP_ERROR_SHARE,
     NEGLIGIBLE_COLUMNS_SHARE,
     NEGLIGIBLE_DIRECTION_SHARE,
     NEGLIGIBLE_POWER_SHARE,
@@ -646,18 +647,33 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
 
 
 def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`)."""
+    """Return max_n |A_e a_n| (n_points,) of every point, and its n (collective on `comm`).
+
+    Right to `MAP_ERROR_SHARE` times the largest of all; of instants no more are looked at than that
+    takes.
+    """
     few, count = _condense(comm, A, a), A.shape[1]
-    squares, when = np.full(count, -1.0), np.zeros(count, dtype=int)
-    for part in _runs(len(a)):
+    instants = every(len(a))
+    enough = MAP_ERROR_SHARE * float(few.lengths(comm, instants).max(initial=0.0))
+    while True:
+        apart = few.apart(instants)
+        crowded = np.unique(np.searchsorted(instants, np.flatnonzero(apart > enough)))
+        halves = (instants[crowded - 1] + instants[crowded]) // 2
+        wider = np.union1d(instants, halves)
+        if len(wider) == len(instants):
+            break
+        instants = wider
+    by_point, when = np.full(count, -1.0), np.zeros(count, dtype=int)
+    for run in _runs(len(instants)):
+        part = instants[run]
         for start in range(0, count, CHUNK_POINTS):
             here = slice(start, start + CHUNK_POINTS)
-            found = _squares(few.B[:, here], few.y[part])
-            worst = found.argmax(axis=1)
-            values = found[np.arange(len(worst)), worst]
-            larger = values > squares[here]
-            squares[here][larger], when[here][larger] = values[larger], part.start + worst[larger]
-    return np.sqrt(np.maximum(squares, 0.0)), when
+            squares = _squares(few.B[:, here], few.y[part])
+            worst = squares.argmax(axis=1)
+            values = squares[np.arange(len(worst)), worst]
+            larger = values > by_point[here]
+            by_point[here][larger], when[here][larger] = values[larger], part[worst[larger]]
+    return np.sqrt(np.maximum(by_point, 0.0)), when
 
 
 def every(count: int, most: int = COARSE_INSTANTS) -> np.ndarray:
