@@ -179,7 +179,7 @@ def orthonormalise(
         return Expansion(Q, Q, by_V, kept)
     for _ in range(ORTHONORMAL_ROUNDS_LIMIT):
         # Differences of nearly equal fields have lost the rigid motion of the interface.
-        Q = arm.expand(_interior(arm, Q), arm.coordinates(Q))
+        Q = arm.expand(interior_rows(arm, Q), arm.coordinates(Q))
         h = dot(arm, MV, Q)
         Q, again, still = _qr(arm, Q - combine(V, h), np.full(len(kept), ROUNDING_LENGTH_SHARE))
         by_V, R, kept = by_V + h @ R, again @ R, kept[still]
@@ -293,7 +293,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     none = np.empty((*V.shape[:2], 0))
     V = orthonormalise(arm, combine(V, y), none, none).Q
     outboard = arm.coordinates(V)
-    V = arm.expand(_interior(arm, V), outboard)
+    V = arm.expand(interior_rows(arm, V), outboard)
     MV = arm.mass_times(V)
     sign = orient(arm, V, MV)
     stiffness = np.diag(np.diag(arm.energy_matrix(V)))
@@ -301,7 +301,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     return Basis(V * sign, MV * sign, stiffness, outboard * sign, start)
 
 
-def _interior(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
+def interior_rows(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
     """Return the owned interior rows (num_interior, k) of nodal fields."""
     return field[arm.interior_nodes].reshape(arm.num_interior, field.shape[2])
 

@@ -22,6 +22,7 @@ from dolfinopt.reduction.basis import (
     frame_fields,
     frame_loads,
     interface_loads,
+    interior_rows,
     orient,
     orthonormalise,
     ritz,
@@ -192,7 +193,7 @@ def krylov_adjoint(
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
-    inner = arm.comm.allreduce(basis.V[arm.interior_nodes].reshape(interior.shape).T @ interior)
+    inner = arm.comm.allreduce(interior_rows(arm, basis.V).T @ interior)
     inner += basis.outboard.T @ outboard
     weighted = arm.restrict(basis.MV)
     interior = (interior - weighted[0] @ inner) @ turn.T
