@@ -12,15 +12,12 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import Columns, ElasticArm, Rows
-from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
     EIGENVALUE_GAP,
     EXACT_TOLERANCE,
-    GUARD_VECTORS,
     ITERATIONS_LIMIT,
     LOST_MODE_SHARE,
     RAMP_SHARE,
-    ROUNDING_SHARE,
     VECTOR_TOLERANCE,
     WARM_STEPS,
 )
@@ -88,9 +85,14 @@ class Pencil:
             outboard += self.carried @ self.split(V)[1]
         return self.joined(interior, outboard)
 
+    @property
+    def tolerance(self) -> float:
+        """Relative residual of solutions and eigenpairs: nearly all digits, where a factor is."""
+        return VECTOR_TOLERANCE if self.arm.is_iterative else EXACT_TOLERANCE
+
     def inverse(self, R: np.ndarray) -> np.ndarray:
-        """Return (T'KT)^-1 R, to nearly all digits."""
-        return self._inverse(lambda F: self.arm.solve(F, EXACT_TOLERANCE), R)
+        """Return (T'KT)^-1 R, to the tolerance."""
+        return self._inverse(lambda F: self.arm.solve(F, self.tolerance), R)
 
     def precondition(self, R: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 R, or an approximation of it where solutions are iterative."""
@@ -176,8 +178,8 @@ def complement_solve(
 def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> Pairs:
     """Return the `count` smallest eigenvalues of K phi = lambda M phi and their vectors.
 
-    With a factor at hand from the modes of a nearby problem by `modes_from`, otherwise or where
-    that gives up by SLEPc's Krylov-Schur on K^-1 M; where solutions are iterative by `lobpcg`.
+    From the modes of a nearby problem by `modes_from`; without these, or where that gives up, or
+    with options of the user, by SLEPc's Krylov-Schur on K^-1 M.
 
     Args:
         pencil: K and M, symmetric positive definite.
@@ -193,11 +195,8 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
     arm = pencil.arm
     with arm.profile.phase("eigenproblem"):
         pairs = None
-        if not user_options(OPTIONS):
-            if arm.is_iterative:
-                pairs = lobpcg(pencil, count, start, VECTOR_TOLERANCE)
-            elif start is not None and start.shape[1] > 0:
-                pairs = modes_from(pencil, count, start)
+        if start is not None and start.shape[1] > 0 and not user_options(OPTIONS):
+            pairs = modes_from(pencil, count, start)
         if pairs is None:
             pairs = _from_cold(pencil, count)
     arm.profile.counts.eigenproblems += 1
@@ -212,7 +211,7 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
 def _from_cold(pencil: Pencil, count: int) -> Pairs:
     """Return up to `count` pairs by SLEPc, see `lowest_eigenpairs`."""
     with closing(_Search(pencil, pencil.mass)) as search:
-        found = search.largest(count, _ramp(pencil), EXACT_TOLERANCE)
+        found = search.largest(count, _ramp(pencil), pencil.tolerance)
         if len(found[0]) == count:  # nothing tells from cold how many modes have one frequency
             found = search.without_gaps(*found)
     inverse, vectors = found
@@ -289,7 +288,7 @@ def _noise(pencil: Pencil, count: int) -> np.ndarray:
     return np.modf(np.abs(waves) * 43758.5453)[0] - 0.5
 
 
-# -- with a factor, from the modes of a nearby problem -------------------------------------------
+# -- from the modes of a nearby problem ----------------------------------------------------------
 
 
 def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
@@ -318,7 +317,7 @@ def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
         if m >= count:
             theta, y = np.linalg.eigh(T[:m, :m], UPLO="U")
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
-            if (length * np.abs(y[-1]) <= EXACT_TOLERANCE * theta).all():
+            if (length * np.abs(y[-1]) <= pencil.tolerance * theta).all():
                 pairs = 1.0 / theta, (y.T @ Q[:m]).T
                 close = np.diff(pairs[0]) <= EIGENVALUE_GAP * pairs[0][1:]
                 return None if close.any() or _passes_over(pencil, pairs, start) else pairs
@@ -354,72 +353,6 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
     inverse = pencil.total(np.einsum("nk,nk->k", forces, pencil.inverse(forces)))
     # Not a number included.
     return not bool((inverse * values[-1] <= (1.0 + EIGENVALUE_GAP) * left[new]).all())
-
-
-# -- without a factor: locally optimal block conjugate gradients ---------------------------------
-#
-# Source: Knyazev, SIAM J. Sci. Comput. 23 (2001) 517-541, doi:10.1137/S1064827500366124; bases made
-# orthonormal as in Hetmaniuk & Lehoucq, J. Comput. Phys. 218 (2006) 324-332,
-# doi:10.1016/j.jcp.2006.02.007.
-
-
-def lobpcg(pencil: Pencil, count: int, start: np.ndarray | None, tolerance: float) -> Pairs | None:
-    """Return the lowest eigenvalues (count,) and M-orthonormal vectors; None if that fails.
-
-    A pair is found once its residual, in the norm of the preconditioner, is below the tolerance
-    times the square root of its eigenvalue: about the error of the vector in energy.
-
-    Args:
-        pencil: K and M.
-        count: number of eigenpairs.
-        start: (rows, k) vectors of a nearby problem, or None.
-        tolerance: relative.
-    """
-    m = count + GUARD_VECTORS
-    known = np.empty((pencil.rows, 0)) if start is None else start[:, :m]
-    noise = _noise(pencil, m - known.shape[1])
-    S = _products(pencil, np.hstack([known, pencil.precondition(pencil.precondition(noise))]))
-    P = [np.empty((pencil.rows, 0))] * 3
-    for _ in range(ITERATIONS_LIMIT):
-        C, values = _ritz(pencil, S)
-        C, values = C[:, :m], values[:m]
-        # The next directions: what the new vectors have of the last residuals and directions.
-        P = [part[:, m:] @ C[m:] for part in S]
-        X, KX, MX = _products(pencil, S[0] @ C)  # combined ones drift by rounding
-        R = KX - MX * values
-        W = pencil.precondition(R)
-        size = pencil.total(np.einsum("nk,nk->k", R, W))
-        if not np.isfinite(size).all():
-            return None
-        if (np.sqrt(np.maximum(size, 0.0)) <= tolerance * np.sqrt(values))[:count].all():
-            return values[:count], X[:, :count]
-        new = _products(pencil, W - X @ pencil.total(MX.T @ W))
-        S = [np.concatenate(parts, axis=1) for parts in zip((X, KX, MX), new, P, strict=True)]
-    return None
-
-
-def _products(pencil: Pencil, V: np.ndarray) -> list[np.ndarray]:
-    """Return V, K V, M V."""
-    return [V, pencil.stiffness(V), pencil.mass(V)]
-
-
-def _ritz(pencil: Pencil, space: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients of all Ritz vectors of S, given S, K S and M S, and their values."""
-    S, KS, MS = space
-    K, M = (pencil.total(S.T @ product) for product in (KS, MS))
-    K, M = 0.5 * (K + K.T), 0.5 * (M + M.T)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
-
-    def solved() -> tuple[np.ndarray, np.ndarray]:
-        lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
-        kept = lengths > ROUNDING_SHARE * lengths[-1]
-        T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
-        values, vectors = np.linalg.eigh(T.T @ K @ T)
-        return T @ vectors, values
-
-    # One rank decides how many vectors are independent, and when the search ends.
-    found: tuple[np.ndarray, np.ndarray] = on_root(pencil.arm.comm, solved)
-    return found
 
 
 # -- by SLEPc -----------------------------------------------------------------------------------
@@ -458,8 +391,8 @@ class _Search:
         # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
         # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
         # have, need more vectors, not more restarts.
-        spaces = ((max(count + 4, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100))
-        for space, restarts in spaces[0 if beside is None else 1 :]:
+        spaces = ((max(count + 4, 2 * count), 25), (4 * count + 100, 100))
+        for space, restarts in spaces:
             with self._solver(count, space, absolute) as eps:
                 eps.setTolerances(tolerance, restarts)
                 pairs = self._solved(eps, count, first, beside)
@@ -524,7 +457,7 @@ class _Search:
         for first in _noise(self.pencil, len(values)).T:
             if self.stiffness.getSize()[0] == len(values):
                 break  # all there are
-            more, vector = self.largest(1, first, EXACT_TOLERANCE, vectors)
+            more, vector = self.largest(1, first, self.pencil.tolerance, vectors)
             if len(more) == 0:
                 raise ConvergenceError(
                     f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "

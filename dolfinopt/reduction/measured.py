@@ -12,14 +12,13 @@ EXACT_TOLERANCE = 1e-12
 # Part of a length or energy, of the largest, below which what is left of a vector beside others is
 # rounding: that leaves 1e-16 of dependent ones, independent ones have 1e-2.
 ROUNDING_SHARE = 1e-12
-# Relative, in energy, of what needs fewer digits: modes without a factor and their adjoints, from
+# Relative, of what needs fewer digits: modes without a factor and the adjoints of modes, from
 # which gradients are right to it, more than an optimiser can use.
 VECTOR_TOLERANCE = 1e-8
-ITERATIONS_LIMIT = 500  # of conjugate gradients for modes and their adjoints
+ITERATIONS_LIMIT = 500  # of conjugate gradients for the adjoints of modes
 
 # -- eigenproblem --------------------------------------------------------------------------------
 
-GUARD_VECTORS = 3  # beyond those that are wanted: the last ones converge slowly
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 EIGENVALUE_GAP = 1e-6
