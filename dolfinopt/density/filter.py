@@ -26,7 +26,7 @@ from dolfinopt.density.measured import (
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
-from dolfinopt.mesh.checks import facet_areas, facet_corners
+from dolfinopt.mesh.checks import cell_centroids, facet_areas, facet_corners, facet_middles
 from dolfinopt.scene.load import Arm
 from dolfinopt.solver import conjugate_gradients, direct_solver, obeying_options
 
@@ -105,32 +105,23 @@ class _Sides:
     @property
     def skew(self) -> np.ndarray:
         """Offset (n, k) of the midpoint from the foot of the perpendicular, in side lengths."""
-        if self.arm.shape[2] == 3:
-            normal = np.einsum("nki,nki->nk", self.normal, self.arm)[..., None] * self.normal
-            return np.linalg.norm(self.arm - normal, axis=2) / np.sqrt(self.length)
-        tangential = self.arm[..., 0] * self.normal[..., 1] - self.arm[..., 1] * self.normal[..., 0]
-        return np.abs(tangential) / self.length
+        normal = np.einsum("nki,nki->nk", self.normal, self.arm)[..., None] * self.normal
+        size = self.length ** (1.0 / (self.arm.shape[2] - 1))
+        return np.linalg.norm(self.arm - normal, axis=2) / size
 
 
 def _sides(mesh: ArmMesh, open_edges: bool) -> _Sides:
     owned, ghosts = compat.local_cell_counts(mesh.mesh)
     facet = compat.cell_facets(mesh.mesh, owned + ghosts)
     corners = compat.cell_coordinates(mesh.mesh, owned)[:, :, : mesh.dim]
-    if mesh.dim == 3:
-        length, normal, arm = _faces(corners)
-        return _Sides(facet[:owned], length, normal, arm, mesh.area, _open(mesh, facet, open_edges))
-    if corners.shape[1] == 3:
-        ends, around = [(1, 2), (0, 2), (0, 1)], [0, 1, 2]
-    else:  # a tensor product
-        ends, around = [(0, 1), (0, 2), (1, 3), (2, 3)], [0, 1, 3, 2]
-    area, centroid = _area_and_centroid(corners[:, around])
-    a, b = (corners[:, [end[i] for end in ends]] for i in (0, 1))
-    along = b - a
-    length = np.linalg.norm(along, axis=2)
-    arm = 0.5 * (a + b) - centroid[:, None]
-    normal = np.stack([along[..., 1], -along[..., 0]], axis=2) / length[..., None]
-    normal *= np.where(np.einsum("nki,nki->nk", normal, arm) < 0.0, -1.0, 1.0)[..., None]
-    return _Sides(facet[:owned], length, normal, arm, area, _open(mesh, facet, open_edges))
+    facets = corners[:, np.array(facet_corners(mesh.dim, corners.shape[1]))]
+    flat = facets.reshape(-1, *facets.shape[2:])
+    vector = facet_areas(flat).reshape(facets.shape[0], facets.shape[1], -1)
+    arm = facet_middles(flat).reshape(vector.shape) - cell_centroids(corners)[:, None]
+    length = np.linalg.norm(vector, axis=2)
+    outward = np.where(np.einsum("nki,nki->nk", vector, arm) < 0.0, -1.0, 1.0)
+    normal = vector * (outward / length)[..., None]
+    return _Sides(facet[:owned], length, normal, arm, mesh.area, _open(mesh, facet, open_edges))
 
 
 def _open(mesh: ArmMesh, facet: np.ndarray, open_edges: bool) -> np.ndarray:
@@ -141,38 +132,6 @@ def _open(mesh: ArmMesh, facet: np.ndarray, open_edges: bool) -> np.ndarray:
     # Every neighbour of an owned cell is a ghost at least.
     count = np.bincount(facet.ravel())
     return (count[owned] == 1) & ~np.isin(owned, mesh.interface_facets)
-
-
-def _faces(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return area (n, k), normals and arms (n, k, 3) of cells in space, see `_Sides`."""
-    centroid = corners.mean(axis=1)
-    vectors, middles = [], []
-    for face in facet_corners(3, corners.shape[1]):
-        around = corners[:, list(face)]
-        vectors.append(facet_areas(around))
-        if len(face) == 3:
-            middles.append(around.mean(axis=1))
-            continue
-        # Two triangles on either side of a diagonal.
-        parts = around[:, [0, 1, 3]], around[:, [0, 2, 3]]
-        weight = [np.linalg.norm(facet_areas(part), axis=1)[:, None] for part in parts]
-        middle = sum(w * part.mean(axis=1) for w, part in zip(weight, parts, strict=True))
-        middles.append(middle / (weight[0] + weight[1]))
-    vector, arm = np.stack(vectors, axis=1), np.stack(middles, axis=1) - centroid[:, None]
-    area = np.linalg.norm(vector, axis=2)
-    outward = np.where(np.einsum("nki,nki->nk", vector, arm) < 0.0, -1.0, 1.0)
-    return area, vector * (outward / area)[..., None], arm
-
-
-def _area_and_centroid(polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return area (n,) and centroid (n, 2) of polygons (n, k, 2), corners in order."""
-    origin = polygon.mean(axis=1)
-    p = polygon - origin[:, None]
-    q = np.roll(p, -1, axis=1)
-    twice = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    total = twice.sum(axis=1)
-    moment = np.einsum("nk,nki->ni", twice, p + q) / 3.0
-    return 0.5 * np.abs(total), origin + moment / total[:, None]
 
 
 class _TwoPoint:

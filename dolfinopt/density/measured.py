@@ -38,6 +38,7 @@ COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above on
 # Samples along a cell of the mean area, and in all: a width is known to a sample.
 CELL_SAMPLES = 4
 SAMPLES_LIMIT = 1_000_000
+SIDE_ROUNDING_SHARE = 1e-9  # of a sample, by which a middle may lie outside its cell
 # A piece that hangs on the rest by one end is a corner up to this length, in widths, and a member
 # beyond. Two straight edges that meet at less than 23 degrees make the longest corners.
 CORNER_LENGTH_RATIO = 2.0

@@ -301,12 +301,9 @@ def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     first, second = cell[order[twice]], cell[order[twice + 1]]
     centroid = corners.mean(axis=1)
     distance = np.linalg.norm(centroid[first] - centroid[second], axis=1)
-    if dim == 3:
-        around = np.concatenate([nodes[:, side] for side in sides])[order[twice]]
-        area = np.linalg.norm(facet_areas(mesh.geometry.x[around]), axis=1)
-        return first, second, area, distance
-    a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
-    return first, second, np.linalg.norm(a - b, axis=1), distance
+    around = np.concatenate([nodes[:, side] for side in sides])[order[twice]]
+    area = np.linalg.norm(facet_areas(mesh.geometry.x[around][:, :, :dim]), axis=1)
+    return first, second, area, distance
 
 
 # -- solid arms that are boxes: grids of hexahedra -----------------------------------------------

@@ -342,19 +342,52 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
 
 def cell_sizes(corners: np.ndarray) -> np.ndarray:
     """Return areas or volumes (n,) of cells with corners (n, c, d) in DOLFINx's order."""
+    return _volumes(corners).sum(axis=1)
+
+
+def cell_centroids(corners: np.ndarray) -> np.ndarray:
+    """Return the centroids (n, d) of cells with corners (n, c, d), m."""
+    volumes = _volumes(corners)
+    moments = np.einsum("ep,pn,eni->ei", volumes, _tabulated(corners)[1][0], corners)
+    return moments / volumes.sum(axis=1, keepdims=True)
+
+
+def _volumes(corners: np.ndarray) -> np.ndarray:
+    """Return the parts (n, p) of the cells' volumes at points of a rule exact for centroids."""
+    weights, functions = _tabulated(corners)
+    J = np.einsum("eni,kpn->epik", corners, functions[1:])
+    return np.abs(np.linalg.det(J)) * weights
+
+
+def _tabulated(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (p,), and the corners' functions and their derivatives (1 + d, p, c)."""
     kind = KINDS[corners.shape[2], corners.shape[1]]
-    # Exact: the Jacobian of tensor products is of second degree in each direction.
-    points, weights = basix.make_quadrature(kind, 2 * (corners.shape[1] > corners.shape[2] + 1))
-    functions = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)
-    J = np.einsum("eni,kpn->epik", corners, functions[1:, :, :, 0])
-    return np.asarray(np.abs(np.linalg.det(J)) @ weights)
+    # The Jacobian of tensor products is of second degree in each direction.
+    points, weights = basix.make_quadrature(
+        kind, 3 if corners.shape[1] > corners.shape[2] + 1 else 1
+    )
+    element = basix.create_element(basix.ElementFamily.P, kind, 1)
+    return weights, element.tabulate(1, points)[..., 0]
 
 
 def facet_areas(corners: np.ndarray) -> np.ndarray:
-    """Return the area vectors (n, 3) of facets (n, 3 or 4, 3) of cells in space, of either sense.
+    """Return the area vectors (n, d) of facets (n, 2, 3 or 4, d) of cells, of either sense.
 
     Exact of bilinear quadrilaterals, whose corners are numbered as a tensor product.
     """
+    if corners.shape[1] == 2:
+        along = corners[:, 1] - corners[:, 0]
+        return np.stack([along[:, 1], -along[:, 0]], axis=1)
     if corners.shape[1] == 3:
         return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1])
+
+
+def facet_middles(corners: np.ndarray) -> np.ndarray:
+    """Return the centroids (n, d) of such facets, those of two triangles for a quadrilateral."""
+    if corners.shape[1] < 4:
+        return corners.mean(axis=1)
+    parts = corners[:, [0, 1, 3]], corners[:, [0, 2, 3]]
+    weight = [np.linalg.norm(facet_areas(part), axis=1)[:, None] for part in parts]
+    moments = weight[0] * parts[0].mean(axis=1) + weight[1] * parts[1].mean(axis=1)
+    return moments / (weight[0] + weight[1])
