@@ -12,8 +12,8 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import facet_corners
-from dolfinopt.mesh.geometry import check_place, read_groups, telling_where, where_of
+from dolfinopt.mesh.checks import check_place, facet_corners
+from dolfinopt.mesh.geometry import read_groups, telling_where, where_of
 from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
 from dolfinopt.mesh.measured import (
     CORNER_CELL_RATIO,
@@ -27,7 +27,7 @@ from dolfinopt.mesh.measured import (
     SECTION_LEAST_ALONG,
     SHORT_CELL_SHARE,
 )
-from dolfinopt.mesh.solid_cells import ENDS, TENSOR, elements_of
+from dolfinopt.mesh.solid_cells import ENDS, TENSOR, elements_of, points_by_tag
 
 if TYPE_CHECKING:
     from dolfinopt.scene.load import Arm
@@ -503,10 +503,8 @@ def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.nda
         InputError: one line that names file, arm and remedy.
     """
     with telling_where(where_of(arm)):
-        groups = read_groups(gmsh, arm)
-        tags, places, _ = gmsh.model.mesh.getNodes()
-        points = np.zeros((int(tags.max()) + 1, 3))
-        points[tags.astype(int)] = places.reshape(-1, 3)
+        groups = read_groups(gmsh, arm, [])
+        points = points_by_tag(gmsh)
         cells = elements_of(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
         ends = [points[np.unique(elements_of(gmsh, 2, groups[tag]))] for tag in ENDS]
         for name, at, x in zip(("inboard", "outboard"), ends, (0.0, arm.length), strict=True):

@@ -60,6 +60,22 @@ def further_of(arm: Arm) -> dict[str, int]:
     return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
 
 
+def group_named(name: str, *groups: int) -> int | None:
+    """Return which of `groups` a name in a file means: "Passive2" begins with passive."""
+    known = name.strip().casefold()
+    return next((group for group in groups if known.startswith(NAMES[group])), None)
+
+
+def interface_named(name: str, arm: Arm) -> int | None:
+    """Return the group of the arm's interface that a name in a file means."""
+    return further_of(arm).get(name.strip().casefold()) or group_named(name, *ENDS)
+
+
+def no_groups(arm: Arm) -> Entities:
+    """Return all groups of an arm without entities."""
+    return {tag: [] for tag in (*NAMES, *further_of(arm).values())}
+
+
 def interface_names(arm: Arm) -> dict[int, str]:
     """Return the names of all interfaces by their groups."""
     more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.interfaces)}
@@ -91,6 +107,14 @@ def elements_of(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
     return np.concatenate(rows)
 
 
+def points_by_tag(gmsh: Any) -> np.ndarray:
+    """Return the nodes (n, 3) of a model by their tags, zeros where there is none, m."""
+    tags, places, _ = gmsh.model.mesh.getNodes()
+    points = np.zeros((int(tags.max()) + 1, 3))
+    points[tags.astype(int)] = places.reshape(-1, 3)
+    return points
+
+
 @dataclass(frozen=True, eq=False)
 class SolidCells:
     """The cells of a solid mesh and the facets of its interfaces.
@@ -116,30 +140,26 @@ def boundary(cells: np.ndarray) -> np.ndarray:
 
 
 def into_model(gmsh: Any, mesh: SolidCells) -> Entities:
-    """Make cells and facets a model of Gmsh, in place of what it has; return its entities."""
+    """Make cells, facets and their points a model of Gmsh, in place of what it has."""
     gmsh.clear()
     model = gmsh.model
-    found: Entities = {group: [] for group in NAMES}
     model.add("solid")
-    numbered = False
-    kinds = {
-        3: {4: TETRAHEDRON, 8: HEXAHEDRON},
-        2: {3: TRIANGLE, 4: QUADRILATERAL},
-    }
+    used = np.unique(np.concatenate([rows.ravel() for rows in mesh.cells.values()]))
+    number = np.zeros(len(mesh.points), dtype=int)
+    number[used] = np.arange(1, len(used) + 1)
+    found: Entities = {group: [] for group in NAMES}
+    kinds = {3: {4: TETRAHEDRON, 8: HEXAHEDRON}, 2: {3: TRIANGLE, 4: QUADRILATERAL}}
     for dim, groups in ((3, mesh.cells), (2, mesh.facets)):
         for group, rows in groups.items():
             found[group] = []
-            if not len(rows):
-                continue
-            entity = model.addDiscreteEntity(dim)
-            if not numbered:
-                model.mesh.addNodes(
-                    dim, entity, np.arange(1, len(mesh.points) + 1), mesh.points.ravel()
-                )
-                numbered = True
-            kind = kinds[dim][rows.shape[1]]
-            model.mesh.addElementsByType(entity, kind, [], rows.ravel() + 1)
-            found[group] = [entity]
+            if len(rows):
+                entity = model.addDiscreteEntity(dim)
+                if len(used):  # the first one has them all
+                    model.mesh.addNodes(dim, entity, number[used], mesh.points[used].ravel())
+                    used = used[:0]
+                kind = kinds[dim][rows.shape[1]]
+                model.mesh.addElementsByType(entity, kind, [], number[rows].ravel())
+                found[group] = [entity]
     return found
 
 
@@ -152,18 +172,13 @@ def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
     bores = bores_of(arm)
     if not bores and arm.mesh_scale == 1.0:
         return groups
-    tags, places, _ = gmsh.model.mesh.getNodes()
-    number = np.zeros(int(tags.max()) + 1, dtype=int)
-    number[tags.astype(int)] = np.arange(len(tags))
-    points = arm.mesh_scale * places.reshape(-1, 3)
-    cells = {
-        group: number[elements_of(gmsh, 3, groups[group])] for group in REGIONS if groups[group]
-    }
+    points = arm.mesh_scale * points_by_tag(gmsh)
+    cells = {group: elements_of(gmsh, 3, groups[group]) for group in REGIONS if groups[group]}
     widths = {rows.shape[1] for rows in cells.values()}
     if len(widths) != 1 or not widths <= set(SIDES):
         return groups  # told by its kinds of cells
     facets = {
-        group: number[elements_of(gmsh, 2, groups[group])]
+        group: elements_of(gmsh, 2, groups[group])
         for group in interface_names(arm)
         if group not in bores
     }
