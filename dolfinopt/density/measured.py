@@ -26,11 +26,6 @@ SIMPLICES = {
     (3, 4): [[0, 1, 2, 3]],
     (3, 8): [[0, *pair, 7] for pair in ((1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6))],
 }
-# Facets of a solid of skew cells up to which its filter is factorised, once. Tetrahedra, factor
-# and solve by MUMPS beside a solve by conjugate gradients, filter radius of 3 cells: 100 700 facets
-# 0.60 and 0.035 s, 36 MB, 0.10 s (0.23 with 8 cells, 0.53 with 25); a cube of 132 800 1.15 and
-# 0.055 s, 129 MB, 0.11 s; a slender arm of 290 800 1.9 and 0.107 s, 164 MB, 0.25 s.
-FACTORISED_FACETS = 150_000
 COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above one another
 
 # -- members ---------------------------------------------------------------------------------

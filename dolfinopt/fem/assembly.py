@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,7 +12,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.fem.measured import (
-    BUFFER_ENTRIES,
     FIELD_CHUNK_ENTRIES,
     STRESS_CHUNK_CELLS,
     STRESS_CHUNK_ENTRIES,
@@ -516,12 +514,9 @@ class StiffenedModes:
             count, stiff = len(run.young), run.a * run.young
             found = np.empty((len(self._pairs), q, q, count))
             both = np.empty((run.a.shape[1], q, q, count))
-            with short_buffers():
-                for out, (b, c) in zip(found, self._pairs, strict=True):
-                    np.multiply(stiff[b][:, :, None], run.a[c][:, None], out=both)
-                    np.add(both[0], both[1], out=out)
-                    for more in both[2:]:
-                        out += more
+            for out, (b, c) in zip(found, self._pairs, strict=True):
+                np.multiply(stiff[b][:, :, None], run.a[c][:, None], out=both)
+                both.sum(axis=0, out=out)
             yield run, found.reshape(len(found), q * q, count)
 
     def _by_modes(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -560,13 +555,3 @@ def geometric_matrix(cells: Cells, u: np.ndarray, modulus: np.ndarray) -> sp.csr
     entries = (D.T @ reduced @ D).ravel()
     places = np.repeat(nodes, n, axis=1).ravel(), np.tile(nodes, n).ravel()
     return sp.coo_matrix((entries, places), 2 * (len(u),)).tocsr()
-
-
-@contextmanager
-def short_buffers() -> Iterator[None]:
-    """Let NumPy multiply rows of more than `BUFFER_ENTRIES` entries without copies."""
-    before = np.setbufsize(BUFFER_ENTRIES)
-    try:
-        yield
-    finally:
-        np.setbufsize(before)

@@ -24,7 +24,7 @@ from dolfinopt.mesh.gmsh_session import (
     gmsh_on_root,
 )
 from dolfinopt.mesh.hollow import Hull, Wall, box_hull, read_hull, rib_stations, tube_hull, wall_of
-from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 from dolfinopt.mesh.solid_cells import add_cells
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
@@ -369,7 +369,7 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
         point = np.array(one.point)
         assert one.radius is not None
         distance = np.linalg.norm(middles - point, axis=2)
-        own = outer & (distance <= INTERFACE_REACH_RATIO * one.radius)
+        own = outer & (distance <= (1.0 + GRID_ROUNDING_SHARE) * one.radius)
         problem = _problem(mesh.comm, own, own & taken, distance[outer])
         with together(mesh.comm):
             if problem:

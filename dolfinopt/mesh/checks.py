@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.measured import (
     FILE_ROUNDING_SHARE,
-    FLAT_CORNER_SINE,
-    FLAT_VOLUME_SHARE,
+    FLAT_CELL_SHARE,
     FRAME_TOLERANCE,
     FULL_TURN_ANGLE,
     TOUCHING_AREA_SHARE,
@@ -65,7 +64,7 @@ def _check_cells(flat: FlatMesh) -> None:
     corner = flat.points[flat.cells][:, :, :2]
     ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     turn = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
-    least = FLAT_CORNER_SINE * np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
+    least = FLAT_CELL_SHARE * np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
     sound = (turn > least).all(axis=1) | (turn < -least).all(axis=1)
     _refuse(~sound, corner, "are folded or flat")
     angle = np.arctan2(np.abs(turn), (ahead * back).sum(axis=2))
@@ -185,9 +184,9 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     corners = points[cells]
     _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
     longest = np.ptp(corners, axis=1).max(axis=1)
-    _refuse(cell_sizes(corners) < FLAT_VOLUME_SHARE * longest**3, corners, "are flat")
+    _refuse(cell_sizes(corners) < FLAT_CELL_SHARE * longest**3, corners, "are flat")
     if cells.shape[1] == 8:
-        _refuse(_folded(corners, FLAT_VOLUME_SHARE * longest**3), corners, "are folded")
+        _refuse(_folded(corners, FLAT_CELL_SHARE * longest**3), corners, "are folded")
     _refuse(_overlapping(corners, facet_keys(cells, 3)), corners, OVERLAP.format("volumes"))
     _check_parts(cells, "volumes must share their faces")
 

@@ -87,9 +87,9 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     """Make the Gmsh model of an arm with a mesh file: read, mesh, name the groups, check.
 
     Returns:
-        Facets (n, 2 or 3, d) of all interfaces, m, from which `arm.solid_ends` is still to be
-        measured: lines, or corners and middles as points (n, 1, 3) of a solid arm; none where the
-        geometry has seen to it. And warnings, a sentence each.
+        Lines (n, 2, 2) of the interfaces, of a solid arm corners and middles (n, 1, 3) of their
+        facets, m, from which `arm.solid_ends` is still to be measured; none where the geometry has
+        seen to it. And warnings, a sentence each.
 
     Raises:
         InputError: one line that names file, arm and remedy. Other errors are this program's.

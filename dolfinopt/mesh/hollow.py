@@ -17,10 +17,9 @@ from dolfinopt.mesh.geometry import read_groups, telling_where, where_of
 from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
 from dolfinopt.mesh.measured import (
     CORNER_CELL_RATIO,
-    LAYER_SHARE,
+    FILE_ROUNDING_SHARE,
     RAY_SHIFT_SHARE,
     ROUND_CELLS,
-    SAME_CROSSING_SHARE,
     SECTION_ALONG_SHARE,
     SECTION_CELLS,
     SECTION_END_CELLS,
@@ -92,7 +91,7 @@ def member(section: Section, length: float, sides: tuple[float, float], share: f
         share: of the largest wall.
     """
     assert section.plane is not None
-    layers = 1 + int(share / LAYER_SHARE)
+    layers = 1 + int(share * SECTION_CELLS)
     flat, quads = section.plane(*sides, share * section.largest_wall(*sides), layers)
     along = max(SECTION_LEAST_ALONG, round(length / (SECTION_ALONG_SHARE * max(sides))))
     cell = length / along
@@ -547,7 +546,7 @@ def _radii(triangles: np.ndarray, x: float, rays: np.ndarray, arm: Arm) -> np.nd
         share = beside[0][meets] / (beside[0] - beside[1])[meets]
         radius = along[0][meets] + share * (along[1] - along[0])[meets]
         radius = np.sort(radius[radius > 0.0])
-        apart = np.diff(radius, prepend=-np.inf) > SAME_CROSSING_SHARE * arm.height
+        apart = np.diff(radius, prepend=-np.inf) > FILE_ROUNDING_SHARE * arm.height
         if apart.sum() != 1:
             raise InputError(
                 f"{arm.hull}: arm {arm.name!r}: seen from the axis at x = {x:.4g} m in the "

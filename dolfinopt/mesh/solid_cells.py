@@ -36,7 +36,6 @@ from dolfinopt.mesh.gmsh_session import (
 from dolfinopt.mesh.measured import (
     BORE_RADIUS_SHARE,
     FACES_EDGE_ANGLE,
-    INTERFACE_AREA_SHARE,
     LOST_VOLUME_SHARE,
 )
 from dolfinopt.scene.load import Arm
@@ -401,7 +400,7 @@ def _faces_of(
         inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
         a, b, c = points[nodes - 1].swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        if area[inside].sum() > INTERFACE_AREA_SHARE * area.sum():
+        if area[inside].sum() > 0.5 * area.sum():
             found.append(face)
     return found
 

@@ -19,9 +19,8 @@ from dolfinopt.mesh.checks import remedy
 from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import DESIGN, FURTHER, PASSIVE, mesh_surfaces, mesh_volumes
 from dolfinopt.mesh.measured import (
-    END_FACE_COSINE_GAP,
+    FACE_COSINE,
     FILE_ROUNDING_SHARE,
-    SIDE_FACE_COSINE,
     THICKNESS_TOLERANCE,
 )
 from dolfinopt.mesh.solid_cells import (
@@ -162,9 +161,9 @@ def _end_faces(model: Any, solid: Entity, arm: Arm) -> dict[Entity, float]:
     for face in model.getBoundary([solid], oriented=False):
         points, places = _sampled(model, face, 5)
         upright = np.abs(np.reshape(model.getNormal(face[1], places), (-1, 3))[:, 2])
-        if (upright > 1.0 - END_FACE_COSINE_GAP).all():
+        if (upright > 1.0 - FACE_COSINE).all():
             found[face] = float(points[:, 2].mean())
-        elif not (upright < SIDE_FACE_COSINE).all():
+        elif not (upright < FACE_COSINE).all():
             x, y, z = model.occ.getCenterOfMass(*face)
             raise InputError(
                 f"it holds a solid whose face about ({x:.4g}, {y:.4g}, {z:.4g}) m is neither "

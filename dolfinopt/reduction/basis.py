@@ -15,9 +15,7 @@ from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     EXACT_TOLERANCE,
-    ORTHONORMAL_ROUNDS_LIMIT,
     ROUNDING_LENGTH_SHARE,
-    ROUNDING_SHARE,
 )
 
 
@@ -160,7 +158,7 @@ def orthonormalise(
 ) -> Expansion:
     """Orthonormalise the columns of W against V and one another in the inner product of M.
 
-    Block Gram-Schmidt in two rounds, and more where the check at its end asks for them.
+    Block Gram-Schmidt in two rounds, up to four where the check at its end asks for them.
     Source: Giraud et al., Numer. Math. 101 (2005) 87-100, doi:10.1007/s00211-005-0615-4.
 
     Args:
@@ -177,7 +175,7 @@ def orthonormalise(
     Q, R, kept = _qr(arm, W - combine(V, by_V), deflation * size)
     if len(kept) == 0:
         return Expansion(Q, Q, by_V, kept)
-    for _ in range(ORTHONORMAL_ROUNDS_LIMIT):
+    for _ in range(4):
         # Differences of nearly equal fields have lost the rigid motion of the interface.
         Q = arm.expand(interior_rows(arm, Q), arm.coordinates(Q))
         h = dot(arm, MV, Q)
@@ -276,7 +274,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > ROUNDING_SHARE * shares[-1]:  # not a number included
+            if not shares[0] > EXACT_TOLERANCE * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:

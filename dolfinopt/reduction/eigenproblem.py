@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +55,12 @@ class Pencil:
         """Those of this rank."""
         arm = self.arm
         return arm.num_interior + (arm.rigid.shape[2] if self.is_last else 0)
+
+    @property
+    def size(self) -> int:
+        """Rows of all ranks."""
+        free = self.arm.rigid.shape[2]
+        return self.arm.num_dofs - (0 if self.is_free else free)
 
     def split(self, V: np.ndarray) -> Rows:
         """Return interior rows, and the outboard coordinates (b, k) on every rank."""
@@ -210,10 +216,9 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
 
 def _from_cold(pencil: Pencil, count: int) -> Pairs:
     """Return up to `count` pairs by SLEPc, see `lowest_eigenpairs`."""
-    with closing(_Search(pencil, pencil.mass)) as search:
-        found = search.largest(count, _ramp(pencil), pencil.tolerance)
-        if len(found[0]) == count:  # nothing tells from cold how many modes have one frequency
-            found = search.without_gaps(*found)
+    found = _largest(pencil, pencil.mass, count, _ramp(pencil), pencil.tolerance)
+    if len(found[0]) == count:  # nothing tells from cold how many modes have one frequency
+        found = _without_gaps(pencil, *found)
     inverse, vectors = found
     # K-orthonormal; of far apart eigenvalues not M-orthogonal to all digits.
     return 1.0 / inverse, orthonormal(pencil, vectors)
@@ -251,8 +256,8 @@ def largest_eigenpairs(
     """
     arm = pencil.arm
     first = _ramp(pencil) if start is None else _initial(pencil, start)
-    with arm.profile.phase("eigenproblem"), closing(_Search(pencil, product)) as search:
-        pairs = search.largest(count, first, tolerance, absolute=True)
+    with arm.profile.phase("eigenproblem"):
+        pairs = _largest(pencil, product, count, first, tolerance, absolute=True)
     arm.profile.counts.eigenproblems += 1
     if len(pairs[0]) < count:
         raise ConvergenceError(
@@ -358,118 +363,110 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
 # -- by SLEPc -----------------------------------------------------------------------------------
 
 
-class _Search:
-    """The largest eigenvalues of A phi = mu K phi, by Krylov-Schur on K^-1 A."""
+def _largest(
+    pencil: Pencil,
+    product: Columns,
+    count: int,
+    first: np.ndarray,
+    tolerance: float,
+    known: np.ndarray | None = None,
+    absolute: bool = False,
+) -> Pairs:
+    """Return up to `count` largest values of A phi = mu K phi, descending, by Krylov-Schur.
 
-    def __init__(self, pencil: Pencil, product: Columns):
-        self.pencil = pencil
-        self.stiffness = _matrix(pencil, pencil.stiffness)
-        self.matrix = _matrix(pencil, product)
+    Args:
+        pencil: K.
+        product: A times columns.
+        count: that are wanted.
+        first: (rows,) the first vector of the subspace.
+        tolerance: of the eigenvalues' residuals.
+        known: (rows, k) vectors to which the new ones, K-orthonormal, are K-orthogonal.
+        absolute: whether the tolerance is not relative to each eigenvalue.
+    """
+    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
+    # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
+    # have, need more vectors, not more restarts.
+    for space, restarts in ((max(count + 4, 2 * count), 25), (4 * count + 100, 100)):
+        with _solver(pencil, product, min(count, pencil.size), min(space, pencil.size)) as eps:
+            eps.setTolerances(tolerance, restarts)
+            if absolute:
+                eps.setConvergenceTest(SLEPc.EPS.Conv.ABS)
+            pairs = _solved(pencil, eps, count, first, known)
+        if len(pairs[0]) == count:
+            break
+    return pairs
 
-    def close(self) -> None:
-        """Destroy the matrices: they would keep the arm's design, and PETSc keeps them."""
-        self.stiffness.destroy()
-        self.matrix.destroy()
 
-    def largest(
-        self,
-        count: int,
-        first: np.ndarray,
-        tolerance: float,
-        beside: np.ndarray | None = None,
-        absolute: bool = False,
-    ) -> Pairs:
-        """Return up to `count` values, descending, and K-orthonormal vectors.
+@contextmanager
+def _solver(pencil: Pencil, product: Columns, count: int, space: int) -> Iterator[SLEPc.EPS]:
+    stiffness, matrix = _matrix(pencil, pencil.stiffness), _matrix(pencil, product)
+    eps = SLEPc.EPS().create(pencil.arm.comm)
+    eps.setOptionsPrefix(OPTIONS)
+    eps.setOperators(matrix, stiffness)
+    eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+    eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
+    eps.setDimensions(count, space)
+    transform = eps.getST()
+    transform.setType(SLEPc.ST.Type.SHIFT)
+    ksp = _as_ksp(stiffness, pencil.inverse)
+    transform.setKSP(ksp)
+    yield eps
+    # PETSc keeps what Python forgets, and with it the arm's design: 5 MB of 400 x 24 cells.
+    for one in (eps, transform, ksp, stiffness, matrix):
+        one.destroy()
 
-        Args:
-            count: that are wanted.
-            first: (rows,) the first vector of the subspace.
-            tolerance: of the eigenvalues' residuals.
-            beside: (rows, k) vectors to which the new ones are K-orthogonal.
-            absolute: whether the tolerance is not relative to each eigenvalue.
-        """
-        # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
-        # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
-        # have, need more vectors, not more restarts.
-        spaces = ((max(count + 4, 2 * count), 25), (4 * count + 100, 100))
-        for space, restarts in spaces:
-            with self._solver(count, space, absolute) as eps:
-                eps.setTolerances(tolerance, restarts)
-                pairs = self._solved(eps, count, first, beside)
-            if len(pairs[0]) == count:
-                break
-        return pairs
 
-    @contextmanager
-    def _solver(self, count: int, space: int, absolute: bool) -> Iterator[SLEPc.EPS]:
-        eps = SLEPc.EPS().create(self.pencil.arm.comm)
-        eps.setOptionsPrefix(OPTIONS)
-        eps.setOperators(self.matrix, self.stiffness)
-        eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
-        eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
-        size = self.stiffness.getSize()[0]
-        eps.setDimensions(min(count, size), min(size, space))
-        if absolute:
-            eps.setConvergenceTest(SLEPc.EPS.Conv.ABS)
-        transform = eps.getST()
-        transform.setType(SLEPc.ST.Type.SHIFT)
-        ksp = _as_ksp(self.stiffness, self.pencil.inverse)
-        transform.setKSP(ksp)
-        yield eps
-        # PETSc keeps what Python forgets, and with it the arm's design: 5 MB of 400 x 24 cells.
-        for one in (eps, transform, ksp):
-            one.destroy()
+def _solved(
+    pencil: Pencil, eps: SLEPc.EPS, count: int, first: np.ndarray, known: np.ndarray | None
+) -> Pairs:
+    vector = eps.getOperators()[0].createVecLeft()
+    given = [_filled(vector, first)]
+    eps.setInitialSpace(given)
+    if known is not None:
+        space = [_filled(vector, column) for column in known.T]
+        eps.setDeflationSpace(space)
+        given += space
+    with obeying_options(OPTIONS):
+        eps.setFromOptions()
+        eps.solve()
+    found = min(eps.getConverged(), count)
+    values, vectors = np.empty(found), np.empty((pencil.rows, found))
+    for k in range(found):
+        values[k] = eps.getEigenpair(k, vector).real
+        vectors[:, k] = vector.array
+    for one in (vector, *given):
+        one.destroy()
+    order = np.argsort(-values, kind="stable")
+    return values[order], vectors[:, order]
 
-    def _solved(
-        self, eps: SLEPc.EPS, count: int, first: np.ndarray, beside: np.ndarray | None
-    ) -> Pairs:
-        vector = self.stiffness.createVecLeft()
-        given = [_filled(vector, first)]
-        eps.setInitialSpace(given)
-        if beside is not None:
-            known = [_filled(vector, column) for column in beside.T]
-            eps.setDeflationSpace(known)
-            given += known
-        with obeying_options(OPTIONS):
-            eps.setFromOptions()
-            eps.solve()
-        found = min(eps.getConverged(), count)
-        values, vectors = np.empty(found), np.empty((self.pencil.rows, found))
-        for k in range(found):
-            values[k] = eps.getEigenpair(k, vector).real
-            vectors[:, k] = vector.array
-        for one in (vector, *given):
-            one.destroy()
+
+def _without_gaps(pencil: Pencil, values: np.ndarray, vectors: np.ndarray) -> Pairs:
+    """Return as many pairs of K^-1 M, with those in place that a search passed over.
+
+    A Krylov subspace holds one vector of every eigenvalue but for rounding. What is left is
+    searched in the K-complement of what is known, until it lies below.
+
+    Raises:
+        ConvergenceError: that search does not converge.
+    """
+    # Another vector each time: one that has been used holds no more than rounding of the same
+    # frequency's other modes.
+    for first in _noise(pencil, len(values)).T:
+        if pencil.size == len(values):
+            break  # all there are
+        more, vector = _largest(pencil, pencil.mass, 1, first, pencil.tolerance, vectors)
+        if len(more) == 0:
+            raise ConvergenceError(
+                f"arm {pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
+                "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"
+            )
+        if more[0] <= (1.0 + EIGENVALUE_GAP) * values[-1]:
+            break
+        values = np.append(values[:-1], more)
+        vectors = np.column_stack([vectors[:, :-1], vector])
         order = np.argsort(-values, kind="stable")
-        return values[order], vectors[:, order]
-
-    def without_gaps(self, values: np.ndarray, vectors: np.ndarray) -> Pairs:
-        """Return as many pairs, with those in place that a search passed over.
-
-        A Krylov subspace holds one vector of every eigenvalue but for rounding. What is left is
-        searched in the K-complement of what is known, until it lies below.
-
-        Raises:
-            ConvergenceError: that search does not converge.
-        """
-        # Another vector each time: one that has been used holds no more than rounding of the same
-        # frequency's other modes.
-        for first in _noise(self.pencil, len(values)).T:
-            if self.stiffness.getSize()[0] == len(values):
-                break  # all there are
-            more, vector = self.largest(1, first, self.pencil.tolerance, vectors)
-            if len(more) == 0:
-                raise ConvergenceError(
-                    f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
-                    "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"
-                )
-            if more[0] <= (1.0 + EIGENVALUE_GAP) * values[-1]:
-                break
-            values = np.append(values[:-1], more)
-            vectors = np.column_stack([vectors[:, :-1], vector])
-            order = np.argsort(-values, kind="stable")
-            values, vectors = values[order], vectors[:, order]
-        return values, vectors
+        values, vectors = values[order], vectors[:, order]
+    return values, vectors
 
 
 class _Product:

@@ -33,7 +33,6 @@ from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     EXACT_TOLERANCE,
     KRYLOV_BLOCKS_LIMIT,
-    ROUNDING_SHARE,
 )
 
 # -- by modes: Craig-Bampton (constraint and fixed-interface modes), modes of a free arm ----------
@@ -310,7 +309,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     """
     arm.profile.counts.reductions += 1
     first = arm.static_response(*_inputs(arm))
-    space = InverseSpace(arm, first, ROUNDING_SHARE)
+    space = InverseSpace(arm, first, EXACT_TOLERANCE)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
     for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()
