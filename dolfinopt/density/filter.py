@@ -18,9 +18,6 @@ from dolfinopt.density.measured import (
     FACET_SKEW_LIMIT,
     LEAST_SIDE_DISTANCE,
     MIRROR_DISTANCE_LIMIT,
-    NEAR_CELLS,
-    OUTSIDE_SHARE,
-    SIMPLICES,
 )
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
@@ -296,8 +293,7 @@ class AxisSymmetry:
 
     The mirror of a cell is the cell with the centroid nearest to the mirror image of its own. On
     a mesh that is its own mirror image these are pairs, and y is symmetric to the last bit; on
-    others y is as symmetric as the mesh: of a symmetric arm whose cells are not, the cell in which
-    that image lies, where no centroid is near. Works on arms shared by several ranks.
+    others y is as symmetric as the mesh. Works on arms shared by several ranks.
     """
 
     def __init__(self, mesh: ArmMesh, axis: int = 1):
@@ -319,23 +315,16 @@ class AxisSymmetry:
         sign = np.ones(mesh.dim)
         sign[axis] = -1.0
         distance, mirror = cKDTree(everywhere).query(everywhere * sign)
-        off = distance / (np.sqrt(area) if mesh.dim == 2 else np.cbrt(area))
-        far = np.flatnonzero(off > MIRROR_DISTANCE_LIMIT)
-        if len(far):  # the same on all ranks
-            corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
-            within = _containing(
-                everywhere[far] * sign, everywhere, np.concatenate(self.comm.allgather(corners))
-            )
-            mirror[far] = np.where(within >= 0, within, mirror[far])
-            off[far[within >= 0]] = 0.0
+        size = np.sqrt(area) if mesh.dim == 2 else np.cbrt(area)
+        off = distance / size[mirror]
         worst = int(np.argmax(off))
         if off[worst] > MIRROR_DISTANCE_LIMIT:
             place = ", ".join(f"{x:.4g}" for x in everywhere[worst])
             key, name = ("symmetric", "y") if axis == 1 else ("symmetric_z", "z")
             raise InputError(
                 f"arm {mesh.name!r}: {key} = true, but the mesh is not symmetric about {name} = 0: "
-                f"the cell at ({place}) m has no mirror image: that of its middle lies in no cell, "
-                f"nor within {MIRROR_DISTANCE_LIMIT:g} cell sizes of one; correct the geometry, or "
+                f"the cell at ({place}) m has no mirror image: that of its middle is farther than "
+                f"{MIRROR_DISTANCE_LIMIT:g} cell sizes from all others; correct the geometry, or "
                 "mesh one half and mirror it"
             )
         self.mirror = mirror
@@ -353,22 +342,6 @@ class AxisSymmetry:
     def _all(self, values: np.ndarray) -> np.ndarray:
         """Return the field of all ranks' cells, ranks in order."""
         return values if self.comm.size == 1 else np.concatenate(self.comm.allgather(values))
-
-
-def _containing(points: np.ndarray, centroids: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return for each of points (k, d), m, which of the cells near it it lies in; -1: in none."""
-    # Cells have centroids (n, d) and corners (n, c, d), those of a tensor product in its order.
-    parts = np.array(SIMPLICES[corners.shape[2], corners.shape[1]])
-    near = cKDTree(centroids).query(points, k=min(NEAR_CELLS, len(centroids)))[1]
-    near = near.reshape(len(points), -1)
-    found = np.full(len(points), -1)
-    for other in near.T[::-1]:  # the nearest last, so that it stays
-        a, *rest = np.moveaxis(corners[other][:, parts], 2, 0)  # (k, parts, d)
-        edges = np.stack([b - a for b in rest], axis=-1)
-        shares = np.linalg.solve(edges, (points[:, None] - a)[..., None])[..., 0]
-        inside = (shares >= -OUTSIDE_SHARE).all(axis=2) & (shares.sum(axis=2) <= 1 + OUTSIDE_SHARE)
-        found[inside.any(axis=1)] = other[inside.any(axis=1)]
-    return found
 
 
 class Extrusion:

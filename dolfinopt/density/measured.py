@@ -16,16 +16,6 @@ LEAST_SIDE_DISTANCE = 0.05
 # space cubic roots of its volume. Meshes of symmetric geometries that were made without a thought
 # of symmetry: 0.7 to 1.0.
 MIRROR_DISTANCE_LIMIT = 1.25
-NEAR_CELLS = 64  # that are looked at for the one in which a mirror image lies
-# Of a cell, by which a mirror image may lie outside it: sides across a curved face are chords.
-OUTSIDE_SHARE = 0.05
-# Corners of the simplices that make up a cell, by its directions and corners.
-SIMPLICES = {
-    (2, 3): [[0, 1, 2]],
-    (2, 4): [[0, 1, 3], [0, 2, 3]],
-    (3, 4): [[0, 1, 2, 3]],
-    (3, 8): [[0, *pair, 7] for pair in ((1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6))],
-}
 COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above one another
 
 # -- members ---------------------------------------------------------------------------------

@@ -130,12 +130,11 @@ class SolidCells:
 
 
 def boundary(cells: np.ndarray) -> np.ndarray:
-    """Return the facets (k, 3 or 4) that only one of the cells (m, 4 or 8) has."""
+    """Return the facets (k, 3 or 4) that only one of the cells (m, 4 or 8) has, around them."""
     facets = np.concatenate([cells[:, side] for side in SIDES[cells.shape[1]]])
-    _, first, count = np.unique(
-        np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    return np.asarray(facets[first[count == 1]])
+    order = np.sort(facets, axis=1)
+    _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(facets[count[which.ravel()] == 1])
 
 
 def into_model(gmsh: Any, mesh: SolidCells) -> Entities:
@@ -252,10 +251,7 @@ class Tetrahedra:
     @property
     def boundary(self) -> np.ndarray:
         """Facets (k, 3) that only one cell has, counterclockwise from outside."""
-        facets = np.concatenate([self.cells[:, side] for side in SIDES[4]])
-        order = np.sort(facets, axis=1)
-        _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
-        return np.asarray(facets[count[which.ravel()] == 1])
+        return boundary(self.cells)
 
     def figures(self) -> dict[str, Any]:
         """Return its entry of part.json."""
