@@ -416,7 +416,7 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         hull = on_root(comm, _hull, gmsh, arm)
         with together(comm):
             if comm.rank == 0:
-                add_cells(gmsh.model, hull.member(limits[1]))
+                add_cells(gmsh, hull.member(limits[1]))
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
     with together(comm):
         mesh = _arm_mesh(comm, arm.name, arm.length, *parts)

@@ -42,6 +42,13 @@ from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.joints import Bore, frame_of
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
+STRAIGHT = {  # by dimension and number of corners
+    (1, 2): LINE,
+    (2, 3): TRIANGLE,
+    (2, 4): QUADRILATERAL,
+    (3, 4): TETRAHEDRON,
+    (3, 8): HEXAHEDRON,
+}
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.
 TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 # Sides of cells in Gmsh's order of corners, around them, by the number of corners.
@@ -116,12 +123,12 @@ def points_by_tag(gmsh: Any) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class SolidCells:
-    """The cells of a solid mesh and the facets of its interfaces.
+    """The cells of a mesh and the facets of its interfaces.
 
     Attributes:
-        points: (n, 3) m.
-        cells: (m, 4 or 8) of every region by its group, in Gmsh's order.
-        facets: (k, 3 or 4) of every interface that is known by its group.
+        points: (n, d) m.
+        cells: (m, c) of every region by its group, in Gmsh's order.
+        facets: (k, f) of every interface that is known by its group.
     """
 
     points: np.ndarray
@@ -140,22 +147,22 @@ def boundary(cells: np.ndarray) -> np.ndarray:
 def into_model(gmsh: Any, mesh: SolidCells) -> Entities:
     """Make cells, facets and their points a model of Gmsh, in place of what it has."""
     gmsh.clear()
-    model = gmsh.model
+    model, dim = gmsh.model, mesh.points.shape[1]
     model.add("solid")
     used = np.unique(np.concatenate([rows.ravel() for rows in mesh.cells.values()]))
     number = np.zeros(len(mesh.points), dtype=int)
     number[used] = np.arange(1, len(used) + 1)
+    places = np.pad(mesh.points[used], ((0, 0), (0, 3 - dim)))
     found: Entities = {group: [] for group in NAMES}
-    kinds = {3: {4: TETRAHEDRON, 8: HEXAHEDRON}, 2: {3: TRIANGLE, 4: QUADRILATERAL}}
-    for dim, groups in ((3, mesh.cells), (2, mesh.facets)):
+    for d, groups in ((dim, mesh.cells), (dim - 1, mesh.facets)):
         for group, rows in groups.items():
             found[group] = []
             if len(rows):
-                entity = model.addDiscreteEntity(dim)
-                if len(used):  # the first one has them all
-                    model.mesh.addNodes(dim, entity, number[used], mesh.points[used].ravel())
-                    used = used[:0]
-                kind = kinds[dim][rows.shape[1]]
+                entity = model.addDiscreteEntity(d)
+                if len(places):  # the first one has them all
+                    model.mesh.addNodes(d, entity, number[used], places.ravel())
+                    places = places[:0]
+                kind = STRAIGHT[d, rows.shape[1]]
                 model.mesh.addElementsByType(entity, kind, [], number[rows].ravel())
                 found[group] = [entity]
     return found
@@ -442,7 +449,7 @@ class InterfaceMesh(Protocol):
 def msh_bytes(mesh: InterfaceMesh) -> bytes:
     """Return the .msh file that `arms.mesh` reads back, on this process alone."""
     with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
-        add_cells(gmsh.model, mesh)
+        add_cells(gmsh, mesh)
         gmsh.option.setNumber("Mesh.Binary", 1)
         gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
         path = Path(folder) / "solid.msh"
@@ -450,23 +457,16 @@ def msh_bytes(mesh: InterfaceMesh) -> bytes:
         return path.read_bytes()
 
 
-def add_cells(model: Any, mesh: InterfaceMesh) -> None:
-    """Make a mesh and its interfaces a model of Gmsh."""
-    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
-    cell, side = kinds[mesh.cells.shape[1]]
-    dim = mesh.points.shape[1]
-    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
-    model.add("solid")
-    solid = model.addDiscreteEntity(dim)
-    model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
-    model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
-    model.addPhysicalGroup(dim, [solid], DESIGN)
-    model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
-    named = [(INBOARD, NAMES[INBOARD], mesh.inboard), (OUTBOARD, NAMES[OUTBOARD], mesh.outboard)]
+def add_cells(gmsh: Any, mesh: InterfaceMesh) -> None:
+    """Make a mesh and its interfaces the model of Gmsh."""
+    names = dict(NAMES)
+    facets = {INBOARD: mesh.inboard, OUTBOARD: mesh.outboard}
     if isinstance(mesh, Tetrahedra):
-        named += [(FURTHER + k, name, own) for k, (name, own) in enumerate(mesh.further.items())]
-    for group, name, facets in named:
-        face = model.addDiscreteEntity(dim - 1)
-        model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
-        model.addPhysicalGroup(dim - 1, [face], group)
-        model.setPhysicalName(dim - 1, group, name)
+        for k, (name, own) in enumerate(mesh.further.items(), FURTHER):
+            names[k], facets[k] = name, own
+    groups = into_model(gmsh, SolidCells(mesh.points, {DESIGN: mesh.cells}, facets))
+    model, dim = gmsh.model, mesh.points.shape[1]
+    for group in (DESIGN, *facets):
+        d = dim - (group != DESIGN)
+        model.addPhysicalGroup(d, groups[group], group)
+        model.setPhysicalName(d, group, names[group])
