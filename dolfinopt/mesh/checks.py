@@ -301,21 +301,21 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
 
 def cell_sizes(corners: np.ndarray) -> np.ndarray:
     """Return areas or volumes (n,) of cells with corners (n, c, d) in DOLFINx's order."""
-    return _volumes(corners).sum(axis=1)
+    return _jacobians(corners) @ _tabulated(corners)[0]
 
 
 def cell_centroids(corners: np.ndarray) -> np.ndarray:
     """Return the centroids (n, d) of cells with corners (n, c, d), m."""
-    volumes = _volumes(corners)
-    moments = np.einsum("ep,pn,eni->ei", volumes, _tabulated(corners)[1][0], corners)
+    weights, functions = _tabulated(corners)
+    volumes = _jacobians(corners) * weights
+    moments = np.einsum("ep,pn,eni->ei", volumes, functions[0], corners)
     return moments / volumes.sum(axis=1, keepdims=True)
 
 
-def _volumes(corners: np.ndarray) -> np.ndarray:
-    """Return the parts (n, p) of the cells' volumes at points of a rule exact for centroids."""
-    weights, functions = _tabulated(corners)
-    J = np.einsum("eni,kpn->epik", corners, functions[1:])
-    return np.abs(np.linalg.det(J)) * weights
+def _jacobians(corners: np.ndarray) -> np.ndarray:
+    """Return |det J| (n, p) at the points of a rule that is exact for volumes and centroids."""
+    J = np.einsum("eni,kpn->epik", corners, _tabulated(corners)[1][1:])
+    return np.abs(np.linalg.det(J))
 
 
 def _tabulated(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
