@@ -219,7 +219,7 @@ PLACES = [
     (evaluating, LONE, design_state, "shape_integrals"),
     (evaluating, LONE, static, "static_response", STATIC),
     (evaluating, LONE, static, "static_response", TIP),
-    (evaluating, LONE, frequency, "rigid_integrals", PERIOD),
+    (evaluating, LONE, design_state, "shape_integrals", PERIOD),
     (evaluating, LONE, design_state, "loaded_modes", FREQUENCY),
     (evaluating, LONE, frequency, "squared_period", PERIOD),
     (evaluating, 0, evaluation, "simulate"),

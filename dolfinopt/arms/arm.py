@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
-from dolfinopt.arms.modes import Carried, LoadedModes
+from dolfinopt.arms.modes import LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
     MIDDLE_THRESHOLD,
@@ -293,7 +293,7 @@ class Arm:
         state = self._state
         return state.basis if state is not None and state.is_reduced else None
 
-    def loaded_modes(self, place: int, carried: Carried) -> LoadedModes:
+    def loaded_modes(self, place: int, carried: np.ndarray) -> LoadedModes:
         """Return those of the current design, see `DesignState.loaded_modes`."""
         return self.current.loaded_modes(place, carried)
 
