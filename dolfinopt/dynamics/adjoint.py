@@ -30,7 +30,7 @@ from dolfinopt.dynamics.measured import (
     ADJOINT_CORRECTIONS_LIMIT,
     ROUNDING,
 )
-from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, slow_coordinates
+from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, matrix_of, slow_coordinates
 from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
@@ -101,8 +101,9 @@ class Adjoint:
             return self._kept[key]
         window = self._stages.window(part.start, part.stop)
         q, qd, a = (x[part] for x in self._at)
-        matrix = factorise(window, q, qd, a, slow)
-        exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
+        exact = tangent_at(window, q, qd, a)
+        own = exact if len(slow) == q.shape[2] else exact.step_mean(1, slow)
+        matrix = matrix_of(window, own, slow)
         if len(window.h) == len(self._stages.h):
             self._kept = {key: (matrix, exact)}
         return matrix, exact

@@ -77,8 +77,10 @@ class MachineInstants:
         here = self.state(y, yd, ydd)
         if self.machine.is_prescribed:
             return linearise(self.machine.mechanism, here.motion, *here.elastic, keep)
-        own = np.arange(self.machine.num_coordinates) if keep is None else keep
-        return Tangent(here.matrix()[:, :, own], own, np.arange(len(own)))
+        matrix, own = here.matrix(), np.arange(self.machine.num_coordinates)
+        if keep is not None:  # in memory as products want it, which indexing does not give
+            matrix, own = matrix.take(keep, axis=2), keep
+        return Tangent(matrix, own, np.arange(len(own)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,7 +48,7 @@ class Tangent:
 
     def step_mean(self, stages: int, keep: np.ndarray) -> Tangent:
         """Return its mean over every `stages` instants, by some of the coordinates, ascending."""
-        kept = self.matrix[:, :, self.order[keep]]
+        kept = self.matrix.take(self.order[keep], axis=2)
         mean = kept.reshape(-1, stages, *kept.shape[1:]).mean(axis=1)
         return Tangent(mean, self.own[keep], np.arange(len(keep)))
 
