@@ -31,10 +31,10 @@ from dolfinopt.dynamics.measured import (
     ROUNDING,
 )
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, matrix_of, slow_coordinates
-from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tangent import Tangent
 
-_Factors = tuple[NewtonMatrix, Linearisation]
+_Factors = tuple[NewtonMatrix, Tangent]
 
 
 class Adjoint:
@@ -140,7 +140,7 @@ def _sampled(
 
 def _answered(
     matrix: NewtonMatrix,
-    exact: Linearisation,
+    exact: Tangent,
     by_a: np.ndarray,
     by_y: np.ndarray,
     after: np.ndarray,
@@ -173,7 +173,7 @@ def _answered(
 
 
 def _gradient(
-    stages: Stages, exact: Linearisation, multipliers: np.ndarray
+    stages: Stages, exact: Tangent, multipliers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient of sum multipliers . residual by accelerations and first states."""
     by_rates = exact.transposed(multipliers.reshape(-1, multipliers.shape[2]))

@@ -27,7 +27,7 @@ from dolfinopt.dynamics.collocation import (
     vector_jacobian_product,
 )
 from dolfinopt.dynamics.measured import DENSE_COORDINATES, MATRIX_BYTES, SLOW_ANGLES
-from dolfinopt.dynamics.system import Linearisation
+from dolfinopt.multibody.tangent import Tangent
 
 
 def slow_coordinates(stages: Stages, more_than: int = 0) -> np.ndarray:
@@ -84,7 +84,7 @@ class NewtonMatrix:
     """
 
     stages: Stages
-    tangent: Linearisation
+    tangent: Tangent
     slow: np.ndarray
     fast: np.ndarray
     inverse: np.ndarray
@@ -205,7 +205,7 @@ def factorise(
     return matrix_of(stages, tangent_at(stages, q, qd, a, slow), slow)
 
 
-def matrix_of(stages: Stages, tangent: Linearisation, slow: np.ndarray) -> NewtonMatrix:
+def matrix_of(stages: Stages, tangent: Tangent, slow: np.ndarray) -> NewtonMatrix:
     """Return Newton's matrix of a tangent by the slow coordinates at the n s stages.
 
     Of a tangent at n instants, each of them stands for all stages of its step.
