@@ -52,11 +52,6 @@ def up_to_angle(stages: Stages, limit: float) -> np.ndarray:
     return np.flatnonzero(angles <= max(limit, angles.min()))
 
 
-def has_room(stages: Stages, slow: np.ndarray) -> bool:
-    """Return whether the matrix of all steps fits in `MATRIX_BYTES`."""
-    return len(chunks(stages, slow)) == 1
-
-
 def chunks(stages: Stages, slow: np.ndarray) -> list[slice]:
     """Return runs of steps whose matrices fit in `MATRIX_BYTES`: mostly one."""
     s, count = len(stages.method.c), len(stages.h)

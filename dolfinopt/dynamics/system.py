@@ -25,6 +25,7 @@ import numpy as np
 
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
 from dolfinopt.multibody.tangent import Tangent
+from dolfinopt.multibody.tree import Mechanism
 
 State = tuple[np.ndarray, np.ndarray]  # q, qd
 
@@ -147,7 +148,7 @@ def unchanged(system: System) -> Preconditioner:
     return Preconditioner(system, 0.0 * one, (one, 0.0 * one, one))
 
 
-def relative_error(system: System, error: np.ndarray, q: np.ndarray) -> float:
+def relative_error(system: System | Mechanism, error: np.ndarray, q: np.ndarray) -> float:
     """Return the largest error in time over the largest value, worst group; both (n, N)."""
     return float((system.norm(error) * inverse_size(system.norm(q))).max(initial=0.0))
 
