@@ -22,18 +22,17 @@ from typing import Any
 import numpy as np
 import ufl
 
-from dolfinopt.fem.laws import SHEARS
+from dolfinopt.fem.laws import ROWS, SHEARS, MaterialLaw
 from dolfinopt.mesh.compat import lagrange_element, mixed_element
 
 # A form, or an expression and points (p, d) of the reference cell where it is asked for.
 Forms = list[Any]
 Points = tuple[tuple[float, ...], ...]
 Functional = Callable[..., ufl.Form]
+Law = Callable[["Cell", Any], Any]
 
 ELEMENTS = "incompatible", "linear", "quadratic"
 DIMENSIONS = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 3, "hexahedron": 3}
-# Where stresses are in their tensor.
-ROWS = {2: [[0, 2], [2, 1]], 3: [[0, 3, 5], [3, 1, 4], [5, 4, 2]]}
 
 
 class Cell:
@@ -51,7 +50,8 @@ class Cell:
         xi: reference coordinates: its values are the reference corners.
         corners: places of the corners, one behind the other, as constants of a cell.
         weight: of a cell.
-        C: the law, see `laws`.
+        C: the law's constants, see `laws`.
+        law: the stresses of a cell by its strains.
         nodal, scalar: spaces of the nodes' displacements, and of one component.
         modes: gradients of the incompatible modes; none of other elements.
         displacement: the space of nodes' displacements and modes' amplitudes.
@@ -59,8 +59,9 @@ class Cell:
             cell tau.
     """
 
-    def __init__(self, shape: str, element: str):
+    def __init__(self, shape: str, element: str, law: Law = MaterialLaw.stress):
         self.shape, self.element, self.dim = shape, element, DIMENSIONS[shape]
+        self.law = law
         self.is_simplex = shape in ("triangle", "tetrahedron")
         self.degree = 2 if element == "quadratic" else 1
         d = self.dim
@@ -110,7 +111,7 @@ class Cell:
 
     def stress(self, u: Any) -> Any:
         """Return the stresses of a displacement, see `laws`."""
-        return ufl.dot(self.C, self.strain(u))
+        return self.law(self, self.strain(u))
 
     def stress_tensor(self, u: Any) -> Any:
         """Return sigma_ab of a displacement."""

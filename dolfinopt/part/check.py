@@ -29,7 +29,7 @@ from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.responses.constraints import Limit, limits_of
-from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report
+from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report, unjudged
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 if sys.version_info >= (3, 11):
@@ -425,7 +425,7 @@ class Check:
             found.append(
                 f"largest stress of the part: {_told(self.part.stress, self.part.stressed)}"
             )
-        return found
+        return [*found, *unjudged(self.part.trajectory.scene)]
 
     @property
     def warnings(self) -> list[str]:

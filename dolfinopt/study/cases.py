@@ -61,7 +61,8 @@ SCENARIO = frozenset(
     "motion control closures payload forces damping reduction simulation objective constraints "
     "optimizer scenarios".split()
 )
-# Bases that do not depend on `SCALING`: Krylov's shifts and the Gramian's band are frequencies.
+# Bases that do not depend on `Scene.scaling_keys`: Krylov's shifts and the Gramian's band are
+# frequencies.
 SCALABLE = ("craig-bampton", "modal")
 
 
@@ -119,7 +120,7 @@ class Case:
         motion_alone = scene.objective.needs("motion") and not scene.constraints.limits
         if motion_alone and scene.reduction.method in SCALABLE:
             for row in (kept["material"], *kept["arms"]):
-                for key in set(SCALING) - set(scene.arm_sizes):
+                for key in scene.scaling_keys:
                     row.pop(key, None)
         return _digest([kept, self.design_key])
 
@@ -223,9 +224,6 @@ def _digest(content: Any) -> str:
 # -- simulating them -------------------------------------------------------------------------
 
 
-# These values of material and arms scale the integrals of the reduced arms; the thickness in the
-# plane alone: in space it is one of the cells' sides.
-SCALING = ("young_modulus", "density", "thickness")
 APART = (
     "motion",
     "payload",
@@ -278,7 +276,7 @@ def _basis(number: int, scene: Scene) -> Any:
 
 def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    scaling = set(SCALING) - set(scene.arm_sizes)
+    scaling = scene.scaling_keys
     parts = [key.split(".") for key in keys]
     return all(
         one[0] in APART or (one[0] in ("material", "arms") and one[-1] in scaling) for one in parts
