@@ -388,9 +388,8 @@ class Check:
         """Whether the part's largest stress does not depend on the mesh."""
         limited = any(one.quantity == STRESS for one in self.part.limits)
         refines = all(one.kind == "triangles" for one in self.meshes.values())
-        return abs(self.refinement[STRESS]) <= (
-            SETTLED_LIMITED if limited and refines else SETTLED_STRESS
-        )
+        settled = SETTLED_LIMITED if limited and refines else SETTLED_STRESS
+        return self.part.stress is None or abs(self.refinement[STRESS]) <= settled
 
     @property
     def loss(self) -> str:
@@ -418,7 +417,7 @@ class Check:
         if self.coarse is not None:
             change = ", ".join(
                 f"{name} by {_percent(100.0 * self.refinement[name])}"
-                for name in (*self._judged, STRESS)
+                for name in (*self._judged, *([] if self.part.stress is None else [STRESS]))
             )
             found.append(f"mesh: the last refinement changed {change}")
         if self.part.stress is not None:

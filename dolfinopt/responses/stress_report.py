@@ -176,8 +176,6 @@ def _shared(partition: Partition, places: np.ndarray, point: int) -> np.ndarray:
 
 
 def unjudged(scene: Scene) -> list[str]:
-    """Return a sentence on every arm whose stress is not told."""
-    return [
-        f"{name}: no stress is told, as no strength criterion is known for {kind} material"
-        for name, kind in scene.without_strength.items()
-    ]
+    """Return a sentence on the arms whose stress is not told."""
+    names = ", ".join(scene.without_strength)
+    return [f"no stress is told of {names}: no strength criterion is known"] if names else []
