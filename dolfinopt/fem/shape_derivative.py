@@ -49,7 +49,7 @@ class ShapeDerivative:
         """Differentiate sum_k left_k' K right_k of nodal fields (n_nodes, d, k)."""
         cell, found = self._cell, self._zeros()
         for u, v in zip(self._columns(left), self._columns(right), strict=True):
-            values = {cell.u: self._recovered(u), cell.v: self._recovered(v)}
+            values = {cell.u: self.recovered(u), cell.v: self.recovered(v)}
             values[cell.weight] = young[:, None]
             found += self._by_corners(values, forms.stiffness_product)
         return self._operators.thickness * found
@@ -83,7 +83,7 @@ class ShapeDerivative:
             # Of a pair of modes the stress of one sum of the fields counts.
             sums = fields @ np.hstack([2.0 * symmetric[:, i, :i], symmetric[:, i, i : i + 1]])
             for u, w in zip(self._columns(sums), modes, strict=False):
-                values = {cell.u: self._recovered(u), cell.p: p, cell.w: w}
+                values = {cell.u: self.recovered(u), cell.p: p, cell.w: w}
                 values[cell.weight] = young[:, None]
                 found += self._with_adjoint(values, forms.geometric_product)
         return self._operators.thickness * found
@@ -105,7 +105,7 @@ class ShapeDerivative:
             for point, weight in zip(points, weights.swapaxes(0, 1), strict=True):
                 # Of a component of the stress the sum of the fields counts.
                 u = (nodal @ weight[:, :, None])[:, :, 0]
-                values = {cell.u: self._recovered(u), cell.tau: tau}
+                values = {cell.u: self.recovered(u), cell.tau: tau}
                 found += self._with_adjoint(values, forms.stress_component, *point)
         return found
 
@@ -119,19 +119,19 @@ class ShapeDerivative:
         for k in range(field.shape[2]):
             yield field[:, :, k][self._operators.cells].reshape(len(self._coordinates), -1)
 
-    def _recovered(self, u: np.ndarray) -> np.ndarray:
+    def recovered(self, u: np.ndarray) -> np.ndarray:
         """Return nodal values with the amplitudes of the modes behind them."""
         return np.hstack([u, (self._operators.recovery @ u[:, :, None])[:, :, 0]])
 
-    def _run(self, derivative: Derivative, values: Values, *functional: Any) -> list[np.ndarray]:
-        """Return the tensors of what `forms` makes of a functional."""
+    def run(self, make: Derivative, values: Values, *functional: Any) -> list[np.ndarray]:
+        """Return the tensors of every cell of what `forms` makes of a functional."""
         known = geometry(self._cell, self._coordinates, self._operators.law) | values
-        kernels = self._operators.kernels(derivative, *functional)
+        kernels = self._operators.kernels(make, *functional)
         return [kernel(self._coordinates, known) for kernel in kernels]
 
     def _by_corners(self, values: Values, *functional: Any) -> np.ndarray:
         """Differentiate a functional, the amplitudes of modes held."""
-        parts = self._run(forms.by_corners, values, *functional)
+        parts = self.run(forms.by_corners, values, *functional)
         return np.sum(parts, axis=0).reshape(self._operators.corners.shape)
 
     def _with_adjoint(self, values: Values, *functional: Any) -> np.ndarray:
@@ -140,7 +140,7 @@ class ShapeDerivative:
         if not self._cell.modes:
             return found
         cell, operators = self._cell, self._operators
-        [by_u] = self._run(forms.by_displacement, values, *functional)
+        [by_u] = self.run(forms.by_displacement, values, *functional)
         n = operators.recovery.shape[2]
         by_u[:, n:] = -np.linalg.solve(operators.modal, by_u[:, n:, None])[:, :, 0]
         by_u[:, :n] = 0.0
