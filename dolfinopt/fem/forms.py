@@ -55,6 +55,7 @@ class Cell:
         nodal, scalar: spaces of the nodes' displacements, and of one component.
         modes: gradients of the incompatible modes; none of other elements.
         displacement: the space of nodes' displacements and modes' amplitudes.
+        stresses: that of stresses and strains of a cell.
         u, v, p, w, tau: coefficients: displacements u and v, nodal vectors p and w, stresses of a
             cell tau.
     """
@@ -83,8 +84,8 @@ class Cell:
             amplitudes = lagrange_element(shape, 0, len(self.modes))
             nodal = lagrange_element(shape, self.degree, d)
             self.displacement = self._space(mixed_element(nodal, amplitudes))
-        stresses = self._space(lagrange_element(shape, 0, kinds))
-        spaces = self.displacement, self.displacement, self.nodal, self.nodal, stresses
+        self.stresses = self._space(lagrange_element(shape, 0, kinds))
+        spaces = self.displacement, self.displacement, self.nodal, self.nodal, self.stresses
         self.u, self.v, self.p, self.w, self.tau = (
             ufl.Coefficient(space, count=3 + k) for k, space in enumerate(spaces)
         )
@@ -151,11 +152,18 @@ def centre(cell: Cell) -> tuple[Any, Any]:
 # -- measures: Gauss points that are exact on parallelepipeds and simplices --------------------
 
 
-def dx_stiffness(cell: Cell) -> ufl.Measure:
+def stiffness_degree(cell: Cell) -> int:
     """Return that of a product of two gradients: degree + 1 Gauss points a direction."""
+    if cell.is_simplex:
+        return 2 * (cell.degree - 1)
     # Quadrilaterals without modes have had one more.
     more = 2 if cell.shape == "quadrilateral" and not cell.modes else 0
-    return cell.dx(2 * cell.degree + more, 2 * (cell.degree - 1))
+    return 2 * cell.degree + more
+
+
+def dx_stiffness(cell: Cell) -> ufl.Measure:
+    """Return the measure of a product of two gradients."""
+    return ufl.dx(cell.mesh, degree=stiffness_degree(cell))
 
 
 def dx_mass(cell: Cell) -> ufl.Measure:
@@ -185,6 +193,11 @@ def mass(cell: Cell) -> Forms:
 def stress_at(cell: Cell, points: Points) -> Forms:
     """Return the stress by displacements at p points."""
     return [(cell.stress(ufl.TrialFunction(cell.displacement)), np.array(points))]
+
+
+def tangent(cell: Cell) -> Forms:
+    """Return the stress by the strain, C of the law's form, at a corner."""
+    return [(cell.law(cell, ufl.TrialFunction(cell.stresses)), np.zeros((1, cell.dim)))]
 
 
 def geometric_factors(cell: Cell, points: Points) -> Forms:

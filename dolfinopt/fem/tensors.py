@@ -264,6 +264,11 @@ def corner_functions(cell: forms.Cell, points: np.ndarray) -> np.ndarray:
     return np.asarray(_lagrange(cell, 1).tabulate(0, points)[0, :, :, 0])
 
 
+def reference_gradients(cell: forms.Cell, degree: int, points: np.ndarray) -> np.ndarray:
+    """Return the gradients (p, n, d) of functions of a degree at points, in the reference cell."""
+    return np.asarray(np.moveaxis(_lagrange(cell, degree).tabulate(1, points)[1:, :, :, 0], 0, 2))
+
+
 def node_places(cell: forms.Cell) -> np.ndarray:
     """Return the element's nodes (n, d) in the reference cell."""
     return np.asarray(_lagrange(cell, cell.degree).points)
