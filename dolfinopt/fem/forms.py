@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import ufl
 
-from dolfinopt.fem.laws import ROWS, SHEARS, MaterialLaw
+from dolfinopt.fem.laws import SHEARS, MaterialLaw
 from dolfinopt.mesh.compat import lagrange_element, mixed_element
 
 # A form, or an expression and points (p, d) of the reference cell where it is asked for.
@@ -56,8 +56,7 @@ class Cell:
         modes: gradients of the incompatible modes; none of other elements.
         displacement: the space of nodes' displacements and modes' amplitudes.
         stresses: that of stresses and strains of a cell.
-        u, v, p, w, tau: coefficients: displacements u and v, nodal vectors p and w, stresses of a
-            cell tau.
+        u, v, p, w: coefficients: displacements u and v, nodal vectors p and w.
     """
 
     def __init__(self, shape: str, element: str, law: Law = MaterialLaw.stress):
@@ -85,8 +84,8 @@ class Cell:
             nodal = lagrange_element(shape, self.degree, d)
             self.displacement = self._space(mixed_element(nodal, amplitudes))
         self.stresses = self._space(lagrange_element(shape, 0, kinds))
-        spaces = self.displacement, self.displacement, self.nodal, self.nodal, self.stresses
-        self.u, self.v, self.p, self.w, self.tau = (
+        spaces = self.displacement, self.displacement, self.nodal, self.nodal
+        self.u, self.v, self.p, self.w = (
             ufl.Coefficient(space, count=3 + k) for k, space in enumerate(spaces)
         )
 
@@ -113,11 +112,6 @@ class Cell:
     def stress(self, u: Any) -> Any:
         """Return the stresses of a displacement, see `laws`."""
         return self.law(self, self.strain(u))
-
-    def stress_tensor(self, u: Any) -> Any:
-        """Return sigma_ab of a displacement."""
-        s = self.stress(u)
-        return ufl.as_matrix([[s[k] for k in row] for row in ROWS[self.dim]])
 
 
 def incompatible_modes(cell: Cell) -> list[Any]:
@@ -224,20 +218,6 @@ def mass_product(cell: Cell) -> ufl.Form:
     return cell.weight * ufl.inner(cell.p, cell.w) * dx_mass(cell)
 
 
-def geometric_product(cell: Cell) -> ufl.Form:
-    """Return the weighted int sigma(u)_ab d_a p . d_b w."""
-    both = ufl.dot(ufl.transpose(ufl.grad(cell.p)), ufl.grad(cell.w))
-    dx = ufl.dx(cell.mesh, degree=geometric_degree(cell))
-    return cell.weight * ufl.inner(cell.stress_tensor(cell.u), both) * dx
-
-
-def stress_component(cell: Cell, *point: float) -> ufl.Form:
-    """Return sigma(u) . tau at a point (d,) of the reference cell, tau as stresses are."""
-    rule = {"quadrature_rule": "custom", "quadrature_degree": 1, "quadrature_weights": np.ones(1)}
-    dx = ufl.dx(cell.mesh, metadata={**rule, "quadrature_points": np.array([point])})
-    return ufl.inner(cell.stress(cell.u), cell.tau) / abs(ufl.det(cell.J)) * dx
-
-
 def value(cell: Cell, functional: Functional) -> Forms:
     """Return the functional itself, a number a cell."""
     return [functional(cell)]
@@ -250,8 +230,3 @@ def by_corners(cell: Cell, functional: Functional, *args: float) -> Forms:
     if cell.corners in form.coefficients():
         forms.append(ufl.derivative(form, cell.corners, ufl.TestFunction(cell.constants)))
     return forms
-
-
-def by_displacement(cell: Cell, functional: Functional, *args: float) -> Forms:
-    """Return the derivative of a functional by u."""
-    return [ufl.derivative(functional(cell, *args), cell.u, ufl.TestFunction(cell.displacement))]
