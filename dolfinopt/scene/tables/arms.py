@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 from pydantic.fields import FieldInfo
 
-from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.base import (
+    FileName,
+    Length,
+    Loc,
+    Position,
+    Refusal,
+    Table,
+    shown,
+    table_in,
+)
 from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
     FRICTION_SPEED,
@@ -833,6 +842,9 @@ def _add_material_keys() -> None:
             default=None,
             description=f"of this arm: {words}; default: material.{key} [{unit}",
         )
+    fields = Arm.model_fields
+    for key in [key for key, field in fields.items() if table_in(field.annotation)]:
+        fields[key] = fields.pop(key)  # keys are told before the tables below them
 
 
 _add_material_keys()
