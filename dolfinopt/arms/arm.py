@@ -26,7 +26,7 @@ from dolfinopt.density.filter import (
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.laws import isotropic
+from dolfinopt.fem.laws import law_of, stiffness_tensor
 from dolfinopt.fem.tensors import ElementTensors, element_of
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
@@ -114,8 +114,8 @@ class Arm:
                 element = element_of(self.mesh, arm.element)
             except InputError as error:
                 raise InputError(f"{scene.source}: {error}") from None
-            law = isotropic(self.mesh.dim, self.solid.poisson_ratio)
-            operators = ElementTensors(self.mesh, element, arm.depth, law, profile)
+            law, stress = stiffness_tensor(self.mesh, self.solid), law_of(self.solid).stress
+            operators = ElementTensors(self.mesh, element, arm.depth, law, profile, stress)
             self.substructure = Substructure(
                 operators, field_tolerance(scene), needs_alone(scene, STATICS)
             )

@@ -142,7 +142,7 @@ def kind_of(substructure: Substructure, solid: Material, law: Interpolation) -> 
 
 
 def _elastic(arm: Substructure, solid: Material, material: Interpolated) -> ElasticArm:
-    return arm.at(solid.young_modulus * material.stiffness, solid.density * material.mass)
+    return arm.at(solid.modulus * material.stiffness, solid.density * material.mass)
 
 
 # --
@@ -212,7 +212,7 @@ class DesignState:
     @property
     def young_slope(self) -> np.ndarray:
         """Derivative of Young's modulus by x_phys (n_cells,), Pa."""
-        return self.solid.young_modulus * self.material.stiffness_slope
+        return self.solid.modulus * self.material.stiffness_slope
 
     @property
     def density_slope(self) -> np.ndarray:

@@ -68,8 +68,8 @@ def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:
 def plain_statics(scene: Scene, cells: Cells) -> PlainStatics:
     """Return plain DOLFINx's iteration of the scene's first arm."""
     arm, solid = with_cells(scene, cells).arms[0], scene.material_of(0)
-    mesh, modulus = arm_mesh(MPI.COMM_SELF, arm), solid.young_modulus * arm.thickness
-    return PlainStatics(mesh, modulus, solid.poisson_ratio, arm.height)
+    mesh, modulus = arm_mesh(MPI.COMM_SELF, arm), solid.modulus * arm.thickness
+    return PlainStatics(mesh, modulus, solid.ratio, arm.height)
 
 
 def _iterations(plan: Plan) -> Steps:
@@ -216,7 +216,7 @@ def pymoto_iteration(scene: Scene, cells: Sequence[int]) -> Iteration | None:
     density, load = pym.Signal("x", np.ones(domain.nel)), pym.Signal("f", force)
     stiff, matrix, u, compliance = (pym.Signal(name) for name in "sKuc")
     options = {"domain": domain, "bc": fixed, "plane": "stress"}
-    options |= {"e_modulus": solid.young_modulus, "poisson_ratio": solid.poisson_ratio}
+    options |= {"e_modulus": solid.modulus, "poisson_ratio": solid.ratio}
     law = f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
     solver = None
     if d == 3:

@@ -421,6 +421,17 @@ class Wall:
         total[1:] += rows
         return self.least + (self.most - self.least) * total / self._around
 
+    @property
+    def normals(self) -> np.ndarray:
+        """Return the outer surface's unit normals (n_cells, 3) in the owned cells' middles."""
+        outer = self.hull.points(self.most)[: self.hull.outer[:, :, 0].size]
+        outer = outer.reshape(self.hull.outer.shape)
+        ahead = np.roll(outer, -1, axis=1)
+        sides = (ahead - outer)[:-1] + (ahead - outer)[1:]
+        found = np.cross(sides, (outer + ahead)[1:] - (outer + ahead)[:-1])
+        found /= np.linalg.norm(found, axis=2, keepdims=True)
+        return np.asarray(found.reshape(-1, 3)[self.cells])
+
     def points(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
         """Return the places (n, 3) of this rank's nodes, m (collective on the arm)."""
         return self.hull.points(self.thickness(comm, x))[self.nodes]

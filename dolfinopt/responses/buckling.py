@@ -125,7 +125,7 @@ def stressed_modulus(state: DesignState) -> StressedModulus:
     With r = E / E_0 less that of void, and e = `VOID_STRESS_SHARE`, s = E_0 r^2 (1 + e) / (r + e):
     Young's where there is material, and less than any share of it towards void.
     """
-    law, solid, e = state.scene.interpolation, state.solid.young_modulus, VOID_STRESS_SHARE
+    law, solid, e = state.scene.interpolation, state.solid.modulus, VOID_STRESS_SHARE
     void = interpolate(np.zeros(1), law.law, law.penalty, law.floor).stiffness
     r = state.elastic.young / solid - void
     share = (1.0 + e) * r / (r + e)
@@ -195,8 +195,8 @@ def _loads(scene: Scene, trajectory: Trajectory) -> dict[int, Loads]:
     motions = motions_of(trajectory)
 
     def stiffer(one: ArmLoads) -> float:
-        other = motions[one.motion].scene.material_of(one.place).young_modulus
-        return other / scene.material_of(one.place).young_modulus
+        other = motions[one.motion].scene.material_of(one.place).modulus
+        return other / scene.material_of(one.place).modulus
 
     every = arm_loads(scene, motions)
     return {k: [(one, stiffer(one)) for one in each] for k, each in every.items()}

@@ -312,7 +312,7 @@ def factors(scene: Scene, other: Scene, index: int) -> Factors:
     thicker = other.arms[index].thickness / scene.arms[index].thickness
     return Factors(
         thicker * there.density / here.density,
-        thicker * there.young_modulus / here.young_modulus,
+        thicker * there.modulus / here.modulus,
         other.damping.stiffness_proportional,
     )
 

@@ -139,7 +139,7 @@ class CellStress(PointStress):
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to the design, see `PointStress`."""
         x = state.share
-        by_stress = state.solid.young_modulus * self.root[:, None] * by
+        by_stress = state.solid.modulus * self.root[:, None] * by
         operator = state.elastic.substructure.stress_operator
         by_u = self.fields.stress_transposed(operator, by_stress)
         centre = element_centre(state.elastic.operators.cell)
@@ -162,7 +162,7 @@ def cell_stress(state: DesignState, fields: LoadFields, margin: float = 0.0) -> 
         if margin > 0.0:
             weights[substructure.interface_distance < margin] = 0.0
         A = fields.stress(substructure.stress_operator)
-        A *= (state.solid.young_modulus * root * (weights > 0.0))[:, None]
+        A *= (state.solid.modulus * root * (weights > 0.0))[:, None]
         return CellStress(fields, A, weights, root)
 
 
@@ -301,7 +301,7 @@ def _scale(scene: Scene, other: Scene, place: int, body: ShapeIntegrals) -> np.n
     scale[q:] = f.mass / f.stiffness
     outboard = q + counts.frame
     scale[outboard : outboard + counts.outboard] = 1.0 / f.stiffness
-    young = other.material_of(owner).young_modulus / scene.material_of(owner).young_modulus
+    young = other.material_of(owner).modulus / scene.material_of(owner).modulus
     return young * scale
 
 

@@ -202,9 +202,6 @@ def _digest(content: Any) -> str:
 # -- simulating them -------------------------------------------------------------------------
 
 
-# These values of material and arms scale the integrals of the reduced arms; the thickness in the
-# plane alone: in space it is one of the cells' sides.
-SCALING = ("young_modulus", "density", "thickness")
 APART = (
     "motion",
     "payload",
@@ -244,7 +241,7 @@ def simulate_scenarios(
 
 def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    scaling = set(SCALING) - set(scene.arm_sizes)
+    scaling = scene.scaling_keys
     parts = [key.split(".") for key in keys]
     return all(
         one[0] in APART or (one[0] in ("material", "arms") and one[-1] in scaling) for one in parts

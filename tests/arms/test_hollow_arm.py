@@ -139,10 +139,12 @@ COARSE = (
     "changes",
     [
         ("objective.kind=esl", "constraints.mass=2.0", "constraints.tip_deflection=1e-3"),
+        ("objective.kind=esl", "constraints.tip_deflection=1e-3", "arms.link1.angle=0.5",
+         "material=CFRP unidirectional", "simulation.stiffening=true"),
         pytest.param(("objective.kind=mass", "constraints.deviation=0.01", "constraints.stress=1e8",
                       "constraints.first_frequency=100"), marks=pytest.mark.slow),
     ],
-    ids=["esl", "mass"],
+    ids=["esl", "carbon", "mass"],
 )  # fmt: skip
 def test_gradients_by_the_wall(changes):
     """Remainders of objective and limits are of second order along a random direction."""
