@@ -1,9 +1,10 @@
 """Whether runs end alike on other processors and ranks: a table of their iterations, in Markdown.
 
-    python docs/endings.py [SCENE ...]
+    python docs/endings.py [--coarse] [SCENE ...]
 
 OpenBLAS chooses its kernel by the processor, and sums round otherwise with each. Every scene is
-optimised with the kernels that this processor can run, and on one, two and three ranks.
+optimised with the kernels that this processor can run, and on one, two and three ranks; with
+--coarse on meshes, and to projections, that take a minute instead of an hour.
 """
 
 from __future__ import annotations
@@ -19,7 +20,13 @@ from typing import Any
 from dolfinopt.bench.measure import mpirun
 
 DEMOS = Path(__file__).parent.parent / "demos"
-SCENES = ["two_arm.toml", "lightest_two_arm.toml", "scara.toml", "spatial_arm.toml"]
+SHORT = ["design.sharpness=8", "design.continuation=10"]
+COARSE = {
+    "two_arm.toml": ["arms.cells=[100,6]", "design.filter_radius=0.02"],
+    "lightest_two_arm.toml": ["arms.cells=[80,6]", "design.filter_radius=0.025", *SHORT],
+    "scara.toml": ["arms.mesh_size=0.012", "design.filter_radius=0.024", *SHORT],
+    "spatial_arm.toml": ["arms.cells=[30,4,3]", "design.filter_radius=0.03"],
+}
 KERNELS = {"Haswell": "avx2", "SkylakeX": "avx512f", "Zen": "avx2", "Nehalem": "sse4_2"}
 RANKS = 1, 2, 3
 
@@ -30,9 +37,10 @@ def kernels() -> list[str]:
     return [name for name, flag in KERNELS.items() if flag in flags]
 
 
-def ending(scene: str, kernel: str, ranks: int) -> dict[str, Any]:
+def ending(scene: str, settings: list[str], kernel: str, ranks: int) -> dict[str, Any]:
     """Return the summary of an optimisation with a kernel, on so many ranks."""
-    command = [sys.executable, "-m", "dolfinopt", "optimize", scene, "--no-plots", "--out"]
+    command = [sys.executable, "-m", "dolfinopt", "optimize", scene, "--no-plots"]
+    command += [word for one in settings for word in ("--set", one)] + ["--out"]
     if ranks > 1:
         command = [str(mpirun()), "-n", str(ranks), *command]
     with tempfile.TemporaryDirectory() as folder:
@@ -50,12 +58,13 @@ def ending(scene: str, kernel: str, ranks: int) -> dict[str, Any]:
 def main() -> None:
     """Print a line a run."""
     print("| scene | kernel | ranks | iterations | ending | objective |\n|---|---|---|---|---|---|")
-    known = kernels()
+    known, asked = kernels(), sys.argv[1:]
+    coarse = "--coarse" in asked
     runs = [(kernel, 1) for kernel in known] + [(known[0], ranks) for ranks in RANKS[1:]]
-    for name in sys.argv[1:] or SCENES:
+    for name in [one for one in asked if one != "--coarse"] or COARSE:
         scene = str(DEMOS / name) if (DEMOS / name).is_file() else name
         for kernel, ranks in runs:
-            one = ending(scene, kernel, ranks)
+            one = ending(scene, COARSE[name] if coarse else [], kernel, ranks)
             words = one["iterations"], one["stop_code"], f"{one['objective']:.7g}"
             print("|", " | ".join(map(str, [name, kernel, ranks, *words])), "|", flush=True)
 

@@ -33,7 +33,8 @@ pytestmark = pytest.mark.serial  # nothing here knows of ranks
 
 PAGES = ROOT / "docs" / "pages"
 TESTED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(PAGES.glob("tutorials/*.md")),
-          *sorted(PAGES.glob("howto/*.md")), PAGES / "develop" / "add-response.md"]  # fmt: skip
+          *sorted(PAGES.glob("howto/*.md")), PAGES / "develop" / "add-response.md",
+          PAGES / "develop" / "own-form.md"]  # fmt: skip
 # Of every scene that a page simulates, so that it takes a fraction of a second.
 SETTINGS = {"cells": "[20, 3]", "max_iterations": "2", "mesh_size": "0.01", "load_cases": "4"}
 SUFFIXES = (".npz", ".md", ".gif", ".csv", ".vtu", ".xdmf", ".png", ".json", ".toml", ".py")

@@ -13,20 +13,20 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
-from dolfinopt.arms.modes import Carried, LoadedModes
+from dolfinopt.arms.modes import LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
+    MIDDLE_THRESHOLD,
     HelmholtzFilter,
     Projected,
     averages_of,
-    preserving_threshold,
     project,
     robust_thresholds,
 )
 from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
-from dolfinopt.fem.laws import isotropic
+from dolfinopt.fem.laws import law_of, stiffness_tensor
 from dolfinopt.fem.tensors import ElementTensors, element_of
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
@@ -40,8 +40,6 @@ from dolfinopt.reduction import Basis, Options
 from dolfinopt.scene import load as scenes
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.responses import STATICS, needs_alone
-
-THRESHOLD_BOUNDS = 0.25, 0.75  # bounds of `preserving_threshold`: the middle half of the densities
 
 # Share of the least change that an optimisation looks at, or of the simulation's tolerance, that
 # iterative solutions may leave; and what they leave, in their tolerance, with any contrast and
@@ -116,8 +114,8 @@ class Arm:
                 element = element_of(self.mesh, arm.element)
             except InputError as error:
                 raise InputError(f"{scene.source}: {error}") from None
-            law = isotropic(self.mesh.dim, self.solid.poisson_ratio)
-            operators = ElementTensors(self.mesh, element, arm.depth, law, profile)
+            law, stress = stiffness_tensor(self.mesh, self.solid), law_of(self.solid).stress
+            operators = ElementTensors(self.mesh, element, arm.depth, law, profile, stress)
             self.substructure = Substructure(
                 operators, field_tolerance(scene), needs_alone(scene, STATICS)
             )
@@ -187,9 +185,7 @@ class Arm:
         x = self.scene.initial(self.places[0]) if density is None else density
         return self.physical(np.full(self.mesh.num_cells, x))
 
-    def physical_designs(
-        self, x: np.ndarray, beta: float, threshold: float
-    ) -> tuple[PhysicalDesign, ...]:
+    def physical_designs(self, x: np.ndarray, beta: float) -> tuple[PhysicalDesign, ...]:
         """Return the designs that x stands for.
 
         One; or eroded, dilated and nominal with the robust projection, the nominal one last.
@@ -197,13 +193,12 @@ class Arm:
         Args:
             x: (n_cells,) design variables.
             beta: sharpness of the scene's projection.
-            threshold: its eta.
         """
         filtered = self.filtered(x)
         kind = self.scene.design.projection
         if not kind:
             return (filtered,)
-        thresholds: Sequence[float] = (threshold,)
+        thresholds: Sequence[float] = (MIDDLE_THRESHOLD,)
         if kind == "robust":
             eroded, nominal, dilated = robust_thresholds(*self.scene.design.erosions)
             thresholds = (eroded, dilated, nominal)
@@ -211,16 +206,6 @@ class Arm:
         return tuple(
             PhysicalDesign(self.mesh.keep(p.value), p, filtered.clipped) for p in projected
         )
-
-    def preserving_threshold(self, x: np.ndarray, beta: float) -> float:
-        """Return the projection's threshold that keeps the volume of x (collective on the arm).
-
-        Within `THRESHOLD_BOUNDS`: where all that is left between void and solid is nearly void, the
-        volume alone would choose a threshold among the void cells.
-        """
-        area = self._active(self.mesh.area)
-        eta = preserving_threshold(self.physical(x), area, beta, self.mesh.comm)
-        return float(np.clip(eta, *THRESHOLD_BOUNDS))
 
     def backward(self, gradient: np.ndarray, design: PhysicalDesign | None = None) -> np.ndarray:
         """Return the derivative with respect to x from that with respect to x_phys.
@@ -308,7 +293,7 @@ class Arm:
         state = self._state
         return state.basis if state is not None and state.is_reduced else None
 
-    def loaded_modes(self, place: int, carried: Carried) -> LoadedModes:
+    def loaded_modes(self, place: int, carried: np.ndarray) -> LoadedModes:
         """Return those of the current design, see `DesignState.loaded_modes`."""
         return self.current.loaded_modes(place, carried)
 

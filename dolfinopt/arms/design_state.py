@@ -11,9 +11,10 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial import cKDTree
 
-from dolfinopt.arms.modes import Carried, LoadedModes, full_first_frequency, loaded_modes
+from dolfinopt.arms.modes import LoadedModes, loaded_modes
 from dolfinopt.density.interpolation import Interpolated, interpolate
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
@@ -23,6 +24,8 @@ from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.hollow import Wall
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.reduction import METHODS, Basis, Options
+from dolfinopt.reduction.basis import interior_rows
+from dolfinopt.reduction.eigenproblem import Pencil, lowest_eigenpairs
 from dolfinopt.scene import load as scenes
 from dolfinopt.scene.schema import Material
 from dolfinopt.scene.tables.design import Interpolation
@@ -139,7 +142,7 @@ def kind_of(substructure: Substructure, solid: Material, law: Interpolation) -> 
 
 
 def _elastic(arm: Substructure, solid: Material, material: Interpolated) -> ElasticArm:
-    return arm.at(solid.young_modulus * material.stiffness, solid.density * material.mass)
+    return arm.at(solid.modulus * material.stiffness, solid.density * material.mass)
 
 
 # --
@@ -190,7 +193,7 @@ class DesignState:
     initial: InitialVectors
     stiffened: bool = False
     kept: dict[str, Any] = field(default_factory=dict, init=False)
-    _loaded: dict[int, tuple[Carried, LoadedModes]] = field(default_factory=dict, init=False)
+    _loaded: dict[int, tuple[np.ndarray, LoadedModes]] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self.x_phys = self.x_phys.copy()
@@ -209,7 +212,7 @@ class DesignState:
     @property
     def young_slope(self) -> np.ndarray:
         """Derivative of Young's modulus by x_phys (n_cells,), Pa."""
-        return self.solid.young_modulus * self.material.stiffness_slope
+        return self.solid.modulus * self.material.stiffness_slope
 
     @property
     def density_slope(self) -> np.ndarray:
@@ -254,6 +257,24 @@ class DesignState:
             return shape_integrals(self.elastic, basis, damping, loads)
 
     @cached_property
+    def static_body(self) -> ShapeIntegrals:
+        """The body in the static modes of its interfaces, which need no eigenproblem."""
+        elastic, static = self.elastic, self.elastic.constraint_modes()
+        none = np.empty((len(static.interior), 0))
+        weighted = elastic.mass_times(static.field)
+        basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)
+        loads = self.unit_loads.with_modes(static.field, weighted)
+        return shape_integrals(elastic, basis, self.scene.damping.stiffness_proportional, loads)
+
+    @cached_property
+    def rigid_body(self) -> ShapeIntegrals:
+        """The same body held undeformed; no reduction is needed."""
+        none = np.empty((*self.elastic.points.shape, 0))
+        outboard = np.empty((self.elastic.rigid.shape[2], 0))
+        basis = Basis(none, none, np.empty((0, 0)), outboard, np.empty((0, 0)))
+        return shape_integrals(self.elastic, basis, 0.0)
+
+    @cached_property
     def unit_loads(self) -> UnitLoads:
         """The static fields of unit accelerations, forces and moment, see there."""
         return unit_loads(self.elastic)
@@ -284,18 +305,23 @@ class DesignState:
     @cached_property
     def first_frequency(self) -> float:
         """First natural frequency of the arm by itself, clamped-free, Hz; not the reduced one's."""
+        pencil, V = Pencil(self.elastic, is_free=True), self.basis.V
+        _, mode = eigh(self.body.K, self.body.M, subset_by_index=[0, 0])
+        interior = interior_rows(self.elastic, V @ mode)
+        start = pencil.joined(interior, self.basis.outboard @ mode)
         with self.elastic.profile.phase("vibration"):
-            return full_first_frequency(self.elastic, self.basis.V, self.body.K, self.body.M)
+            values, _ = lowest_eigenpairs(pencil, 1, start)
+        return float(np.sqrt(values[0]) / (2.0 * np.pi))
 
-    def loaded_modes(self, place: int, carried: Carried) -> LoadedModes:
+    def loaded_modes(self, place: int, carried: np.ndarray) -> LoadedModes:
         """Return the natural modes with what is carried; once for the same load.
 
         Args:
             place: of the arm in the chain; several arms may share this design.
-            carried: about the outboard point.
+            carried: inertia (b, b) about the outboard points.
         """
         known = self._loaded.get(place)
-        if known is None or known[0] != carried:
+        if known is None or not np.array_equal(known[0], carried):
             count, guess = self.scene.objective.modes, self.initial.loaded.get(place)
             with self.elastic.profile.phase("vibration"):
                 known = carried, loaded_modes(self.elastic, carried, count, guess)
@@ -316,11 +342,13 @@ class DesignState:
         )
         if self.scene.objective == scene.objective:
             other._loaded = dict(self._loaded)
+        shared = ["unit_loads"]
+        if self.scene.damping == scene.damping:
+            shared += ["static_body"]
         if self.num_modes == num_modes and same_basis(self.scene, scene):
             same = self.scene.damping == scene.damping and self.stiffened == stiffened
-            for name in ("basis", "body") if same else ("basis",):
-                if name in self.__dict__:
-                    other.__dict__[name] = self.__dict__[name]
+            shared += ["basis", "body"] if same else ["basis"]
+        other.__dict__.update({name: x for name, x in self.__dict__.items() if name in shared})
         return other
 
 

@@ -12,8 +12,7 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.modes import Modes
-from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.dynamics.system import Preconditioner, State
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
@@ -99,11 +98,10 @@ class Crank(MachineSystem):
         """Return it."""
         return self.start
 
-    def preconditioner(self) -> Modes | Unchanged:
+    def preconditioner(self) -> Preconditioner:
         """Return the rod's vibrations, the start in their coordinates."""
         modes = super().preconditioner()
         q, qd = (modes.to_modes(x) for x in self.start)
-        assert isinstance(modes, Modes) and isinstance(modes.system, Crank)
         return replace(modes, system=replace(modes.system, start=(q, qd)))
 
 

@@ -80,7 +80,7 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     """Return a static iteration in plain DOLFINx: trilinear hexahedra, one load (collective)."""
     arm, solid = box_arm(comm, "link", SIZE, cells), scene.material_of(0)
-    elastic = solid.young_modulus, solid.poisson_ratio
+    elastic = solid.modulus, solid.ratio
     plain = PlainStatics(arm, *elastic, HEIGHT * THICKNESS, field_tolerance(scene))
     return plain.load.getSize(), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
 

@@ -119,13 +119,21 @@ def _materials(pattern: str | None, found: list[KeyInfo]) -> list[str]:
     asked = any(info.key == "material.name" for info in found)
     word = pattern.casefold()
     rows = [
-        f"{name:<24}{one.young_modulus / 1e9:>7.4g} GPa{one.poisson_ratio:>7.3g}"
-        f"{one.density:>7.0f} kg/m3{one.yield_strength / 1e6:>6.0f} MPa  {one.source}"
+        f"{name:<24}{_in_units(one.young_modulus, 1e9):>9} GPa{one.poisson_ratio:>7.3g}"
+        f"{one.density:>7.0f} kg/m3{_in_units(one.yield_strength, 1e6):>6} MPa  {one.source}"
         for name, one in CATALOGUE.items()
         if asked or word in name.casefold()
     ]
-    head = f"{'material':<24}{'Young':>11}{'Poisson':>8}{'density':>12}{'yield':>10}  source"
+    head = f"{'material':<24}{'Young':>13}{'Poisson':>8}{'density':>12}{'yield':>10}  source"
     return [head, *rows] if rows else []
+
+
+def _in_units(value: float | tuple[float, ...] | None, unit: float) -> str:
+    """Return a value, or those of both directions, in a unit; "-" for none."""
+    if value is None:
+        return "-"
+    values = value if isinstance(value, tuple) else (value,)
+    return "/".join(f"{one / unit:.4g}" for one in values)
 
 
 def _explained(info: KeyInfo) -> str:

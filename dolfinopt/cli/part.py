@@ -310,8 +310,10 @@ class Made:
         save(picture, folder / "part.png")
         if self.check is not None:
             save(check_figure(self.check, scene), folder / "deviation.png")
-            stress = stress_figure(designed(self.check.views), f"{scene.name}: stress of the parts")
-            save(stress, folder / "stress.png")
+            title = f"{scene.name}: stress of the parts"
+            stressed = [view for view in designed(self.check.views) if view.stress is not None]
+            if stressed:
+                save(stress_figure(stressed, title), folder / "stress.png")
 
     def tell(self, target: Path) -> None:
         """Print what was made."""

@@ -16,21 +16,6 @@ LEAST_SIDE_DISTANCE = 0.05
 # space cubic roots of its volume. Meshes of symmetric geometries that were made without a thought
 # of symmetry: 0.7 to 1.0.
 MIRROR_DISTANCE_LIMIT = 1.25
-NEAR_CELLS = 64  # that are looked at for the one in which a mirror image lies
-# Of a cell, by which a mirror image may lie outside it: sides across a curved face are chords.
-OUTSIDE_SHARE = 0.05
-# Corners of the simplices that make up a cell, by its directions and corners.
-SIMPLICES = {
-    (2, 3): [[0, 1, 2]],
-    (2, 4): [[0, 1, 3], [0, 2, 3]],
-    (3, 4): [[0, 1, 2, 3]],
-    (3, 8): [[0, *pair, 7] for pair in ((1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6))],
-}
-# Facets of a solid of skew cells up to which its filter is factorised, once. Tetrahedra, factor
-# and solve by MUMPS beside a solve by conjugate gradients, filter radius of 3 cells: 100 700 facets
-# 0.60 and 0.035 s, 36 MB, 0.10 s (0.23 with 8 cells, 0.53 with 25); a cube of 132 800 1.15 and
-# 0.055 s, 129 MB, 0.11 s; a slender arm of 290 800 1.9 and 0.107 s, 164 MB, 0.25 s.
-FACTORISED_FACETS = 150_000
 COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above one another
 
 # -- members ---------------------------------------------------------------------------------
@@ -38,6 +23,7 @@ COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above on
 # Samples along a cell of the mean area, and in all: a width is known to a sample.
 CELL_SAMPLES = 4
 SAMPLES_LIMIT = 1_000_000
+SIDE_ROUNDING_SHARE = 1e-9  # of a sample, by which a middle may lie outside its cell
 # A piece that hangs on the rest by one end is a corner up to this length, in widths, and a member
 # beyond. Two straight edges that meet at less than 23 degrees make the longest corners.
 CORNER_LENGTH_RATIO = 2.0

@@ -8,8 +8,13 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage
 
-from dolfinopt.density.measured import CELL_SAMPLES, CORNER_LENGTH_RATIO, SAMPLES_LIMIT
-from dolfinopt.mesh.checks import cell_sizes
+from dolfinopt.density.measured import (
+    CELL_SAMPLES,
+    CORNER_LENGTH_RATIO,
+    SAMPLES_LIMIT,
+    SIDE_ROUNDING_SHARE,
+)
+from dolfinopt.mesh.checks import cell_sizes, facet_areas, facet_corners
 
 EIGHT = np.ones((3, 3), dtype=bool)
 
@@ -101,31 +106,50 @@ def _thinnest(sides: int, corners: bytes, solid: bytes) -> Widths:
 
 def _sampled(corners: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, float]:
     """Return 1 (solid), 0 (void) or -1 (outside) on a grid of squares, and their size, m."""
-    low = corners.min(axis=(0, 1))
-    extent = corners.max(axis=(0, 1)) - low
+    low, extent = corners.min(axis=(0, 1)), np.ptp(corners, axis=(0, 1))
     x, y = np.moveaxis(corners, 2, 0)
     area = 0.5 * np.abs((x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1))
-    size = max(np.sqrt(np.median(area)) / CELL_SAMPLES, np.sqrt(extent.prod() / SAMPLES_LIMIT))
-    counts = np.maximum(np.rint(extent / size).astype(int), 1)
-    size = float(extent[0] / counts[0])
-    raster = np.full(counts, -1, dtype=np.int8)
-    first = np.floor((corners.min(axis=1) - low) / size - 0.5).astype(int)
-    last = np.ceil((corners.max(axis=1) - low) / size - 0.5).astype(int)
-    spread = (last - first).max(axis=0) + 1
-    # Corners in one sense of rotation, so that inside is to the left of every side.
-    turned = (x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1) < 0.0
-    around = np.where(turned[:, None, None], corners[:, ::-1], corners)
-    side = np.roll(around, -1, axis=1) - around
-    for i in range(spread[0]):
-        for j in range(spread[1]):
-            place = first + np.array([i, j])
-            point = low + (place + 0.5) * size
-            away = point[:, None] - around
-            left = side[..., 0] * away[..., 1] - side[..., 1] * away[..., 0]
-            inside = (left >= -1e-9 * size * size).all(axis=1)
-            inside &= ((place >= 0) & (place < counts)).all(axis=1)
-            raster[tuple(place[inside].T)] = solid[inside]
-    return raster, size
+    size = sample_size(np.sqrt(np.median(area)), extent)
+    size = float(extent[0] / max(np.rint(extent[0] / size), 1))
+    cells = _cells_at(corners, low, extent, size)
+    return np.where(cells < 0, -1, solid[cells]), size
+
+
+def sample_size(cell: float, extent: np.ndarray) -> float:
+    """Return the side of the samples, m, of cells of a size within a box of sides (d,), m."""
+    return max(cell / CELL_SAMPLES, float(np.prod(extent) / SAMPLES_LIMIT) ** (1.0 / len(extent)))
+
+
+def _cells_at(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float) -> np.ndarray:
+    """Return which convex cell holds the middle of every sample of side h from `low` on, or -1."""
+    counts = np.maximum(np.rint(extent / h).astype(int), 1)
+    found = np.full(counts, -1)
+    first = np.floor((corners.min(axis=1) - low) / h - 0.5).astype(int)
+    last = np.ceil((corners.max(axis=1) - low) / h - 0.5).astype(int)
+    sides = [_inwards(corners, side) for side in _sides(corners)]
+    for step in np.ndindex(*((last - first).max(axis=0) + 1)):
+        place = first + step
+        point = low + (place + 0.5) * h
+        inside = ((place >= 0) & (place < counts)).all(axis=1)
+        for origin, normal in sides:
+            height = np.einsum("ni,ni->n", normal, point - origin)
+            inside &= height >= -SIDE_ROUNDING_SHARE * h ** corners.shape[2]
+        found[tuple(place[inside].T)] = np.flatnonzero(inside)
+    return found
+
+
+def _sides(corners: np.ndarray) -> list[list[int]]:
+    """Return corners of every side: two in order around a plane cell; three or four in space."""
+    _, count, d = corners.shape
+    return facet_corners(3, count) if d == 3 else [[k - 1, k] for k in range(count)]
+
+
+def _inwards(corners: np.ndarray, side: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a point (n, d) of each cell's side, and a vector normal to it into the cell."""
+    # Three corners tell a side of a hexahedron.
+    origin, normal = corners[:, side[0]], facet_areas(corners[:, side[:3]])
+    height = np.einsum("ni,ni->n", normal, corners.mean(axis=1) - origin)
+    return origin, normal * np.sign(height)[:, None]
 
 
 Place = tuple[int, ...]  # of a sample
@@ -196,17 +220,10 @@ def _thinner(inside: np.ndarray, depth: np.ndarray, diameter: int) -> Place | No
 # 0.7 r would fit, which tells them from members. After Hildebrand & Ruegsegger (1997),
 # doi:10.1046/j.1365-2818.1997.1340694.x.
 
-FINE = 4.0  # voxels in a cell's length
-MOST_VOXELS = 1_500_000
 FIRST, FACTOR = 1.5, 1.2  # smallest radius, in voxels; from one radius to the next
 THIN = 0.7  # radius that fits in what opening takes away, over its own, from which on it is narrow
 FEW = 4  # voxels that are no member
 WIDE = 1.5  # of the widths asked for: up to which gaps are looked for
-# Three corners of every face of a cell, in the order of the finite elements.
-FACES = {
-    4: [(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)],
-    8: [(0, 2, 4), (1, 3, 5), (0, 1, 4), (2, 3, 6), (0, 1, 2), (4, 5, 6)],
-}
 
 
 def thinnest_solid(corners: np.ndarray, solid: np.ndarray, asked: float) -> Widths:
@@ -224,9 +241,9 @@ def thinnest_solid(corners: np.ndarray, solid: np.ndarray, asked: float) -> Widt
         return None, None
     low, extent = corners.min(axis=(0, 1)), np.ptp(corners, axis=(0, 1))
     cell = float(np.median(cell_sizes(corners))) ** (1.0 / 3.0)
-    h = voxel_size(cell, extent)
+    h = sample_size(cell, extent)
     margin = int(np.ceil(WIDE * asked / h)) + 1
-    voxels = np.pad(_voxels(corners[solid], low, extent, h), margin)
+    voxels = np.pad(_cells_at(corners[solid], low, extent, h) >= 0, margin)
 
     def width(found: tuple[float, Place] | None) -> Width | None:
         if found is None:
@@ -236,33 +253,6 @@ def thinnest_solid(corners: np.ndarray, solid: np.ndarray, asked: float) -> Widt
 
     gap = width(narrowest(~voxels, h, WIDE * asked))
     return width(narrowest(voxels, h) or widest(voxels, h)), gap
-
-
-def voxel_size(cell: float, extent: np.ndarray) -> float:
-    """Return the side of the voxels, m, of cells of a size within a box of sides (3,), m."""
-    return max(cell / FINE, float(np.prod(extent) / MOST_VOXELS) ** (1.0 / 3.0))
-
-
-def _voxels(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float) -> np.ndarray:
-    """Return which voxels (nx, ny, nz) of side h from `low` on have their centres in cells."""
-    counts = np.maximum(np.rint(extent / h).astype(int), 1)
-    found = np.zeros(counts, dtype=bool)
-    first = np.floor((corners.min(axis=1) - low) / h - 0.5).astype(int)
-    last = np.ceil((corners.max(axis=1) - low) / h - 0.5).astype(int)
-    middle = corners.mean(axis=1)
-    planes = []
-    for a, b, c in FACES[corners.shape[1]]:
-        normal = np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
-        inwards = np.einsum("ni,ni->n", normal, middle - corners[:, a])
-        planes.append((corners[:, a], normal * np.sign(inwards)[:, None]))
-    for step in np.ndindex(*((last - first).max(axis=0) + 1)):
-        place = first + step
-        point = low + (place + 0.5) * h
-        inside = ((place >= 0) & (place < counts)).all(axis=1)
-        for origin, normal in planes:
-            inside &= np.einsum("ni,ni->n", normal, point - origin) >= -1e-9 * h**3
-        found[tuple(place[inside].T)] = True
-    return found
 
 
 def narrowest(inside: np.ndarray, h: float, most: float = np.inf) -> tuple[float, Place] | None:

@@ -31,11 +31,11 @@ from dolfinopt.dynamics.measured import (
     ADJOINT_CORRECTIONS_LIMIT,
     ROUNDING,
 )
-from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, factorise, slow_coordinates
-from dolfinopt.dynamics.system import Linearisation
+from dolfinopt.dynamics.newton_matrix import NewtonMatrix, chunks, matrix_of, slow_coordinates
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.tangent import Tangent
 
-_Factors = tuple[NewtonMatrix, Linearisation]
+_Factors = tuple[NewtonMatrix, Tangent]
 
 
 class Adjoint:
@@ -114,8 +114,9 @@ class Adjoint:
             return self._kept[key]
         window = self._stages.window(part.start, part.stop)
         q, qd, a = (x[part] for x in self._at)
-        matrix = factorise(window, q, qd, a, slow)
-        exact = tangent_at(window, q, qd, a) if len(matrix.fast) else matrix.tangent
+        exact = tangent_at(window, q, qd, a)
+        own = exact if len(slow) == q.shape[2] else exact.step_mean(1, slow)
+        matrix = matrix_of(window, own, slow)
         if len(window.h) == len(self._stages.h):
             self._kept = {key: (matrix, exact)}
         return matrix, exact
@@ -152,7 +153,7 @@ def _sampled(
 
 def _answered(
     matrix: NewtonMatrix,
-    exact: Linearisation,
+    exact: Tangent,
     by_a: np.ndarray,
     by_y: np.ndarray,
     after: np.ndarray,
@@ -185,7 +186,7 @@ def _answered(
 
 
 def _gradient(
-    stages: Stages, exact: Linearisation, multipliers: np.ndarray
+    stages: Stages, exact: Tangent, multipliers: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient of sum multipliers . residual by accelerations and first states."""
     by_rates = exact.transposed(multipliers.reshape(-1, multipliers.shape[2]))

@@ -21,6 +21,7 @@ from dolfinopt.motion.build import (
     rigid_motion,
     table_rows,
 )
+from dolfinopt.motion.measured import DENSE_INSTANTS
 from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
@@ -98,7 +99,26 @@ def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
     drives = _drives(scene)
     if drives.table is not None:
         instants = with_ends(instants, [drives.table], scene.horizon)
+    if drives.rigid_feed_forward:
+        instants = _among(instants, _reversals(scene, motion), scene.horizon)
     return MachineSystem(mechanism, motion, instants, drives, loops_of(scene))
+
+
+def _reversals(scene: Scene, motion: Callable[[np.ndarray], RigidMotion]) -> list[float]:
+    """Return the instants at which joints with Coulomb friction are to turn round, s.
+
+    Feed-forward jumps there, and friction almost then: what is left of both is a pulse, which steps
+    of smooth motions pass over without a trace.
+    """
+    coulomb = sum(friction_of(scene, soft).coulomb for soft in (False, True))
+    if not np.any(coulomb):
+        return []
+    t = np.linspace(0.0, scene.horizon, DENSE_INSTANTS)
+    v = motion(t).qd * (coulomb > 0.0)
+    k, joint = np.nonzero(v[:-1] * v[1:] < 0.0)
+    before, after = np.abs(v[k, joint]), np.abs(v[k + 1, joint])
+    found: list[float] = (t[k] + (t[k + 1] - t[k]) * before / (before + after)).tolist()
+    return found
 
 
 def _begun_at(
@@ -189,11 +209,15 @@ def with_ends(
     instants: tuple[float, ...], tables: Iterable[Table], horizon: float
 ) -> tuple[float, ...]:
     """Return the breakpoints, s, and among them the ends of tables, beyond which they are zero."""
+    return _among(instants, (float(table.t[-1]) for table in tables), horizon)
+
+
+def _among(instants: tuple[float, ...], more: Iterable[float], horizon: float) -> tuple[float, ...]:
+    """Return the breakpoints, s, and among them more instants before the horizon."""
     apart, breakpoints = FILE_ROUNDING * horizon, list(instants)
-    for table in tables:
-        end = float(table.t[-1])
-        if end < horizon and min(abs(end - other) for other in breakpoints) > apart:
-            breakpoints.append(end)
+    for t in more:
+        if t < horizon and min(abs(t - other) for other in breakpoints) > apart:
+            breakpoints.append(t)
     return tuple(sorted(breakpoints))
 
 

@@ -16,7 +16,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from dolfinopt.dynamics.system import Instants, Linearisation, Preconditioner, State, inverse_size
+from dolfinopt.dynamics.system import Instants, Preconditioner, State, inverse_size
+from dolfinopt.multibody.tangent import Tangent
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,7 @@ def tangent_at(
     qd: np.ndarray,
     a: np.ndarray,
     keep: np.ndarray | None = None,
-) -> Linearisation:
+) -> Tangent:
     """Return the residual's derivative at the n s stages by the coordinates `keep`, or all."""
     q, qd, a = (x.reshape(-1, q.shape[2]) for x in (q, qd, a))
     return stages.instants.linearise(q, qd, a, keep)

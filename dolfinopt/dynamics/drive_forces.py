@@ -16,10 +16,9 @@ import numpy as np
 from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import MATRIX_BYTES
-from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals, add_integrals
-from dolfinopt.multibody.tangent import linearise
+from dolfinopt.multibody.tangent import Tangent, linearise
 
 
 class DriveForces:
@@ -75,7 +74,7 @@ class _Chunk:
     state: MachineState
 
     @cached_property
-    def tangent(self) -> Linearisation:
+    def tangent(self) -> Tangent:
         """Of inverse dynamics by rigid, motors' and elastic coordinates."""
         mechanism, motion = self.state.machine.mechanism, self.state.motion
         every = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))

@@ -48,7 +48,8 @@ class Springs:
 
 
 NOTHING = np.zeros(0)
-NO_SPRINGS = Springs(np.zeros(0, dtype=int), NOTHING, NOTHING, Friction.none(0))
+NO_COORDINATES = np.zeros(0, dtype=int)
+NO_SPRINGS = Springs(NO_COORDINATES, NOTHING, NOTHING, Friction.none(0))
 
 
 @dataclass(frozen=True, eq=False)

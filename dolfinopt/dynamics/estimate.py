@@ -134,7 +134,7 @@ def unresolved(
     vibrates = preconditioner.frequencies > 0.0
     if not vibrates.any():
         return 0.0, np.zeros(count)  # nothing is known of single coordinates
-    q, qd = stage_values(stages, *step_beginnings(stages, state, a), a)
+    q, qd = at_stages(stages, state, a)
     breaks = np.searchsorted(time_grid, preconditioner.system.breakpoints)[:-1]
     amplitudes, rate = _free_vibrations(stages, (q, qd, a), state[0][0], breaks)
     method, z = radau_iia(len(stages.method.c) + 1), rate * stages.h[:, None]

@@ -18,7 +18,6 @@ import numpy as np
 
 from dolfinopt.dynamics.feed_forward import feed_forward_gradient
 from dolfinopt.dynamics.measured import CLOSURE_COMPLIANCE_SHARE
-from dolfinopt.dynamics.system import Linearisation
 from dolfinopt.multibody.closures import ClosedLoops
 from dolfinopt.multibody.gradient import body_gradient
 from dolfinopt.multibody.newton_euler import elastic_residual, inverse_dynamics
@@ -72,13 +71,15 @@ class MachineInstants:
 
     def linearise(
         self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray, keep: np.ndarray | None = None
-    ) -> Linearisation:
+    ) -> Tangent:
         """Return its derivative by the coordinates `keep`, or all."""
         here = self.state(y, yd, ydd)
         if self.machine.is_prescribed:
             return linearise(self.machine.mechanism, here.motion, *here.elastic, keep)
-        own = np.arange(self.machine.num_coordinates) if keep is None else keep
-        return Tangent(here.matrix()[:, :, own], own, np.arange(len(own)))
+        matrix, own = here.matrix(), np.arange(self.machine.num_coordinates)
+        if keep is not None:  # in memory as products want it, which indexing does not give
+            matrix, own = matrix.take(keep, axis=2), keep
+        return Tangent(matrix, own, np.arange(len(own)))
 
 
 @dataclass(frozen=True, eq=False)

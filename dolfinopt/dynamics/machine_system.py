@@ -25,13 +25,13 @@ from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.dynamics.drives import NOTHING, Drives
+from dolfinopt.dynamics.drives import NO_COORDINATES, NOTHING, Drives
 from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.feed_forward import known_forces
 from dolfinopt.dynamics.machine_instants import MachineInstants
 from dolfinopt.dynamics.measured import DEFLECTION_LIMIT, EXACT
-from dolfinopt.dynamics.modes import Modes, modes_of
-from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.dynamics.modes import modes_of
+from dolfinopt.dynamics.system import Preconditioner, State, unchanged
 from dolfinopt.dynamics.tables import motion_at_stages, stage_instants
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.closures import Loops
@@ -42,13 +42,7 @@ from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.multibody.tree import Mechanism
 
-PRESCRIBED = Drives(
-    free=np.zeros(0, dtype=int),
-    stiffness=NOTHING,
-    damping=NOTHING,
-    limits=NOTHING,
-    driven=np.zeros(0, dtype=bool),
-)
+PRESCRIBED = Drives(NO_COORDINATES, NOTHING, NOTHING, NOTHING, NO_COORDINATES > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,13 +359,13 @@ class MachineSystem:
         squares = np.linalg.eigvals(np.linalg.solve(self.mechanism.stiffness(), mass))
         return float(np.sqrt(1.0 / np.abs(squares).max()))
 
-    def preconditioner(self) -> Modes | Unchanged:
+    def preconditioner(self) -> Preconditioner:
         """Return the arms' vibrations; simulation and adjoint ask for the same.
 
         Where nothing guides a free coordinate it goes far, and all are treated densely.
         """
-        return Unchanged(self) if self.is_held.any() else self._modes
+        return unchanged(self) if self.is_held.any() else self._modes
 
     @cached_property
-    def _modes(self) -> Modes:
+    def _modes(self) -> Preconditioner:
         return modes_of(self)

@@ -17,7 +17,6 @@ from dolfinopt.dynamics.newton_matrix import (
     NewtonMatrix,
     chunks,
     factorise,
-    has_room,
     slow_coordinates,
 )
 from dolfinopt.dynamics.system import State
@@ -92,7 +91,7 @@ def newton(
         spend(float(len(stages.h)))
         fresh = step is None
         if step is None:
-            if not has_room(stages, slow):
+            if len(chunks(stages, slow)) > 1:  # no room
                 return Iterate(at.a, False, iteration)
             matrix = factorise(stages, at.q, at.qd, at.a, slow)
             step = _step(matrix, at)

@@ -27,7 +27,7 @@ from dolfinopt.dynamics.collocation import (
     vector_jacobian_product,
 )
 from dolfinopt.dynamics.measured import DENSE_COORDINATES, MATRIX_BYTES, SLOW_ANGLES
-from dolfinopt.dynamics.system import Linearisation
+from dolfinopt.multibody.tangent import Tangent
 
 
 def slow_coordinates(stages: Stages, more_than: int = 0) -> np.ndarray:
@@ -50,11 +50,6 @@ def up_to_angle(stages: Stages, limit: float) -> np.ndarray:
     if preconditioner.coupled or not preconditioner.guided:
         return np.arange(len(angles))
     return np.flatnonzero(angles <= max(limit, angles.min()))
-
-
-def has_room(stages: Stages, slow: np.ndarray) -> bool:
-    """Return whether the matrix of all steps fits in `MATRIX_BYTES`."""
-    return len(chunks(stages, slow)) == 1
 
 
 def chunks(stages: Stages, slow: np.ndarray) -> list[slice]:
@@ -84,7 +79,7 @@ class NewtonMatrix:
     """
 
     stages: Stages
-    tangent: Linearisation
+    tangent: Tangent
     slow: np.ndarray
     fast: np.ndarray
     inverse: np.ndarray
@@ -205,7 +200,7 @@ def factorise(
     return matrix_of(stages, tangent_at(stages, q, qd, a, slow), slow)
 
 
-def matrix_of(stages: Stages, tangent: Linearisation, slow: np.ndarray) -> NewtonMatrix:
+def matrix_of(stages: Stages, tangent: Tangent, slow: np.ndarray) -> NewtonMatrix:
     """Return Newton's matrix of a tangent by the slow coordinates at the n s stages.
 
     Of a tangent at n instants, each of them stands for all stages of its step.

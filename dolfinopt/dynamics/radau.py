@@ -172,7 +172,8 @@ class _Integration:
         if marched:
             self._step_error = min(self._step_error, errors.max()) / over
         # Vibrations that are not resolved hardly get smaller with more steps, until they are.
-        stalls = before is not None and error > 0.9 * before.error
+        more = before is not None and len(before.time_grid) < len(self.time_grid)
+        stalls = before is not None and more and error > 0.9 * before.error
         self._stalled += stalls
         least = FINER_GRID_RATIOS[1] if stalls else FINER_GRID_RATIOS[0]
         return finer(self._system, self.time_grid, errors, 1.0 / over, self._stages, least)

@@ -10,40 +10,24 @@ second derivative of a coordinate that nothing else depends on: collocation then
 stage, positions with order 2 s - 1, velocities s, multipliers s - 1 (Hairer, Lubich & Roche 1989,
 doi:10.1007/BFb0093947). That holds for the method's own `collocation.stage_values`; a solution's
 interpolant meets it at the steps' ends, and between them to its order. Neither is definite: such a
-system has no preconditioner (`Unchanged`), and all its coordinates are treated densely, with
+system has no preconditioner (`unchanged`), and all its coordinates are treated densely, with
 pivots. tests/dynamics/test_system.py has examples.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import prod
+from typing import Any, Protocol
 
 import numpy as np
 
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
+from dolfinopt.multibody.tangent import Tangent
+from dolfinopt.multibody.tree import Mechanism
 
 State = tuple[np.ndarray, np.ndarray]  # q, qd
-
-
-class Linearisation(Protocol):
-    """Derivative of the residual by S of the coordinates and their rates at n instants.
-
-    Of m rows or changes, a multiple of n, each instant stands for as many in turn.
-    """
-
-    def step_mean(self, stages: int, keep: np.ndarray) -> Linearisation:
-        """Return its mean over every `stages` instants, by coordinates `keep` of the S."""
-
-    def dense(self) -> np.ndarray:
-        """Return the S coordinates' own rows (n, S, 3 S), columns ordered q, qd, qdd."""
-
-    def times(
-        self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, wanted: np.ndarray
-    ) -> np.ndarray:
-        """Return the change of the W rows `wanted` (m, W) by one of the S coordinates, (m, S)."""
-
-    def transposed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
 
 
 class Instants(Protocol):
@@ -60,37 +44,8 @@ class Instants(Protocol):
 
     def linearise(
         self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, keep: np.ndarray | None = None
-    ) -> Linearisation:
+    ) -> Tangent:
         """Return the derivative by the ascending coordinates `keep` (S,), or all."""
-
-
-class Preconditioner(Protocol):
-    """Coordinates z of a system in which its residual is nearly uncoupled.
-
-    Attributes:
-        system: in z.
-        frequencies: (N,) of every coordinate by itself, rad/s; 0 of what must be treated densely.
-        uncoupled: stiffness, damping and mass (N,) of every coordinate by itself.
-        guided: whether zero is a guess of the whole motion: then all steps are solved at once.
-        coupled: whether constraints couple fast coordinates: then these are treated densely, too.
-    """
-
-    @property
-    def system(self) -> System: ...
-    @property
-    def frequencies(self) -> np.ndarray: ...
-    @property
-    def uncoupled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
-    @property
-    def guided(self) -> bool: ...
-    @property
-    def coupled(self) -> bool: ...
-
-    def to_modes(self, q: np.ndarray) -> np.ndarray:
-        """Return z (..., N) of coordinates q (..., N)."""
-
-    def from_modes(self, z: np.ndarray) -> np.ndarray:
-        """Return q (..., N)."""
 
 
 class System(Protocol):
@@ -138,47 +93,62 @@ class System(Protocol):
         """Return the largest deflection of a body in a motion q (n, N), over its length."""
 
     def preconditioner(self) -> Preconditioner:
-        """Return coordinates for Newton's method; `Unchanged` where there are no better ones."""
+        """Return coordinates for Newton's method; `unchanged` where there are no better ones."""
 
 
-class Unchanged:
-    """A system in its own coordinates: all of them are treated densely, and it is marched."""
+@dataclass(frozen=True, eq=False)
+class Preconditioner:
+    """Coordinates z of a system in which its residual is nearly uncoupled, q = T z part by part.
 
-    guided = False
-    coupled = False
+    Attributes:
+        system: in z, a `System`.
+        frequencies: (N,) of every coordinate by itself, rad/s; 0 of what must be treated densely.
+        uncoupled: stiffness, damping and mass (N,) of every coordinate by itself.
+        guided: whether zero is a guess of the whole motion: then all steps are solved at once.
+        coupled: whether constraints couple fast coordinates: then these are treated densely, too.
+        parts: the coordinates that change; the others stay.
+        transforms, inverses: T and T^-1 (q, q) of every part.
+    """
 
-    def __init__(self, system: System) -> None:
-        """Take the system."""
-        self.system = system
-        size = system.num_coordinates
-        self.frequencies = np.zeros(size)
-        self.uncoupled = (np.ones(size), np.zeros(size), np.ones(size))
+    system: Any
+    frequencies: np.ndarray
+    uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
+    guided: bool = False
+    coupled: bool = False
+    parts: tuple[slice, ...] = ()
+    transforms: tuple[np.ndarray, ...] = ()
+    inverses: tuple[np.ndarray, ...] = ()
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
-        """Return q."""
-        return q
+        """Return z (..., N) of coordinates q (..., N)."""
+        return self._each(q, self.inverses)
 
     def from_modes(self, z: np.ndarray) -> np.ndarray:
-        """Return z."""
-        return z
+        """Return q (..., N)."""
+        return self._each(z, self.transforms)
 
     def gradient_to_modes(self, by_q: np.ndarray) -> np.ndarray:
-        """Return dJ/dq."""
-        return by_q
+        """Return dJ/dz = T' dJ/dq (..., N)."""
+        return self._each(by_q, (T.T for T in self.transforms))
 
     def gradient_from_modes(self, by_z: np.ndarray) -> np.ndarray:
-        """Return dJ/dz."""
-        return by_z
+        """Return dJ/dq = T^-T dJ/dz (..., N)."""
+        return self._each(by_z, (inverse.T for inverse in self.inverses))
+
+    def _each(self, x: np.ndarray, maps: Iterable[np.ndarray]) -> np.ndarray:
+        rows = x.reshape(prod(x.shape[:-1]), x.shape[-1]).copy()
+        for part, T in zip(self.parts, maps, strict=True):
+            rows[:, part] = rows[:, part] @ T.T
+        return rows.reshape(x.shape)
 
 
-class Measured(Protocol):
-    """Anything with a system's norm."""
+def unchanged(system: System) -> Preconditioner:
+    """Return a system in its own coordinates: all are treated densely, and it is marched."""
+    one = np.ones(system.num_coordinates)
+    return Preconditioner(system, 0.0 * one, (one, 0.0 * one, one))
 
-    def norm(self, q: np.ndarray) -> np.ndarray:
-        """Return the largest norm over the instants, by group."""
 
-
-def relative_error(system: Measured, error: np.ndarray, q: np.ndarray) -> float:
+def relative_error(system: System | Mechanism, error: np.ndarray, q: np.ndarray) -> float:
     """Return the largest error in time over the largest value, worst group; both (n, N)."""
     return float((system.norm(error) * inverse_size(system.norm(q))).max(initial=0.0))
 

@@ -36,7 +36,7 @@ from dolfinopt.dynamics.collocation import (
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import EXACT
 from dolfinopt.dynamics.newton_matrix import matrix_of
-from dolfinopt.dynamics.system import Unchanged
+from dolfinopt.dynamics.system import unchanged
 from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_instants
 from dolfinopt.dynamics.time_grid import first_grid
 from dolfinopt.errors import InputError
@@ -240,7 +240,7 @@ def tip_response(
     """Return the tip's answer by the linearised collocation equations, all columns at once."""
     joints, splines = corrections.joints, corrections.splines
     method, S = radau_iia(len(solution.nodes)), machine.num_coordinates
-    stages = stages_of(Unchanged(machine), method, solution.time_grid)
+    stages = stages_of(unchanged(machine), method, solution.time_grid)
     q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
     instants = machine.at_stages(solution.time_grid, method.c)
     state = instants.state(*(x.reshape(-1, S) for x in (q, qd, solution.a)))

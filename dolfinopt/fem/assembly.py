@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,7 +12,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.fem.measured import (
-    BUFFER_ENTRIES,
     FIELD_CHUNK_ENTRIES,
     STRESS_CHUNK_CELLS,
     STRESS_CHUNK_ENTRIES,
@@ -145,120 +143,57 @@ def interior_entries(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) ->
         block: b, dofs of a node, which are interior together.
         numbers: (b n_local_nodes,) global interior number of each local dof, -1 for others.
     """
-    nodes = np.where(numbers[::block] < 0, -1, numbers[::block] // block)
-    rows = nodes[np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))]
-    columns = nodes[pattern.indices]
-    source = np.flatnonzero((rows >= 0) & (columns >= 0))
-    source = source[np.lexsort((columns[source], rows[source]))]
-    row, column = rows[source], columns[source]  # of blocks
-    first = np.flatnonzero(np.diff(row, prepend=-1))
-    lengths = np.diff(np.append(first, len(row)))
-    start, length = np.repeat(first, lengths), np.repeat(lengths, lengths)
-    base = block * block * start + block * (np.arange(len(row)) - start)
-    size, kind = block * block * len(row), PETSc.IntType
-    rows, columns, places = (np.empty(size, dtype=kind) for _ in range(3))
-    for r in range(block):
-        for c in range(block):
-            at = base + r * block * length + c
-            rows[at] = block * row + r
-            columns[at] = block * column + c
-            places[at] = block * block * source + r * block + c
-    return InteriorEntries(rows, columns, places)
-
-
-class SharedRows:
-    """The interior rows that one of several ranks owns, put together of all ranks' entries.
-
-    Who sends what is found once. PETSc's own stash takes five times as long at 500 000 rows a rank.
-
-    Attributes:
-        indptr, columns: of its rows, with global columns.
-    """
-
-    def __init__(self, comm: MPI.Comm, entries: InteriorEntries, owned: int):
-        """Tell the other ranks which entries they get (collective).
-
-        Args:
-            comm: the arm's ranks.
-            entries: of this rank.
-            owned: number of interior dofs this rank owns.
-        """
-        self._comm = comm
-        bounds = np.append(0, np.cumsum(comm.allgather(owned)))
-        first, size = bounds[comm.rank], int(bounds[-1])
-        owner = np.searchsorted(bounds, entries.rows, side="right") - 1
-        sent = np.flatnonzero(owner != comm.rank)
-        sent = sent[np.argsort(owner[sent], kind="stable")]
-        self._sent = entries.source[sent]
-        self._counts = np.bincount(owner[sent], minlength=comm.size)
-        self._arriving = np.array(comm.alltoall(self._counts.tolist()))
-        rows, columns = (
-            self._exchanged(each[sent].astype(np.int64)) for each in (entries.rows, entries.columns)
-        )
-        mine = np.flatnonzero(owner == comm.rank)
-        here = entries.rows[mine] - first
-        joined = np.zeros(owned, dtype=bool)
-        joined[rows - first] = True
-        alone, met = mine[~joined[here]], mine[joined[here]]
-        rows = np.append(entries.rows[met], rows) - first  # int64, as the arriving ones are
-        keys = rows * size + np.append(entries.columns[met], columns)
-        unique, self._place = np.unique(keys, return_inverse=True)
-        self._met = entries.source[met]
-        row = np.append(entries.rows[alone] - first, unique // size)
-        self.indptr = np.append(0, np.cumsum(np.bincount(row, minlength=owned)))
-        self.indptr = self.indptr.astype(PETSc.IntType)
-        # Rows are alone or joined, and either's entries are sorted: one stable order of both.
-        order = np.argsort(row, kind="stable")
-        self.columns = np.append(entries.columns[alone], unique % size).astype(PETSc.IntType)[order]
-        self._source = np.append(entries.source[alone], np.zeros(len(unique), PETSc.IntType))[order]
-        self._joined = np.flatnonzero(order >= len(alone))
-
-    def _exchanged(self, sent: np.ndarray) -> np.ndarray:
-        """Return what arrives, by its sender's rank, when every rank has sent its own."""
-        out = np.empty(self._arriving.sum(), dtype=sent.dtype)
-        self._comm.Alltoallv([sent, self._counts], [out, self._arriving])
-        return out
-
-    def values(self, data: np.ndarray) -> np.ndarray:
-        """Return the rows' values, given the data (nnz,) of this rank's matrix (collective)."""
-        met = np.append(data[self._met], self._exchanged(data[self._sent]))
-        out = np.take(data, self._source)
-        out[self._joined] = np.bincount(self._place, met, minlength=len(self._joined))
-        return out
+    count = pattern.nnz * block**2
+    blocks = np.arange(count).reshape(-1, block, block), pattern.indices, pattern.indptr
+    places = sp.bsr_matrix(blocks, shape=2 * (block * pattern.shape[0],)).tocoo()
+    rows, columns = numbers[places.row], numbers[places.col]
+    kept = (rows >= 0) & (columns >= 0)
+    table = sp.coo_matrix((places.data[kept], (rows[kept], columns[kept]))).tocsr()
+    table.sort_indices()
+    rows = np.repeat(np.arange(table.shape[0]), np.diff(table.indptr))
+    return InteriorEntries(*(x.astype(PETSc.IntType) for x in (rows, table.indices, table.data)))
 
 
 class InteriorMatrix:
     """The interior rows and columns of a local matrix as a PETSc matrix."""
 
     def __init__(self, comm: MPI.Comm, entries: InteriorEntries, owned: int):
-        """Lay down the pattern.
+        """Lay down the pattern (collective).
 
         Args:
             comm: the arm's ranks.
-            entries: of this rank.
+            entries: of this rank, in rows of any rank.
             owned: number of interior dofs this rank owns.
         """
-        self._serial = comm.size == 1
-        if self._serial:
-            rows, cols, self._source = entries.rows, entries.columns, entries.source
-            indptr = np.searchsorted(rows, np.arange(owned + 1)).astype(PETSc.IntType)
-            self._values = np.zeros(len(rows))
-            # The matrix shares this array: no copy an assembly.
-            self._kept = (indptr, cols, self._values)
-            self.mat = PETSc.Mat().createAIJWithArrays((owned, owned), self._kept, comm=comm)
+        self._source, columns = entries.source, entries.columns
+        starts = np.flatnonzero(np.diff(entries.rows, prepend=-1))
+        rows = entries.rows[starts]
+        indptr = np.append(starts, len(columns)).astype(PETSc.IntType)
+        self._csr: tuple[np.ndarray, ...] | None = None
+        if comm.size > 1:
+            self._csr = indptr, columns, rows
+            most = comm.allreduce(int(np.diff(indptr).max(initial=0)), op=MPI.MAX)
+            self.mat = PETSc.Mat().createAIJ(((owned, None), (owned, None)), comm=comm)
+            self.mat.setPreallocationNNZ((most, most))
+            # Rows of two ranks may have more.
+            self.mat.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         else:
-            self._shared = SharedRows(comm, entries, owned)
-            pattern = self._shared.indptr, self._shared.columns
-            self.mat = PETSc.Mat().createAIJ(((owned, None), (owned, None)), csr=pattern, comm=comm)
+            every = np.searchsorted(entries.rows, np.arange(owned + 1)).astype(PETSc.IntType)
+            self._values = np.zeros(len(columns))
+            # The matrix shares these arrays: no copy an assembly.
+            self._kept = every, columns, self._values
+            self.mat = PETSc.Mat().createAIJWithArrays((owned, owned), self._kept, comm=comm)
 
     def update(self, data: np.ndarray) -> None:
-        """Set the values from the data array of a local matrix of that pattern."""
-        if self._serial:
+        """Set the values from the data array of a local matrix of that pattern (collective)."""
+        if self._csr is None:
             np.take(data, self._source, out=self._values)
             self.mat.stateIncrease()
         else:
-            shared = self._shared
-            self.mat.setValuesCSR(shared.indptr, shared.columns, shared.values(data.ravel()))
+            indptr, columns, rows = self._csr
+            self.mat.zeroEntries()
+            values, add = data.ravel()[self._source], PETSc.InsertMode.ADD_VALUES
+            self.mat.setValuesIJV(indptr, columns, values, addv=add, rowmap=rows)
         self.mat.assemble()
         # Forgotten whenever values change; without them MUMPS pivots.
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -579,12 +514,9 @@ class StiffenedModes:
             count, stiff = len(run.young), run.a * run.young
             found = np.empty((len(self._pairs), q, q, count))
             both = np.empty((run.a.shape[1], q, q, count))
-            with short_buffers():
-                for out, (b, c) in zip(found, self._pairs, strict=True):
-                    np.multiply(stiff[b][:, :, None], run.a[c][:, None], out=both)
-                    np.add(both[0], both[1], out=out)
-                    for more in both[2:]:
-                        out += more
+            for out, (b, c) in zip(found, self._pairs, strict=True):
+                np.multiply(stiff[b][:, :, None], run.a[c][:, None], out=both)
+                both.sum(axis=0, out=out)
             yield run, found.reshape(len(found), q * q, count)
 
     def _by_modes(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -623,13 +555,3 @@ def geometric_matrix(cells: Cells, u: np.ndarray, modulus: np.ndarray) -> sp.csr
     entries = (D.T @ reduced @ D).ravel()
     places = np.repeat(nodes, n, axis=1).ravel(), np.tile(nodes, n).ravel()
     return sp.coo_matrix((entries, places), 2 * (len(u),)).tocsr()
-
-
-@contextmanager
-def short_buffers() -> Iterator[None]:
-    """Let NumPy multiply rows of more than `BUFFER_ENTRIES` entries without copies."""
-    before = np.setbufsize(BUFFER_ENTRIES)
-    try:
-        yield
-    finally:
-        np.setbufsize(before)

@@ -22,18 +22,17 @@ from typing import Any
 import numpy as np
 import ufl
 
-from dolfinopt.fem.laws import SHEARS
+from dolfinopt.fem.laws import SHEARS, MaterialLaw
 from dolfinopt.mesh.compat import lagrange_element, mixed_element
 
 # A form, or an expression and points (p, d) of the reference cell where it is asked for.
 Forms = list[Any]
 Points = tuple[tuple[float, ...], ...]
 Functional = Callable[..., ufl.Form]
+Law = Callable[["Cell", Any], Any]
 
 ELEMENTS = "incompatible", "linear", "quadratic"
 DIMENSIONS = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 3, "hexahedron": 3}
-# Where stresses are in their tensor.
-ROWS = {2: [[0, 2], [2, 1]], 3: [[0, 3, 5], [3, 1, 4], [5, 4, 2]]}
 
 
 class Cell:
@@ -51,16 +50,18 @@ class Cell:
         xi: reference coordinates: its values are the reference corners.
         corners: places of the corners, one behind the other, as constants of a cell.
         weight: of a cell.
-        C: the law, see `laws`.
+        C: the law's constants, see `laws`.
+        law: the stresses of a cell by its strains.
         nodal, scalar: spaces of the nodes' displacements, and of one component.
         modes: gradients of the incompatible modes; none of other elements.
         displacement: the space of nodes' displacements and modes' amplitudes.
-        u, v, p, w, tau: coefficients: displacements u and v, nodal vectors p and w, stresses of a
-            cell tau.
+        stresses: that of stresses and strains of a cell.
+        u, v, p, w: coefficients: displacements u and v, nodal vectors p and w.
     """
 
-    def __init__(self, shape: str, element: str):
+    def __init__(self, shape: str, element: str, law: Law = MaterialLaw.stress):
         self.shape, self.element, self.dim = shape, element, DIMENSIONS[shape]
+        self.law = law
         self.is_simplex = shape in ("triangle", "tetrahedron")
         self.degree = 2 if element == "quadratic" else 1
         d = self.dim
@@ -82,9 +83,9 @@ class Cell:
             amplitudes = lagrange_element(shape, 0, len(self.modes))
             nodal = lagrange_element(shape, self.degree, d)
             self.displacement = self._space(mixed_element(nodal, amplitudes))
-        stresses = self._space(lagrange_element(shape, 0, kinds))
-        spaces = self.displacement, self.displacement, self.nodal, self.nodal, stresses
-        self.u, self.v, self.p, self.w, self.tau = (
+        self.stresses = self._space(lagrange_element(shape, 0, kinds))
+        spaces = self.displacement, self.displacement, self.nodal, self.nodal
+        self.u, self.v, self.p, self.w = (
             ufl.Coefficient(space, count=3 + k) for k, space in enumerate(spaces)
         )
 
@@ -110,12 +111,7 @@ class Cell:
 
     def stress(self, u: Any) -> Any:
         """Return the stresses of a displacement, see `laws`."""
-        return ufl.dot(self.C, self.strain(u))
-
-    def stress_tensor(self, u: Any) -> Any:
-        """Return sigma_ab of a displacement."""
-        s = self.stress(u)
-        return ufl.as_matrix([[s[k] for k in row] for row in ROWS[self.dim]])
+        return self.law(self, self.strain(u))
 
 
 def incompatible_modes(cell: Cell) -> list[Any]:
@@ -150,11 +146,18 @@ def centre(cell: Cell) -> tuple[Any, Any]:
 # -- measures: Gauss points that are exact on parallelepipeds and simplices --------------------
 
 
-def dx_stiffness(cell: Cell) -> ufl.Measure:
+def stiffness_degree(cell: Cell) -> int:
     """Return that of a product of two gradients: degree + 1 Gauss points a direction."""
+    if cell.is_simplex:
+        return 2 * (cell.degree - 1)
     # Quadrilaterals without modes have had one more.
     more = 2 if cell.shape == "quadrilateral" and not cell.modes else 0
-    return cell.dx(2 * cell.degree + more, 2 * (cell.degree - 1))
+    return 2 * cell.degree + more
+
+
+def dx_stiffness(cell: Cell) -> ufl.Measure:
+    """Return the measure of a product of two gradients."""
+    return ufl.dx(cell.mesh, degree=stiffness_degree(cell))
 
 
 def dx_mass(cell: Cell) -> ufl.Measure:
@@ -186,6 +189,11 @@ def stress_at(cell: Cell, points: Points) -> Forms:
     return [(cell.stress(ufl.TrialFunction(cell.displacement)), np.array(points))]
 
 
+def tangent(cell: Cell) -> Forms:
+    """Return the stress by the strain, C of the law's form, at a corner."""
+    return [(cell.law(cell, ufl.TrialFunction(cell.stresses)), np.zeros((1, cell.dim)))]
+
+
 def geometric_factors(cell: Cell, points: Points) -> Forms:
     """Return sigma(u) |det J| and grad p at points: of int sigma(u)_ab d_a p d_b w."""
     [(stress, at)] = stress_at(cell, points)
@@ -210,18 +218,9 @@ def mass_product(cell: Cell) -> ufl.Form:
     return cell.weight * ufl.inner(cell.p, cell.w) * dx_mass(cell)
 
 
-def geometric_product(cell: Cell) -> ufl.Form:
-    """Return the weighted int sigma(u)_ab d_a p . d_b w."""
-    both = ufl.dot(ufl.transpose(ufl.grad(cell.p)), ufl.grad(cell.w))
-    dx = ufl.dx(cell.mesh, degree=geometric_degree(cell))
-    return cell.weight * ufl.inner(cell.stress_tensor(cell.u), both) * dx
-
-
-def stress_component(cell: Cell, *point: float) -> ufl.Form:
-    """Return sigma(u) . tau at a point (d,) of the reference cell, tau as stresses are."""
-    rule = {"quadrature_rule": "custom", "quadrature_degree": 1, "quadrature_weights": np.ones(1)}
-    dx = ufl.dx(cell.mesh, metadata={**rule, "quadrature_points": np.array([point])})
-    return ufl.inner(cell.stress(cell.u), cell.tau) / abs(ufl.det(cell.J)) * dx
+def value(cell: Cell, functional: Functional) -> Forms:
+    """Return the functional itself, a number a cell."""
+    return [functional(cell)]
 
 
 def by_corners(cell: Cell, functional: Functional, *args: float) -> Forms:
@@ -231,8 +230,3 @@ def by_corners(cell: Cell, functional: Functional, *args: float) -> Forms:
     if cell.corners in form.coefficients():
         forms.append(ufl.derivative(form, cell.corners, ufl.TestFunction(cell.constants)))
     return forms
-
-
-def by_displacement(cell: Cell, functional: Functional, *args: float) -> Forms:
-    """Return the derivative of a functional by u."""
-    return [ufl.derivative(functional(cell, *args), cell.u, ufl.TestFunction(cell.displacement))]

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.measured import (
-    DEFLECTION_ROUNDING_ERROR,
+    ENERGY_TOLERANCE,
     HARMLESS_CONTRAST,
     ROUNDING_ITERATIONS,
     ROUNDING_TRANSLATION_SHARE,
@@ -395,9 +395,7 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
     extended = arm.substructure.extended
     # What a symmetric design's deflection has across the load is an error of the fields.
     error = extended.solver.tolerance if extended else 0.0
-    new = on_root(
-        arm.comm, _new_directions, known.directions, loads, error or DEFLECTION_ROUNDING_ERROR
-    )
+    new = on_root(arm.comm, _new_directions, known.directions, loads, error or ENERGY_TOLERANCE)
     if new.shape[1] == 0:
         return known
     if arm.has_constraint_modes or extended is None or floats(arm):

@@ -145,10 +145,24 @@ class Solver(Protocol):
         """Return an approximation of K^-1 right (rows, k), symmetric positive definite."""
 
 
-class PetscSolver:
-    """MUMPS' factor, or what the user's PETSc options put in its place; see `Solver`."""
+class Factor:
+    """What `Solver`s by a factor have in common: `precondition` solves."""
 
     tolerance = 0.0
+
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """See `Solver`."""
+        raise NotImplementedError
+
+    def solve(
+        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
+    ) -> np.ndarray:
+        """See `Solver`."""
+        return self.precondition(right)
+
+
+class PetscSolver(Factor):
+    """MUMPS' factor, or what the user's PETSc options put in its place; see `Solver`."""
 
     def __init__(self, layout: Layout):
         self._matrix = InteriorMatrix(layout.comm, layout.entries(), layout.rows)
@@ -176,23 +190,16 @@ class PetscSolver:
             self._ksp.setUp()
         self._factor = PetscFactor(self._ksp)
 
-    def solve(
-        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
-    ) -> np.ndarray:
+    def precondition(self, right: np.ndarray) -> np.ndarray:
         """See `Solver`."""
         assert self._factor is not None
         return self._factor.solve(right)
 
-    def precondition(self, right: np.ndarray) -> np.ndarray:
-        """See `Solver`."""
-        return self.solve(right)
 
-
-class BandSolver:
+class BandSolver(Factor):
     """LAPACK's factor of a band that one rank owns; see `Solver`."""
 
     name = "LAPACK's band"
-    tolerance = 0.0
 
     def __init__(self, layout: Layout):
         self._layout, entries = layout, layout.entries()
@@ -216,15 +223,9 @@ class BandSolver:
         if not self._is_definite:
             self._indefinite.update(K)
 
-    def solve(
-        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
-    ) -> np.ndarray:
-        """See `Solver`."""
-        return (self._band if self._is_definite else self._indefinite).solve(right)
-
     def precondition(self, right: np.ndarray) -> np.ndarray:
         """See `Solver`."""
-        return self.solve(right)
+        return (self._band if self._is_definite else self._indefinite).solve(right)
 
 
 def choose_solver(layout: Layout, tolerance: float) -> Solver:

@@ -25,7 +25,8 @@ from dolfinopt.progress import log
 
 FFI = cffi.FFI()
 Expression = tuple[Any, np.ndarray]  # of UFL, at points (p, d) of the reference cell
-Values = dict[Any, np.ndarray]  # of coefficients (n_cells or 1, dofs), of constants
+# Of coefficients (n_cells or 1, dofs), of constants (..., m, m), one or those of every cell.
+Values = dict[Any, np.ndarray]
 
 
 class Kernel:
@@ -58,16 +59,24 @@ class Kernel:
         """Return the tensors (n_cells, ...) of cells with corners (n_cells, c, 3), m."""
         count, x = len(coordinates), np.ascontiguousarray(coordinates, dtype=np.float64)
         out = np.zeros((count, *self.shape))
-        c = np.concatenate([np.zeros(1), *(np.ravel(values[each]) for each in self.constants)])[1:]
-        w = [np.broadcast_to(values[f], (count, values[f].shape[1])) for f in self.coefficients]
-        w = np.ascontiguousarray(np.hstack([np.zeros((count, 0)), *w]))
+        w = _of_cells(count, [values[each] for each in self.coefficients])
+        # Constants to the kernel, which may differ from cell to cell nevertheless.
+        sizes = [int(np.prod(each.ufl_shape)) for each in self.constants]
+        c = [values[each].reshape(-1, n) for each, n in zip(self.constants, sizes, strict=True)]
+        c = _of_cells(count, c)
         A, W, X, C = (FFI.cast("double *", each.ctypes.data) for each in (out, w, x, c))
-        a, b, d = (each.size // max(1, count) for each in (out, w, x))
+        a, b, d, e = (each.size // max(1, count) for each in (out, w, x, c))
         run, none = self._run, FFI.NULL
         tail = [none] if VERSION >= (0, 10) else []  # FFCx 0.10 hands custom data through
         for k in range(count):
-            run(A + k * a, W + k * b, C, X + k * d, none, none, *tail)
+            run(A + k * a, W + k * b, C + k * e, X + k * d, none, none, *tail)
         return out
+
+
+def _of_cells(count: int, parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return values (1 or n_cells, dofs) side by side, of every cell."""
+    rows = [np.broadcast_to(one, (count, one.shape[1])) for one in parts]
+    return np.ascontiguousarray(np.hstack([np.zeros((count, 0)), *rows]))
 
 
 def _cell_integral(compiled: Any) -> Any:

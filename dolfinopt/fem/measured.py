@@ -12,9 +12,6 @@ ALIKE_CELLS_ERROR = 1e-11
 # cells at a time, for more modes.
 STRESS_CHUNK_ENTRIES = 120_000
 STRESS_CHUNK_CELLS = 256
-# NumPy copies factors that it repeats along an axis into buffers, unless rows are longer than
-# these: by default 8192, which takes longer than the products.
-BUFFER_ENTRIES = 256
 FIELD_CHUNK_ENTRIES = 4_000_000  # of nodal fields that are copied at a time: 32 MB
 KERNEL_CHUNK_ENTRIES = 2_000_000  # cells, times cubes of their nodes, computed at a time: 100 MB
 
@@ -29,7 +26,6 @@ STIFFNESS_ROUNDING_LIMIT = 1e-3
 # translations, the assembled matrix does: where they are lost in it, refinement fails.
 ROUNDING_TRANSLATION_SHARE = 0.03
 ROUNDING_ITERATIONS = 6  # of that estimate; four give two digits
-DEFLECTION_ROUNDING_ERROR = 1e-8  # of a deflection, by factors of long arms
 # Ratio of Young's moduli up to which floating solids do no harm: the stiffness of an arm is then
 # off by at most a few 1e-7, from rounding.
 HARMLESS_CONTRAST = 1e6
@@ -75,16 +71,14 @@ FACTOR_BYTES, FACTOR_EXPONENT = 3.8e3, 1.12
 
 # Relative, in energy, where nobody says what is needed: stiffness is then right to its square, mass
 # and inertia to it, gradients of frozen loads to five times it, geometric stiffness to ten times.
+# Deflections of long arms by a factor have no more digits, either.
 ENERGY_TOLERANCE = 1e-8
 # Part of the diagonally scaled matrix' spectrum, up to its end, that is smoothed: 23 steps for a
 # slender box beam of 73 599 rows, with 0.09 24, with 0.15 26.
 SMOOTHED_SHARE = 0.05
 # Boxes: nodal values of so many cells, times right sides, at a time stay in the cache.
 BOX_CHUNK_COLUMNS = 4096
-# Ratio of a cell's edges to the shortest that can be joined up to which they are joined, too.
-COARSENED_EDGE_RATIO = 2.0
 COARSEST_BAND_WORK = 3e8  # rows times bandwidth squared up to which a grid is the coarsest
-RIGHT_SIDES_CHUNK = 12  # right sides at a time: memory of their vectors on all levels
 SOLVER_ITERATIONS = 500
 # Least tolerance, of the right side's own length; and least part of a direction's length that is
 # none of the others'.

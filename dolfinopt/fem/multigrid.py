@@ -27,9 +27,7 @@ from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
 from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
 from dolfinopt.fem.measured import (
     BOX_CHUNK_COLUMNS,
-    COARSENED_EDGE_RATIO,
     COARSEST_BAND_WORK,
-    RIGHT_SIDES_CHUNK,
     ROUNDING_SHARE,
     SAME_PLACE_SHARE,
     SMOOTHED_SHARE,
@@ -381,7 +379,7 @@ def coarser(lines: Sequence[np.ndarray], edges: np.ndarray) -> list[np.ndarray]:
     length = np.array([np.diff(one).max() for one in lines]) * edges
     least = [3, 2, 2]  # cells that can be joined: along, one layer of nodes stays between the ends
     can = [len(one) > n for one, n in zip(lines, least, strict=True)]
-    longest = COARSENED_EDGE_RATIO * length[can].min(initial=np.inf)
+    longest = 2.0 * length[can].min(initial=np.inf)  # those are joined cells' edges then
     return [
         np.unique(np.append(one[::2], one[-1])) if ok and h <= longest else one
         for one, ok, h in zip(lines, can, length, strict=True)
@@ -538,20 +536,11 @@ class MultigridSolver:
         B = self._whole(right)
 
         def solved() -> tuple[np.ndarray, int]:
-            X, most = np.empty_like(B), 0
             if not self._grids.works:
-                return X, SOLVER_ITERATIONS
-            for first in range(0, B.shape[1], RIGHT_SIDES_CHUNK):
-                part = slice(first, first + RIGHT_SIDES_CHUNK)
-                X[:, part], steps = block_conjugate_gradients(
-                    self._grids.times,
-                    self._grids.cycle,
-                    B[:, part],
-                    tolerance or self.tolerance,
-                    None if held is None else held[part],
-                )
-                most = max(most, steps)
-            return X, most
+                return B, SOLVER_ITERATIONS
+            grids = self._grids
+            goal = tolerance or self.tolerance
+            return block_conjugate_gradients(grids.times, grids.cycle, B, goal, held)
 
         X, self.steps = on_root(self._box.comm, solved)
         self.failed = self.steps == SOLVER_ITERATIONS

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.fem import forms
 from dolfinopt.fem.kernels import Kernel, Values, compile_kernels, is_compiled
-from dolfinopt.fem.laws import SHEARS
+from dolfinopt.fem.laws import SHEARS, MaterialLaw
 from dolfinopt.fem.measured import ALIKE_CELLS_ERROR, KERNEL_CHUNK_ENTRIES
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
@@ -37,7 +37,7 @@ class ElementTensors:
         points: (n_nodes, d) reference positions, m.
         corners: (n_cells, c, d) of the owned cells, m.
         thickness: t, m.
-        law: C, see `laws`.
+        law: C (m, m), see `laws`, or (n_cells, m, m) where cells have directions of their own.
         stiffness: (1 or n_cells, dn, dn) m, thickness included; times E0 gives N/m.
         mass: (1 or n_cells, n, n) of one displacement component, m3; times rho0 gives kg.
         modal: (1 or n_cells, m, m) stiffness of the m incompatible modes, without thickness.
@@ -45,7 +45,13 @@ class ElementTensors:
     """
 
     def __init__(
-        self, mesh: ArmMesh, element: str, thickness: float, law: np.ndarray, profile: Profile
+        self,
+        mesh: ArmMesh,
+        element: str,
+        thickness: float,
+        law: np.ndarray,
+        profile: Profile,
+        stress: forms.Law = MaterialLaw.stress,
     ):
         """Compile the forms; compute stiffness and mass (collective on the arm's ranks).
 
@@ -55,9 +61,10 @@ class ElementTensors:
             thickness: t, m; 1 in space.
             law: C of unit Young's modulus.
             profile: of this rank, which counts the forms.
+            stress: of `laws`, by C and the strains.
         """
         self.thickness, self.law, self.profile = thickness, law, profile
-        self.cell = cell = cell_of(compat.cell_shape(mesh.mesh), element)
+        self.cell = cell = cell_of(compat.cell_shape(mesh.mesh), element, stress)
         self.space = compat.lagrange_space(mesh.mesh, cell.degree, components=mesh.dim)
         self.cells = compat.cell_nodes(self.space, mesh.num_cells)
         points = self.space.tabulate_dof_coordinates()[:, : mesh.dim].copy()
@@ -92,6 +99,7 @@ class ElementTensors:
         self.mesh, self.points = mesh, points
         coordinates = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
         alike = single(mesh.comm, coordinates - coordinates.mean(axis=1, keepdims=True))
+        alike = None if self.law.ndim == 3 else alike
         self._coordinates = coordinates if alike is None else alike[None]
         self.corners = coordinates[:, :, : mesh.dim]
         n = mesh.dim * self.cells.shape[1]
@@ -109,7 +117,7 @@ class ElementTensors:
         for first in range(0, max(1, len(self._coordinates)), step):
             part = slice(first, first + step)
             at = self._coordinates[part]
-            values = geometry(self.cell, at, self.law)
+            values = geometry(self.cell, at, self.law if self.law.ndim == 2 else self.law[part])
             yield part, [kernel(at, values) for kernel in kernels]
 
     def _recovered(self, stress: np.ndarray, part: slice) -> np.ndarray:
@@ -145,9 +153,9 @@ class ElementTensors:
 
 
 @cache
-def cell_of(shape: str, element: str) -> forms.Cell:
+def cell_of(shape: str, element: str, law: forms.Law) -> forms.Cell:
     """Return the same cell for the same names: kernels know its coefficients."""
-    return forms.Cell(shape, element)
+    return forms.Cell(shape, element, law)
 
 
 @cache
@@ -254,6 +262,11 @@ def stress_points(cell: forms.Cell) -> np.ndarray:
 def corner_functions(cell: forms.Cell, points: np.ndarray) -> np.ndarray:
     """Return the linear functions (p, c) of the corners at points (p, d) of the reference cell."""
     return np.asarray(_lagrange(cell, 1).tabulate(0, points)[0, :, :, 0])
+
+
+def reference_gradients(cell: forms.Cell, degree: int, points: np.ndarray) -> np.ndarray:
+    """Return the gradients (p, n, d) of functions of a degree at points, in the reference cell."""
+    return np.asarray(np.moveaxis(_lagrange(cell, degree).tabulate(1, points)[1:, :, :, 0], 0, 2))
 
 
 def node_places(cell: forms.Cell) -> np.ndarray:

@@ -24,7 +24,7 @@ from dolfinopt.mesh.gmsh_session import (
     gmsh_on_root,
 )
 from dolfinopt.mesh.hollow import Hull, Wall, box_hull, read_hull, rib_stations, tube_hull, wall_of
-from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE, INTERFACE_REACH_RATIO
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 from dolfinopt.mesh.solid_cells import add_cells
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
@@ -176,35 +176,17 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     Raises:
         InputError: the file cannot be the arm; on all ranks of `comm`.
     """
-    if arm.is_solid:
-        return _solid_arm(comm, arm)
     with gmsh_on_root(comm) as gmsh:
-        lines, notes = on_root(comm, build_model, gmsh, arm)
-        parts = compat.model_to_mesh(gmsh.model, comm, gdim=2)
+        facets, notes = on_root(comm, build_model, gmsh, arm)
+        parts = compat.model_to_mesh(gmsh.model, comm, gdim=3 if arm.is_solid else 2)
     with together(comm):
-        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
-        mesh.passive[:] |= _distance(mesh.centroid, lines) < arm.solid_ends
-    return replace(mesh, notes=notes)
-
-
-def _solid_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
-    """Mesh a solid arm from its file, see `file_arm`."""
-    from dolfinopt.mesh.geometry import build_solid
-
-    with gmsh_on_root(comm) as gmsh:
-        points = on_root(comm, build_solid, gmsh, arm)
-        parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
-    with together(comm):
-        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
-        tags = parts[2]
-        further = [
+        mesh, tags = _arm_mesh(comm, arm.name, arm.length, *parts), parts[2]
+        further = tuple(
             InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(point))
             for k, (one, point) in enumerate(zip(arm.interfaces, arm.interface_points[1:]))
-        ]
-        mesh = replace(mesh, further=tuple(further))
-        if arm.solid_ends > 0.0:
-            mesh.passive[:] |= cKDTree(points).query(mesh.centroid)[0] < arm.solid_ends
-    return mesh
+        )
+        mesh.passive[:] |= _distance(mesh.centroid, facets) < arm.solid_ends
+    return replace(mesh, notes=notes, further=further)
 
 
 def _arm_mesh(
@@ -272,10 +254,17 @@ def _all_cells(mesh: ArmMesh) -> Cells:
     return Cells(*(np.concatenate(parts) for parts in zip(*mesh.comm.allgather(mine), strict=True)))
 
 
-def _distance(points: np.ndarray, lines: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of points (n, 2) from the nearest of lines (m, 2, 2)."""
+def _distance(points: np.ndarray, facets: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of points (n, d) from the nearest of lines, or of points.
+
+    Args:
+        points: m.
+        facets: lines (m, 2, 2), or points (m, 1, 3).
+    """
     nearest = np.full(len(points), np.inf)
-    for a, b in lines:
+    if facets.shape[1] == 1 and len(facets):
+        return np.asarray(cKDTree(facets[:, 0]).query(points)[0])
+    for a, b in facets:
         along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
         distance = np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
         np.minimum(nearest, distance, out=nearest)
@@ -301,12 +290,9 @@ def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
     first, second = cell[order[twice]], cell[order[twice + 1]]
     centroid = corners.mean(axis=1)
     distance = np.linalg.norm(centroid[first] - centroid[second], axis=1)
-    if dim == 3:
-        around = np.concatenate([nodes[:, side] for side in sides])[order[twice]]
-        area = np.linalg.norm(facet_areas(mesh.geometry.x[around]), axis=1)
-        return first, second, area, distance
-    a, b = mesh.geometry.x[ends[order[twice]].T][:, :, :2]
-    return first, second, np.linalg.norm(a - b, axis=1), distance
+    around = np.concatenate([nodes[:, side] for side in sides])[order[twice]]
+    area = np.linalg.norm(facet_areas(mesh.geometry.x[around][:, :, :dim]), axis=1)
+    return first, second, area, distance
 
 
 # -- solid arms that are boxes: grids of hexahedra -----------------------------------------------
@@ -383,7 +369,7 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
         point = np.array(one.point)
         assert one.radius is not None
         distance = np.linalg.norm(middles - point, axis=2)
-        own = outer & (distance <= INTERFACE_REACH_RATIO * one.radius)
+        own = outer & (distance <= (1.0 + GRID_ROUNDING_SHARE) * one.radius)
         problem = _problem(mesh.comm, own, own & taken, distance[outer])
         with together(mesh.comm):
             if problem:
@@ -430,7 +416,7 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         hull = on_root(comm, _hull, gmsh, arm)
         with together(comm):
             if comm.rank == 0:
-                add_cells(gmsh.model, hull.member(limits[1]))
+                add_cells(gmsh, hull.member(limits[1]))
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
     with together(comm):
         mesh = _arm_mesh(comm, arm.name, arm.length, *parts)

@@ -1,4 +1,4 @@
-"""What a scene's meshes cost in memory and time, told before anything is meshed."""
+"""What a scene's meshes cost in memory, told before anything is meshed."""
 
 from __future__ import annotations
 
@@ -11,20 +11,14 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.measured import (
-    BUDGET_CELLS,
     CELL_BYTES,
-    CELL_SECONDS,
-    CELL_SECONDS_EXPONENT,
     FILE_CELL_BYTES,
-    FILL_BYTES,
-    QUADRATIC_BYTES_RATIO,
     RANK_BYTES,
     SHARED_BYTES_RATIO,
-    SMALL_MESH_CELLS,
     SOLID_BYTES_RATIO,
 )
 from dolfinopt.parallel import partition_arms
-from dolfinopt.scene.load import Arm, Scene
+from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.arms import DEFAULT_ELEMENT
 
 _CGROUP = Path("/sys/fs/cgroup")
@@ -37,24 +31,14 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     at the same time are not seen.
     """
     cells = scene.cell_counts
-    size = {k: count * _cells_for_one(scene.arms[k]) for k, count in cells.items()}
-    least = {k: count * _least_bytes(scene, k) for k, count in cells.items()}
-    small = SMALL_MESH_CELLS
-    if sum(size.values()) <= small and sum(least.values()) <= small * CELL_BYTES:
-        return
-    partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
-    shared = {k: SHARED_BYTES_RATIO if scene.arms[k].is_solid else 1.0 for k in partition.arms}
-    if partition.comm.size == 1:
-        shared = dict.fromkeys(shared, 1.0)
-    mine = (
-        sum(shared[k] * max(_bytes(size[k]), least[k]) for k in shared) / partition.comm.size
-        + RANK_BYTES
-    )
-    seconds = sum(_seconds(size[k]) for k in partition.arms) / partition.comm.size
-    ranks = world.allgather((MPI.Get_processor_name(), mine, free_memory(), seconds))
+    partition = partition_arms(world, cells, whole=scene.dimension == 2)
+    mine = RANK_BYTES
+    for k in partition.arms:
+        shared = SHARED_BYTES_RATIO if partition.comm.size > 1 and scene.arms[k].is_solid else 1.0
+        mine += shared * cells[k] * _cell_bytes(scene, k) / partition.comm.size
     needed: dict[str, float] = defaultdict(float)
     free: dict[str, float] = {}
-    for machine, need, found, _ in ranks:
+    for machine, need, found in world.allgather((MPI.Get_processor_name(), mine, free_memory())):
         needed[machine] += need
         free[machine] = min(found, free.get(machine, math.inf))
     machine = max(needed, key=lambda name: needed[name] / max(free[name], 1.0))
@@ -63,32 +47,27 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     where = f" on {machine}" if len(needed) > 1 else ""
     raise InputError(
         f"{scene.source}: about {sum(cells.values()):.3g} cells need {_gigabytes(needed[machine])} "
-        f"of memory{where}, where {_gigabytes(free[machine])} are free, and "
-        f"{_spoken(max(row[-1] for row in ranks))} for every iteration; take fewer arms.cells or "
-        "a larger arms.mesh_size"
+        f"of memory{where}, where {_gigabytes(free[machine])} are free; take fewer arms.cells or a "
+        "larger arms.mesh_size"
     )
 
 
-def _cells_for_one(arm: Arm) -> float:
-    """Return how many bilinear quadrilaterals cost as much memory as a cell of the arm."""
-    nodes = arm.nodes_per_cell
-    if arm.is_solid:
-        return SOLID_BYTES_RATIO * nodes
-    return QUADRATIC_BYTES_RATIO * nodes if nodes > 1.0 else 1.0
-
-
-def _least_bytes(scene: Scene, index: int) -> float:
-    """Return the bytes a cell of a solid arm takes if its cells are not all alike; else 0."""
+def _cell_bytes(scene: Scene, index: int) -> float:
+    """Return the bytes that a cell of an arm takes."""
     arm = scene.arms[index]
-    if not arm.is_solid or (arm.mesh is None and not arm.hollow):
-        return 0.0
+    if not arm.is_solid:
+        return CELL_BYTES * arm.nodes_per_cell
+    usual = SOLID_BYTES_RATIO * CELL_BYTES * arm.nodes_per_cell
+    if arm.mesh is None and not arm.hollow:
+        return usual
+    # Cells that are not all alike.
     stiffened = scene.simulation.stiffening is not False
-    element = arm.element or DEFAULT_ELEMENT[arm.shape]
-    if known := FILE_CELL_BYTES.get((arm.shape, element)):
-        return known[stiffened]
-    usual = arm.model_copy(update={"element": None})
-    nodes = arm.nodes_per_cell / usual.nodes_per_cell
-    return nodes * FILE_CELL_BYTES[arm.shape, DEFAULT_ELEMENT[arm.shape]][stiffened]
+    standard = DEFAULT_ELEMENT[arm.shape]
+    element, nodes = arm.element or standard, 1.0
+    if (arm.shape, element) not in FILE_CELL_BYTES:
+        nodes = arm.nodes_per_cell / arm.model_copy(update={"element": None}).nodes_per_cell
+        element = standard
+    return max(usual, nodes * FILE_CELL_BYTES[arm.shape, element][stiffened])
 
 
 def free_memory(proc: Path = Path("/proc"), cgroup: Path = _CGROUP) -> float:
@@ -149,23 +128,8 @@ def _left(folder: Path, limit: str, usage: str, reclaimable: str) -> float:
 def solid_bytes(cells: int, ranks: int) -> float:
     """Return the memory that a solid arm of hexahedra takes on all of its ranks."""
     shared = SHARED_BYTES_RATIO if ranks > 1 else 1.0
-    return shared * _bytes(SOLID_BYTES_RATIO * cells) + ranks * RANK_BYTES
-
-
-def _bytes(cells: float) -> float:
-    return cells * (CELL_BYTES + FILL_BYTES * max(math.log2(max(cells, 1) / BUDGET_CELLS), 0.0))
-
-
-def _seconds(cells: float) -> float:
-    return CELL_SECONDS * cells * (cells / BUDGET_CELLS) ** CELL_SECONDS_EXPONENT
+    return shared * SOLID_BYTES_RATIO * CELL_BYTES * cells + ranks * RANK_BYTES
 
 
 def _gigabytes(amount: float) -> str:
     return f"{amount / 1e9:.3g} GB"
-
-
-def _spoken(seconds: float) -> str:
-    for unit, size in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
-        if seconds > 2.0 * size:
-            return f"{seconds / size:.2g} {unit}"
-    return f"{seconds:.2g} s"

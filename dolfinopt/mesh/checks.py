@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import basix
 import numpy as np
@@ -13,16 +12,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.mesh.measured import (
     FILE_ROUNDING_SHARE,
-    FLAT_CORNER_SINE,
-    FLAT_VOLUME_SHARE,
+    FLAT_CELL_SHARE,
     FRAME_TOLERANCE,
     FULL_TURN_ANGLE,
     TOUCHING_AREA_SHARE,
 )
 from dolfinopt.scene.load import Arm
+
+OVERLAP = "overlap others (inverted cells, or {} on top of each other)"
+TENSOR_PLANE = {3: [0, 1, 2], 4: [0, 1, 3, 2]}  # from corners around a cell to DOLFINx's order
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,27 +41,6 @@ class FlatMesh:
     outboard: np.ndarray
 
 
-def flatten(gmsh: Any) -> FlatMesh:
-    """Return the cells and the interfaces' lines of a model with our groups."""
-    model = gmsh.model
-    tags, points, _ = model.mesh.getNodes()
-    table = np.zeros((int(tags.max()) + 1, 3))
-    table[tags.astype(int)] = points.reshape(-1, 3)
-
-    def elements(dim: int, *groups: int) -> np.ndarray:
-        present = [g for g in groups if (dim, g) in model.getPhysicalGroups(dim)]
-        rows = []
-        for group in present:
-            for entity in model.getEntitiesForPhysicalGroup(dim, group):
-                _, ids, nodes = model.mesh.getElements(dim, entity)
-                rows.append(nodes[0].reshape(len(ids[0]), -1).astype(int))
-        return np.concatenate(rows)
-
-    return FlatMesh(
-        table, elements(2, DESIGN, PASSIVE), elements(1, INBOARD), elements(1, OUTBOARD)
-    )
-
-
 def check_mesh(flat: FlatMesh, arm: Arm) -> None:
     """Check that a mesh can be the arm of a scene.
 
@@ -76,78 +55,43 @@ def check_mesh(flat: FlatMesh, arm: Arm) -> None:
     if off > FILE_ROUNDING_SHARE * arm.height:
         raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
     _check_cells(flat)
-    _check_frame(flat, arm, used)
+    for name, lines, x in (("inboard", flat.inboard, 0.0), ("outboard", flat.outboard, arm.length)):
+        check_place(flat.points[lines.ravel(), :2], name, x, arm)
+    check_extents(used[:, :2], arm)
 
 
 def _check_cells(flat: FlatMesh) -> None:
     corner = flat.points[flat.cells][:, :, :2]
-    ahead = np.roll(corner, -1, axis=1) - corner
-    back = np.roll(corner, 1, axis=1) - corner
+    ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     turn = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
-    size = np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
-    bad = ~(
-        (turn > FLAT_CORNER_SINE * size).all(axis=1) | (turn < -FLAT_CORNER_SINE * size).all(axis=1)
-    )
-    if bad.any():
-        x, y = corner[bad][0].mean(axis=0)
-        raise InputError(
-            f"{bad.sum()} cells are folded or flat, the first at ({x:.4g}, {y:.4g}) m; repair the "
-            "mesh"
-        )
-    _check_overlap(flat, corner)
-    sides = np.stack([flat.cells, np.roll(flat.cells, -1, axis=1)], axis=2).reshape(-1, 2)
-    count = len(flat.points)
-    graph = sp.coo_matrix((np.ones(len(sides)), sides.T), (count, count))
-    parts = connected_components(graph, directed=False)[1][np.unique(flat.cells)]
-    pieces = len(np.unique(parts))
-    if pieces > 1:
-        raise InputError(
-            f"it consists of {pieces} separate parts; neighbouring surfaces must share "
-            "their curves and nodes"
-        )
-    known = np.unique(np.sort(sides, axis=1) @ [count, 1])
+    least = FLAT_CELL_SHARE * np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
+    sound = (turn > least).all(axis=1) | (turn < -least).all(axis=1)
+    _refuse(~sound, corner, "are folded or flat")
+    angle = np.arctan2(np.abs(turn), (ahead * back).sum(axis=2))
+    _refuse(_covering(flat, corner, angle), corner, OVERLAP.format("surfaces"))
+    _check_parts(flat.cells, "surfaces must share their curves")
+    tensor = flat.cells[:, TENSOR_PLANE[flat.cells.shape[1]]]
     for name, lines in (("inboard", flat.inboard), ("outboard", flat.outboard)):
-        if not np.isin(np.sort(lines, axis=1) @ [count, 1], known).all():
-            raise InputError(
-                f'group "{name}" has lines that are no sides of cells; repair the mesh'
-            )
+        check_facets(lines, tensor, 2, name)
 
 
-def _check_overlap(flat: FlatMesh, corner: np.ndarray) -> None:
-    """Raise InputError where cells, convex each, cover a place twice."""
+def _covering(flat: FlatMesh, corner: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return (n,) True for convex cells that cover a place twice, given the angles at corners."""
     # The way round a cell does not tell: surfaces may be oriented either way. But neighbours lie on
     # different sides of what they share, the angles about a point add up to a full turn at most,
     # and then a connected mesh overlaps only where its outline crosses itself or cells lie in
     # others.
-    count, around = flat.cells.shape
-    centre = corner.mean(axis=1)
-    sides = np.sort(np.stack([flat.cells, np.roll(flat.cells, -1, axis=1)], axis=2), axis=2)
-    ends, which, times = np.unique(
-        sides.reshape(-1, 2), axis=0, return_inverse=True, return_counts=True
-    )
-    which = which.ravel()
-    cell = np.repeat(np.arange(count), around)
-    a, b = flat.points[ends[which, 0], :2], flat.points[ends[which, 1], :2]
-    side = np.sign(_twice_area(a, b, centre[cell]))
-    same = np.abs(np.bincount(which, side)) > 1.5  # two cells on one side of it
-    bad = (same | (times > 2))[which]
-    ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
-    sine = np.abs(ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0])
-    angle = np.bincount(flat.cells.ravel(), np.arctan2(sine, (ahead * back).sum(axis=2)).ravel())
-    bad |= (angle > FULL_TURN_ANGLE)[flat.cells].ravel()
+    order = TENSOR_PLANE[flat.cells.shape[1]]
+    keys = facet_keys(flat.cells[:, order], 2)
+    bad = _overlapping(corner[:, order], keys)
+    total = np.bincount(flat.cells.ravel(), angle.ravel())
+    bad |= (total > FULL_TURN_ANGLE)[flat.cells].any(axis=1)
     if not bad.any():
-        crossed = np.zeros(len(ends), dtype=bool)
-        crossed[times == 1] = _crossings(flat.points[ends[times == 1], :2])
-        bad = crossed[which]
-    if not bad.any():
-        bad = np.repeat(_covered(centre, corner), around)
-    if bad.any():
-        found = np.unique(cell[bad])
-        x, y = centre[found[0]]
-        raise InputError(
-            f"{len(found)} cells overlap others, the first at ({x:.4g}, {y:.4g}) m: inverted "
-            "cells, or surfaces on top of each other; repair the mesh"
-        )
+        _, first, count = np.unique(keys, return_index=True, return_counts=True)
+        side, cell = np.divmod(first[count == 1], len(corner))
+        ends = np.array(facet_corners(2, corner.shape[1]))[side]
+        bad[cell[_crossings(corner[:, order][cell[:, None], ends])]] = True
+    return bad if bad.any() else _covered(corner.mean(axis=1), corner)
 
 
 def _twice_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -187,26 +131,37 @@ def _covered(centre: np.ndarray, corner: np.ndarray) -> np.ndarray:
     return covered
 
 
-def _check_frame(flat: FlatMesh, arm: Arm, used: np.ndarray) -> None:
-    tolerance = FRAME_TOLERANCE * arm.height
-    for name, lines, x in (("inboard", flat.inboard, 0.0), ("outboard", flat.outboard, arm.length)):
-        ends = flat.points[lines.ravel(), :2]
-        middle = 0.5 * (ends.min(axis=0) + ends.max(axis=0))
-        if np.linalg.norm(middle - [x, 0.0]) > tolerance:
-            expected = "(0, 0)" if name == "inboard" else f"(length, 0) = ({x:.6g}, 0)"
-            raise InputError(
-                f'group "{name}" has its middle at ({middle[0]:.6g}, {middle[1]:.6g}) m, expected '
-                f"{expected} m within {tolerance:.3g} m; {remedy(middle[0], x)}"
-            )
-    tall = float(np.ptp(used[:, 1]))
-    if abs(tall - arm.height) > tolerance:
+def check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
+    """Raise InputError unless the points (n, d) of an interface have their middle at (x, 0)."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    solid = len(middle) == 3
+    tolerance = FRAME_TOLERANCE * (max(arm.height, arm.thickness) if solid else arm.height)
+    tolerance = (solid and arm.interface_offset) or tolerance
+    zeros = np.zeros(len(middle) - 1)
+    if np.linalg.norm(middle - [x, *zeros]) > tolerance:
+        rest = ", 0" * len(zeros)
+        expected = f"(0{rest})" if name == "inboard" else f"(length{rest}) = ({x:.6g}{rest})"
+        keys = "length and interface_offset" if solid else "length and height"
         raise InputError(
-            f"it is {tall:.6g} m high, expected height = {arm.height:.6g} m within "
-            f"{tolerance:.3g} m; {remedy(tall, arm.height)}"
+            f'group "{name}" has its middle at ({", ".join(f"{at:.6g}" for at in middle)}) m, '
+            f"expected {expected} m within {tolerance:.3g} m; {remedy(middle[0], x, keys)}"
         )
 
 
-def remedy(found: float, expected: float, keys: str = "length and height") -> str:
+def check_extents(used: np.ndarray, arm: Arm) -> None:
+    """Raise InputError unless the points (n, d) are as high, in space as thick, as the arm."""
+    sizes = (("height", arm.height), ("thickness", arm.thickness))[: used.shape[1] - 1]
+    for (key, size), wide in zip(sizes, np.ptp(used[:, 1:], axis=0), strict=True):
+        tolerance = FRAME_TOLERANCE * size
+        if abs(wide - size) > tolerance:
+            raise InputError(
+                f"its {key} is {wide:.6g} m, expected {key} = {size:.6g} m within {tolerance:.3g} "
+                f"m; {remedy(wide, size, key)}"
+            )
+
+
+def remedy(found: float, expected: float, keys: str) -> str:
+    """Return what to do about a length that is another one."""
     if expected > 0.0 and 900.0 < found / expected < 1100.0:
         return "lengths are in metres, these look like millimetres"
     return f"correct the geometry, or {keys} in the scene"
@@ -229,15 +184,20 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     corners = points[cells]
     _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
     longest = np.ptp(corners, axis=1).max(axis=1)
-    _refuse(cell_sizes(corners) < FLAT_VOLUME_SHARE * longest**3, corners, "are flat")
+    _refuse(cell_sizes(corners) < FLAT_CELL_SHARE * longest**3, corners, "are flat")
     if cells.shape[1] == 8:
-        _refuse(_folded(corners, FLAT_VOLUME_SHARE * longest**3), corners, "are folded")
-    _refuse(
-        _overlapping(corners, facet_keys(cells)),
-        corners,
-        "overlap others (inverted cells, or volumes on top of each other)",
-    )
-    _check_parts(cells)
+        _refuse(_folded(corners, FLAT_CELL_SHARE * longest**3), corners, "are folded")
+    _refuse(_overlapping(corners, facet_keys(cells, 3)), corners, OVERLAP.format("volumes"))
+    _check_parts(cells, "volumes must share their faces")
+
+
+def check_facets(facets: np.ndarray, cells: np.ndarray, dim: int, name: str) -> None:
+    """Raise InputError unless facets (k, f) are those of cells (n, c) in DOLFINx's order."""
+    largest = int(cells.max())
+    known = np.isin(keys_of(facets, largest), facet_keys(cells, dim))
+    if facets.max() > largest or not known.all():
+        what = "lines that are no sides of" if dim == 2 else "facets of no"
+        raise InputError(f'group "{name}" has {what} cells; repair the mesh')
 
 
 def _refuse(bad: np.ndarray, corners: np.ndarray, what: str) -> None:
@@ -258,29 +218,31 @@ def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
     return found
 
 
-def facet_keys(cells: np.ndarray) -> np.ndarray:
+def facet_keys(cells: np.ndarray, dim: int) -> np.ndarray:
     """Return numbers (facets, n) that are the same for two cells on both sides of a facet."""
-    sides = facet_corners(3, cells.shape[1])
+    sides = facet_corners(dim, cells.shape[1])
     return np.stack([keys_of(cells[:, side], int(cells.max())) for side in sides])
 
 
 def keys_of(facets: np.ndarray, largest: int) -> np.ndarray:
-    """Return a number (n,) for the corners of each facet (n, 3 or 4), in any order.
+    """Return a number (n,) for the corners of each facet (n, 2, 3 or 4), in any order.
 
     The three smallest corners tell facets apart.
     """
-    first, second, third = np.sort(facets, axis=1)[:, :3].T.astype(np.int64)
-    return np.asarray((first * (largest + 1) + second) * (largest + 1) + third)
+    found = np.zeros(len(facets), dtype=np.int64)
+    for corner in np.sort(facets, axis=1)[:, :3].T:
+        found = found * (largest + 1) + corner
+    return found
 
 
 def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Return (n,) True for cells (n, 4 or 8, 3) that lie on a neighbour's side of a facet."""
+    """Return (n,) True for cells (n, c, d) that lie on a neighbour's side of a facet."""
     count, bad = len(corners), np.zeros(len(corners), dtype=bool)
     order = np.argsort(keys.ravel(), kind="stable")
     known = keys.ravel()[order]
     same = known[1:] == known[:-1]
     first, second = order[:-1][same], order[1:][same]
-    sides = np.array(facet_corners(3, corners.shape[1]))
+    sides = np.array(facet_corners(corners.shape[2], corners.shape[1]))
     facets = corners[(first % count)[:, None], sides[first // count]]
     normal, middle = facet_areas(facets), facets.mean(axis=1)
     centre = corners.mean(axis=1)
@@ -294,16 +256,13 @@ def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
     return bad
 
 
-def _check_parts(cells: np.ndarray) -> None:
+def _check_parts(cells: np.ndarray, what: str) -> None:
     count, width = cells.shape
     start = np.arange(0, count * width + 1, width)
     incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), start))
     pieces = connected_components(incidence @ incidence.T, directed=False)[0]
     if pieces > 1:
-        raise InputError(
-            f"it consists of {pieces} separate parts; neighbouring volumes must share their faces "
-            "and nodes"
-        )
+        raise InputError(f"it consists of {pieces} separate parts; neighbouring {what} and nodes")
 
 
 # -- cells with straight edges: which corners their facets have, areas and volumes ---------------
@@ -342,19 +301,52 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
 
 def cell_sizes(corners: np.ndarray) -> np.ndarray:
     """Return areas or volumes (n,) of cells with corners (n, c, d) in DOLFINx's order."""
+    return _jacobians(corners) @ _tabulated(corners)[0]
+
+
+def cell_centroids(corners: np.ndarray) -> np.ndarray:
+    """Return the centroids (n, d) of cells with corners (n, c, d), m."""
+    weights, functions = _tabulated(corners)
+    volumes = _jacobians(corners) * weights
+    moments = np.einsum("ep,pn,eni->ei", volumes, functions[0], corners)
+    return moments / volumes.sum(axis=1, keepdims=True)
+
+
+def _jacobians(corners: np.ndarray) -> np.ndarray:
+    """Return |det J| (n, p) at the points of a rule that is exact for volumes and centroids."""
+    J = np.einsum("eni,kpn->epik", corners, _tabulated(corners)[1][1:])
+    return np.abs(np.linalg.det(J))
+
+
+def _tabulated(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights (p,), and the corners' functions and their derivatives (1 + d, p, c)."""
     kind = KINDS[corners.shape[2], corners.shape[1]]
-    # Exact: the Jacobian of tensor products is of second degree in each direction.
-    points, weights = basix.make_quadrature(kind, 2 * (corners.shape[1] > corners.shape[2] + 1))
-    functions = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)
-    J = np.einsum("eni,kpn->epik", corners, functions[1:, :, :, 0])
-    return np.asarray(np.abs(np.linalg.det(J)) @ weights)
+    # The Jacobian of tensor products is of second degree in each direction.
+    points, weights = basix.make_quadrature(
+        kind, 3 if corners.shape[1] > corners.shape[2] + 1 else 1
+    )
+    element = basix.create_element(basix.ElementFamily.P, kind, 1)
+    return weights, element.tabulate(1, points)[..., 0]
 
 
 def facet_areas(corners: np.ndarray) -> np.ndarray:
-    """Return the area vectors (n, 3) of facets (n, 3 or 4, 3) of cells in space, of either sense.
+    """Return the area vectors (n, d) of facets (n, 2, 3 or 4, d) of cells, of either sense.
 
     Exact of bilinear quadrilaterals, whose corners are numbered as a tensor product.
     """
+    if corners.shape[1] == 2:
+        along = corners[:, 1] - corners[:, 0]
+        return np.stack([along[:, 1], -along[:, 0]], axis=1)
     if corners.shape[1] == 3:
         return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return 0.5 * np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1])
+
+
+def facet_middles(corners: np.ndarray) -> np.ndarray:
+    """Return the centroids (n, d) of such facets, those of two triangles for a quadrilateral."""
+    if corners.shape[1] < 4:
+        return corners.mean(axis=1)
+    parts = corners[:, [0, 1, 3]], corners[:, [0, 2, 3]]
+    weight = [np.linalg.norm(facet_areas(part), axis=1)[:, None] for part in parts]
+    moments = weight[0] * parts[0].mean(axis=1) + weight[1] * parts[1].mean(axis=1)
+    return moments / (weight[0] + weight[1])

@@ -9,7 +9,7 @@ import signal
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -160,106 +160,18 @@ def mesh_surfaces(gmsh: Any, shape: str | None) -> None:
         gmsh.model.mesh.splitQuadrangles(2.0)  # those of less than twice the best quality: all
 
 
-# -- the groups of an arm's Gmsh model: interfaces, designed and solid surfaces ------------------
-#
-# Whatever a user's file calls its groups and however it numbers them, they become these four.
+def mesh_volumes(gmsh: Any, size: float | None, shape: str | None) -> None:
+    """Mesh the volumes: tetrahedra, or hexahedra by cutting each into four."""
+    halves = shape == "hexahedron"
+    if halves:
+        gmsh.option.setNumber("Mesh.SubdivisionAlgorithm", 2)
+    if size is not None:
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 2.0 * size if halves else size)
+    gmsh.model.mesh.generate(3)
 
-# Physical groups of the model.
+
+# Physical groups of an arm's Gmsh model, whatever a user's file calls and numbers them.
 INBOARD, OUTBOARD, DESIGN, PASSIVE, VOID = 1, 2, 3, 4, 5
 FURTHER = 11  # the first of a solid's further interfaces; the next ones follow
 NAMES = {INBOARD: "inboard", OUTBOARD: "outboard", DESIGN: "design", PASSIVE: "passive"}
 NAMES[VOID] = "void"  # of solids alone; in the plane arms.regions say so
-
-
-def group_named(name: str, *groups: int) -> int | None:
-    """Return which of `groups` a name in a file means: "Passive2" begins with passive."""
-    for group in groups:
-        if name.strip().casefold().startswith(NAMES[group]):
-            return group
-    return None
-
-
-def find_groups(gmsh: Any, unknown: list[str]) -> dict[int, list[int]]:
-    """Return the curves or surfaces of each of our groups, by how the names in the file begin.
-
-    Other names of surfaces are added to `unknown`.
-    """
-    model = gmsh.model
-    named: dict[tuple[int, str], set[int]] = {}
-    for dim, tag in model.getPhysicalGroups():
-        name = model.getPhysicalName(dim, tag).strip()
-        group = group_named(name, *((INBOARD, OUTBOARD) if dim == 1 else (PASSIVE, DESIGN)))
-        if dim == 2 and group is None and name:
-            unknown.append(name)
-        key = dim, NAMES[group] if group else name.casefold()
-        named.setdefault(key, set()).update(model.getEntitiesForPhysicalGroup(dim, tag))
-    groups = {}
-    for tag in (INBOARD, OUTBOARD):
-        groups[tag] = named.get((1, NAMES[tag]), set())
-        if not any(len(model.mesh.getElements(1, curve)[1]) for curve in groups[tag]):
-            raise InputError(_missing(NAMES[tag], named))
-    passive = named.get((2, NAMES[PASSIVE]), set())
-    every = {tag for _, tag in model.getEntities(2) if len(model.mesh.getElements(2, tag)[1])}
-    groups[PASSIVE] = passive & every
-    groups[DESIGN] = named.get((2, NAMES[DESIGN]), every - passive) & every
-    for a, b in ((INBOARD, OUTBOARD), (DESIGN, PASSIVE)):
-        if groups[a] & groups[b]:
-            raise InputError(
-                f"{'curve' if a == INBOARD else 'surface'} {min(groups[a] & groups[b])} is in "
-                f'both groups "{NAMES[a]}" and "{NAMES[b]}"; give each its own geometrical entity'
-            )
-    return {tag: sorted(int(entity) for entity in entities) for tag, entities in groups.items()}
-
-
-def _missing(name: str, named: Mapping[tuple[int, str], set[int]]) -> str:
-    kinds = {1: "curves", 2: "surfaces"}
-    found = [f'{kinds[dim]} "{text}"' for dim, text in sorted(named) if dim in kinds]
-    if (1, name) in named:
-        return f'the curves of group "{name}" carry no lines; save the mesh of all curves'
-    return (
-        f'no curves in a group "{name}"; found {", ".join(found) or "no named groups"}; name the '
-        f'interface\'s curves so: Physical Curve("{name}") = {{...}}'
-    )
-
-
-def rename_groups(gmsh: Any, groups: Mapping[int, list[int]]) -> None:
-    """Put our groups in place of the file's, after a look at the kinds of cells."""
-    model = gmsh.model
-    _check_kinds(gmsh, groups[DESIGN] + groups[PASSIVE])
-    model.removePhysicalGroups()
-    for tag, entities in groups.items():
-        if entities:
-            dim = 1 if tag in (INBOARD, OUTBOARD) else 2
-            entities = [e for e in entities if len(model.mesh.getElements(dim, e)[1])]
-            model.addPhysicalGroup(dim, entities, tag)
-            model.setPhysicalName(dim, tag, NAMES[tag])
-    model.mesh.renumberNodes()  # DOLFINx wants 1, 2, ...
-
-
-def _check_kinds(gmsh: Any, surfaces: list[int]) -> None:
-    mesh = gmsh.model.mesh
-    if len(mesh.getElementTypes(3)):
-        raise InputError("it is a mesh of a body in 3D; give the mesh of the plane z = 0")
-    kinds = {int(kind) for surface in surfaces for kind in mesh.getElements(2, surface)[0]}
-    if not kinds:
-        raise InputError("it has no cells; mesh its surfaces in 2D")
-    if kinds == {TRIANGLE, QUADRILATERAL}:
-        raise InputError(
-            "it mixes triangles and quadrilaterals; expected one of them: set cell_shape (.geo, "
-            ".step), or recombine fully (Mesh.RecombinationAlgorithm = 3)"
-        )
-    if not kinds <= {TRIANGLE, QUADRILATERAL}:
-        found = mesh.getElementProperties(min(kinds - {TRIANGLE, QUADRILATERAL}))[0]
-        raise InputError(
-            f'it has cells of kind "{found}"; expected straight triangles or quadrilaterals '
-            "(Mesh.ElementOrder = 1)"
-        )
-
-
-def unknown_names(where: str, names: list[str]) -> str:
-    listed = ", ".join(f'"{name}"' for name in sorted(set(names)))
-    return (
-        f"{where}: the names of surfaces {listed} have no meaning: expected names that "
-        "begin with passive (stays solid) or design; all other surfaces are "
-        "designed, or left out if one is named design"
-    )

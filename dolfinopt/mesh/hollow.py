@@ -12,22 +12,21 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import facet_corners
-from dolfinopt.mesh.geometry import check_place, read_groups, telling_where, where_of
+from dolfinopt.mesh.checks import check_place, facet_corners
+from dolfinopt.mesh.geometry import read_groups, telling_where, where_of
 from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
 from dolfinopt.mesh.measured import (
     CORNER_CELL_RATIO,
-    LAYER_SHARE,
+    FILE_ROUNDING_SHARE,
     RAY_SHIFT_SHARE,
     ROUND_CELLS,
-    SAME_CROSSING_SHARE,
     SECTION_ALONG_SHARE,
     SECTION_CELLS,
     SECTION_END_CELLS,
     SECTION_LEAST_ALONG,
     SHORT_CELL_SHARE,
 )
-from dolfinopt.mesh.solid_cells import ENDS, TENSOR, elements_of
+from dolfinopt.mesh.solid_cells import ENDS, TENSOR, elements_of, points_by_tag
 
 if TYPE_CHECKING:
     from dolfinopt.scene.load import Arm
@@ -92,7 +91,7 @@ def member(section: Section, length: float, sides: tuple[float, float], share: f
         share: of the largest wall.
     """
     assert section.plane is not None
-    layers = 1 + int(share / LAYER_SHARE)
+    layers = 1 + int(share * SECTION_CELLS)
     flat, quads = section.plane(*sides, share * section.largest_wall(*sides), layers)
     along = max(SECTION_LEAST_ALONG, round(length / (SECTION_ALONG_SHARE * max(sides))))
     cell = length / along
@@ -422,6 +421,17 @@ class Wall:
         total[1:] += rows
         return self.least + (self.most - self.least) * total / self._around
 
+    @property
+    def normals(self) -> np.ndarray:
+        """Return the outer surface's unit normals (n_cells, 3) in the owned cells' middles."""
+        outer = self.hull.points(self.most)[: self.hull.outer[:, :, 0].size]
+        outer = outer.reshape(self.hull.outer.shape)
+        ahead = np.roll(outer, -1, axis=1)
+        sides = (ahead - outer)[:-1] + (ahead - outer)[1:]
+        found = np.cross(sides, (outer + ahead)[1:] - (outer + ahead)[:-1])
+        found /= np.linalg.norm(found, axis=2, keepdims=True)
+        return np.asarray(found.reshape(-1, 3)[self.cells])
+
     def points(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
         """Return the places (n, 3) of this rank's nodes, m (collective on the arm)."""
         return self.hull.points(self.thickness(comm, x))[self.nodes]
@@ -503,10 +513,8 @@ def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.nda
         InputError: one line that names file, arm and remedy.
     """
     with telling_where(where_of(arm)):
-        groups = read_groups(gmsh, arm)
-        tags, places, _ = gmsh.model.mesh.getNodes()
-        points = np.zeros((int(tags.max()) + 1, 3))
-        points[tags.astype(int)] = places.reshape(-1, 3)
+        groups = read_groups(gmsh, arm, [])
+        points = points_by_tag(gmsh)
         cells = elements_of(gmsh, 3, groups[DESIGN] + groups[PASSIVE])
         ends = [points[np.unique(elements_of(gmsh, 2, groups[tag]))] for tag in ENDS]
         for name, at, x in zip(("inboard", "outboard"), ends, (0.0, arm.length), strict=True):
@@ -549,7 +557,7 @@ def _radii(triangles: np.ndarray, x: float, rays: np.ndarray, arm: Arm) -> np.nd
         share = beside[0][meets] / (beside[0] - beside[1])[meets]
         radius = along[0][meets] + share * (along[1] - along[0])[meets]
         radius = np.sort(radius[radius > 0.0])
-        apart = np.diff(radius, prepend=-np.inf) > SAME_CROSSING_SHARE * arm.height
+        apart = np.diff(radius, prepend=-np.inf) > FILE_ROUNDING_SHARE * arm.height
         if apart.sum() != 1:
             raise InputError(
                 f"{arm.hull}: arm {arm.name!r}: seen from the axis at x = {x:.4g} m in the "

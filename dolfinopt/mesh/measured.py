@@ -15,41 +15,30 @@ FRAME_TOLERANCE = 0.05
 
 # -- arm_mesh --------------------------------------------------------------------------------
 
-GRID_ROUNDING_SHARE = 1e-9  # of a cell: a node is so near to its line of the grid by rounding
-# Of an interface's radius, up to which sides belong to it: those as far from its point do, too.
-INTERFACE_REACH_RATIO = 1.0 + 1e-9
+# Of a cell: a node is so near to its line of the grid by rounding; of an interface's radius, by
+# which sides may lie beyond it.
+GRID_ROUNDING_SHARE = 1e-9
 
 # -- hollow ----------------------------------------------------------------------------------
 
 # Of a hollow link's length: how far beside a station the surface is cut, so that no node lies in
-# the plane; and of its height, up to which two crossings of a ray are one edge's.
+# the plane.
 RAY_SHIFT_SHARE = 1e-7
-SAME_CROSSING_SHARE = 1e-6
 
 # -- checks ----------------------------------------------------------------------------------
 
-FLAT_CORNER_SINE = 1e-6  # of a corner's angle, below which a cell has no area
+# Sine of a corner's angle, and part of the cube of the longest edge, below which cells are flat.
+FLAT_CELL_SHARE = 1e-6
 FULL_TURN_ANGLE = 2.0 * math.pi + 1e-6  # rad about a point: rounding of at most some dozen angles
 TOUCHING_AREA_SHARE = 1e-9  # of the longest line squared: lines that meet at an end
-FLAT_VOLUME_SHARE = 1e-6  # of the cube of a cell's longest edge, below which it has no volume
 
 # -- budget ----------------------------------------------------------------------------------
 
-# Peak memory beyond the libraries' and CPU time of one simulation with its gradient, two arms of
-# quadrilaterals on one rank, DOLFINx 0.5.2, one thread, with n cells an arm:
-#   n =   9 600:  265 MB,  0.38 s;      n =  38 400:  648 MB,  2.4 s
-#   n =  86 400: 1307 MB;               n = 153 600: 2279 MB, 15 s
-# Fill-in of a nested dissection makes both grow faster than n.
+# Peak memory beyond the libraries of one simulation with its gradient, two arms of n
+# quadrilaterals on one rank, DOLFINx 0.5.2, one thread: n = 9 600: 265 MB; 38 400: 648 MB; 86 400:
+# 1307 MB; 153 600: 2279 MB. Quadratic elements take 1.3 times as many bytes a node.
 RANK_BYTES = 0.2e9  # of a rank without cells
-BUDGET_CELLS = 38_400  # n for which the next ones hold
-CELL_BYTES = 6.9e3  # of a cell
-FILL_BYTES = 0.2e3  # more, of a cell, for every doubling of n
-CELL_SECONDS = 32e-6  # s, of a cell
-CELL_SECONDS_EXPONENT = 0.33  # power of n with which that grows
-SMALL_MESH_CELLS = 100_000  # of all arms, 1 GB: not worth a look
-# Bytes a node of a quadratic element over those of others: 400 x 24 of them, with the nodes of
-# 800 x 48 others, take the latters' time.
-QUADRATIC_BYTES_RATIO = 1.3
+CELL_BYTES = 7.2e3  # of a cell with one node
 # Bytes of a hexahedron over those of a quadrilateral, with conjugate gradients, which replace the
 # factor where memory is short: 378 000 dofs 3.1 GB, 996 000 8.2 GB (`dolfinopt bench solid`); and
 # of a solid arm on several ranks over one on one: 12.7 GB.
@@ -69,12 +58,13 @@ FILE_CELL_BYTES = {
 
 INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
-END_FACE_COSINE_GAP = 1e-9  # 1 - cosine to z of an end face's normal: rounding of plane surfaces
-SIDE_FACE_COSINE = 1e-6  # to z, of a side face's normal: rounding of splines
+# Cosine to z of a side face's normal, and what is missing to 1 of an end face's: rounding of
+# splines.
+FACE_COSINE = 1e-6
 
 # -- sections: incompatible hexahedra, against beam theory (test_uniform_members.py) -------------
 
-SECTION_CELLS = 4  # of the sides between the walls
+SECTION_CELLS = 4  # of the sides between the walls, and of the thickest wall
 ROUND_CELLS = 24  # around a tube
 SECTION_ALONG_SHARE = 0.5  # side of a cell along the member over the larger one of the section
 SECTION_LEAST_ALONG = 24  # cells along
@@ -86,7 +76,6 @@ SECTION_END_CELLS = (0.125, 0.4)
 # 0.8 %, 1.25 by 0.5 %, 1.1 by 0.4 %: then the cells' inner sides are a tenth of the wall.
 CORNER_CELL_RATIO = 1.25
 SHORT_CELL_SHARE = 0.6  # of a side's cells: longer ones are none that stand at corners
-LAYER_SHARE = 0.25  # of the largest wall: a layer of cells, and one more for each of them
 
 # -- file_check, gmsh_session ----------------------------------------------------------------
 
@@ -101,4 +90,3 @@ UNREAD_STATEMENTS_LIMIT = 1000  # of a .geo file that Gmsh gave up: no file of a
 BORE_RADIUS_SHARE = 0.02
 FACES_EDGE_ANGLE = math.radians(40.0)  # between triangles, from which on it parts two faces
 LOST_VOLUME_SHARE = 0.1  # largest one that flat cells may miss at curved faces
-INTERFACE_AREA_SHARE = 0.5  # of a face, from which on it is the interface's

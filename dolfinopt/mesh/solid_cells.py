@@ -36,13 +36,19 @@ from dolfinopt.mesh.gmsh_session import (
 from dolfinopt.mesh.measured import (
     BORE_RADIUS_SHARE,
     FACES_EDGE_ANGLE,
-    INTERFACE_AREA_SHARE,
     LOST_VOLUME_SHARE,
 )
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.joints import Bore, frame_of
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
+STRAIGHT = {  # by dimension and number of corners
+    (1, 2): LINE,
+    (2, 3): TRIANGLE,
+    (2, 4): QUADRILATERAL,
+    (3, 4): TETRAHEDRON,
+    (3, 8): HEXAHEDRON,
+}
 # From Gmsh's order of a hexahedron's corners to that of a tensor product.
 TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
 # Sides of cells in Gmsh's order of corners, around them, by the number of corners.
@@ -58,6 +64,22 @@ Entities = dict[int, list[int]]  # of every group
 def further_of(arm: Arm) -> dict[str, int]:
     """Return the groups of the arm's further interfaces by their names, small letters."""
     return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
+
+
+def group_named(name: str, *groups: int) -> int | None:
+    """Return which of `groups` a name in a file means: "Passive2" begins with passive."""
+    known = name.strip().casefold()
+    return next((group for group in groups if known.startswith(NAMES[group])), None)
+
+
+def interface_named(name: str, arm: Arm) -> int | None:
+    """Return the group of the arm's interface that a name in a file means."""
+    return further_of(arm).get(name.strip().casefold()) or group_named(name, *ENDS)
+
+
+def no_groups(arm: Arm) -> Entities:
+    """Return all groups of an arm without entities."""
+    return {tag: [] for tag in (*NAMES, *further_of(arm).values())}
 
 
 def interface_names(arm: Arm) -> dict[int, str]:
@@ -91,14 +113,22 @@ def elements_of(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
     return np.concatenate(rows)
 
 
+def points_by_tag(gmsh: Any) -> np.ndarray:
+    """Return the nodes (n, 3) of a model by their tags, zeros where there is none, m."""
+    tags, places, _ = gmsh.model.mesh.getNodes()
+    points = np.zeros((int(tags.max()) + 1, 3))
+    points[tags.astype(int)] = places.reshape(-1, 3)
+    return points
+
+
 @dataclass(frozen=True, eq=False)
 class SolidCells:
-    """The cells of a solid mesh and the facets of its interfaces.
+    """The cells of a mesh and the facets of its interfaces.
 
     Attributes:
-        points: (n, 3) m.
-        cells: (m, 4 or 8) of every region by its group, in Gmsh's order.
-        facets: (k, 3 or 4) of every interface that is known by its group.
+        points: (n, d) m.
+        cells: (m, c) of every region by its group, in Gmsh's order.
+        facets: (k, f) of every interface that is known by its group.
     """
 
     points: np.ndarray
@@ -107,39 +137,34 @@ class SolidCells:
 
 
 def boundary(cells: np.ndarray) -> np.ndarray:
-    """Return the facets (k, 3 or 4) that only one of the cells (m, 4 or 8) has."""
+    """Return the facets (k, 3 or 4) that only one of the cells (m, 4 or 8) has, around them."""
     facets = np.concatenate([cells[:, side] for side in SIDES[cells.shape[1]]])
-    _, first, count = np.unique(
-        np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    return np.asarray(facets[first[count == 1]])
+    order = np.sort(facets, axis=1)
+    _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(facets[count[which.ravel()] == 1])
 
 
 def into_model(gmsh: Any, mesh: SolidCells) -> Entities:
-    """Make cells and facets a model of Gmsh, in place of what it has; return its entities."""
+    """Make cells, facets and their points a model of Gmsh, in place of what it has."""
     gmsh.clear()
-    model = gmsh.model
-    found: Entities = {group: [] for group in NAMES}
+    model, dim = gmsh.model, mesh.points.shape[1]
     model.add("solid")
-    numbered = False
-    kinds = {
-        3: {4: TETRAHEDRON, 8: HEXAHEDRON},
-        2: {3: TRIANGLE, 4: QUADRILATERAL},
-    }
-    for dim, groups in ((3, mesh.cells), (2, mesh.facets)):
+    used = np.unique(np.concatenate([rows.ravel() for rows in mesh.cells.values()]))
+    number = np.zeros(len(mesh.points), dtype=int)
+    number[used] = np.arange(1, len(used) + 1)
+    places = np.pad(mesh.points[used], ((0, 0), (0, 3 - dim)))
+    found: Entities = {group: [] for group in NAMES}
+    for d, groups in ((dim, mesh.cells), (dim - 1, mesh.facets)):
         for group, rows in groups.items():
             found[group] = []
-            if not len(rows):
-                continue
-            entity = model.addDiscreteEntity(dim)
-            if not numbered:
-                model.mesh.addNodes(
-                    dim, entity, np.arange(1, len(mesh.points) + 1), mesh.points.ravel()
-                )
-                numbered = True
-            kind = kinds[dim][rows.shape[1]]
-            model.mesh.addElementsByType(entity, kind, [], rows.ravel() + 1)
-            found[group] = [entity]
+            if len(rows):
+                entity = model.addDiscreteEntity(d)
+                if len(places):  # the first one has them all
+                    model.mesh.addNodes(d, entity, number[used], places.ravel())
+                    places = places[:0]
+                kind = STRAIGHT[d, rows.shape[1]]
+                model.mesh.addElementsByType(entity, kind, [], number[rows].ravel())
+                found[group] = [entity]
     return found
 
 
@@ -152,18 +177,13 @@ def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
     bores = bores_of(arm)
     if not bores and arm.mesh_scale == 1.0:
         return groups
-    tags, places, _ = gmsh.model.mesh.getNodes()
-    number = np.zeros(int(tags.max()) + 1, dtype=int)
-    number[tags.astype(int)] = np.arange(len(tags))
-    points = arm.mesh_scale * places.reshape(-1, 3)
-    cells = {
-        group: number[elements_of(gmsh, 3, groups[group])] for group in REGIONS if groups[group]
-    }
+    points = arm.mesh_scale * points_by_tag(gmsh)
+    cells = {group: elements_of(gmsh, 3, groups[group]) for group in REGIONS if groups[group]}
     widths = {rows.shape[1] for rows in cells.values()}
     if len(widths) != 1 or not widths <= set(SIDES):
         return groups  # told by its kinds of cells
     facets = {
-        group: number[elements_of(gmsh, 2, groups[group])]
+        group: elements_of(gmsh, 2, groups[group])
         for group in interface_names(arm)
         if group not in bores
     }
@@ -238,10 +258,7 @@ class Tetrahedra:
     @property
     def boundary(self) -> np.ndarray:
         """Facets (k, 3) that only one cell has, counterclockwise from outside."""
-        facets = np.concatenate([self.cells[:, side] for side in SIDES[4]])
-        order = np.sort(facets, axis=1)
-        _, which, count = np.unique(order, axis=0, return_inverse=True, return_counts=True)
-        return np.asarray(facets[count[which.ravel()] == 1])
+        return boundary(self.cells)
 
     def figures(self) -> dict[str, Any]:
         """Return its entry of part.json."""
@@ -386,7 +403,7 @@ def _faces_of(
         inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
         a, b, c = points[nodes - 1].swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        if area[inside].sum() > INTERFACE_AREA_SHARE * area.sum():
+        if area[inside].sum() > 0.5 * area.sum():
             found.append(face)
     return found
 
@@ -432,7 +449,7 @@ class InterfaceMesh(Protocol):
 def msh_bytes(mesh: InterfaceMesh) -> bytes:
     """Return the .msh file that `arms.mesh` reads back, on this process alone."""
     with gmsh_on_root(MPI.COMM_SELF) as gmsh, tempfile.TemporaryDirectory() as folder:
-        add_cells(gmsh.model, mesh)
+        add_cells(gmsh, mesh)
         gmsh.option.setNumber("Mesh.Binary", 1)
         gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
         path = Path(folder) / "solid.msh"
@@ -440,23 +457,16 @@ def msh_bytes(mesh: InterfaceMesh) -> bytes:
         return path.read_bytes()
 
 
-def add_cells(model: Any, mesh: InterfaceMesh) -> None:
-    """Make a mesh and its interfaces a model of Gmsh."""
-    kinds = {3: (TRIANGLE, LINE), 4: (TETRAHEDRON, TRIANGLE), 8: (HEXAHEDRON, QUADRILATERAL)}
-    cell, side = kinds[mesh.cells.shape[1]]
-    dim = mesh.points.shape[1]
-    places = np.pad(mesh.points, ((0, 0), (0, 3 - dim)))
-    model.add("solid")
-    solid = model.addDiscreteEntity(dim)
-    model.mesh.addNodes(dim, solid, np.arange(1, len(places) + 1), places.ravel())
-    model.mesh.addElementsByType(solid, cell, [], mesh.cells.ravel() + 1)
-    model.addPhysicalGroup(dim, [solid], DESIGN)
-    model.setPhysicalName(dim, DESIGN, NAMES[DESIGN])
-    named = [(INBOARD, NAMES[INBOARD], mesh.inboard), (OUTBOARD, NAMES[OUTBOARD], mesh.outboard)]
+def add_cells(gmsh: Any, mesh: InterfaceMesh) -> None:
+    """Make a mesh and its interfaces the model of Gmsh."""
+    names = dict(NAMES)
+    facets = {INBOARD: mesh.inboard, OUTBOARD: mesh.outboard}
     if isinstance(mesh, Tetrahedra):
-        named += [(FURTHER + k, name, own) for k, (name, own) in enumerate(mesh.further.items())]
-    for group, name, facets in named:
-        face = model.addDiscreteEntity(dim - 1)
-        model.mesh.addElementsByType(face, side, [], facets.ravel() + 1)
-        model.addPhysicalGroup(dim - 1, [face], group)
-        model.setPhysicalName(dim - 1, group, name)
+        for k, (name, own) in enumerate(mesh.further.items(), FURTHER):
+            names[k], facets[k] = name, own
+    groups = into_model(gmsh, SolidCells(mesh.points, {DESIGN: mesh.cells}, facets))
+    model, dim = gmsh.model, mesh.points.shape[1]
+    for group in (DESIGN, *facets):
+        d = dim - (group != DESIGN)
+        model.addPhysicalGroup(d, groups[group], group)
+        model.setPhysicalName(d, group, names[group])

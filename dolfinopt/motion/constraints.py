@@ -79,10 +79,6 @@ class Constraints:
             parts.append(self.reach * target.turning[order])
         return np.hstack(parts)
 
-    def error(self, q: np.ndarray, target: Target) -> np.ndarray:
-        """Return how far poses are off (n, k), m."""
-        return self.at(q).error(target)
-
 
 class Pose:
     """Closures and path at poses q (n, R)."""

@@ -66,7 +66,7 @@ class Follower:
         target = task.target(t)
         q = task.with_given(table(np.clip(t, 0.0, task.end)), target)
         q = task.newton(q, target)[0]
-        off = np.linalg.norm(task.constraints.error(q, target), axis=1)
+        off = np.linalg.norm(task.constraints.at(q).error(target), axis=1)
         wrong = np.flatnonzero(~(off <= self.start.tolerance))
         if wrong.size:
             raise self._lost(q[wrong[0]], float(t[wrong[0]]))

@@ -69,13 +69,13 @@ def nearest(
         return np.pad(x, [(0, max(len(free) - len(x), 0)), *[(0, 0)] * (x.ndim - 1)])
 
     def error(x: np.ndarray) -> np.ndarray:
-        return padded(-constraints.error(pose(x), target)[0, rows] / constraints.reach)
+        return padded(-constraints.at(pose(x)).error(target)[0, rows] / constraints.reach)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
         return padded(constraints.at(pose(x)).rows()[0, rows][:, free])
 
     if len(free) == 0:
-        off = np.linalg.norm(constraints.error(q[None], target)[0, rows])
+        off = np.linalg.norm(constraints.at(q[None]).error(target)[0, rows])
         return q, float(off)
     found = least_squares(
         error,
@@ -210,7 +210,7 @@ def _check(task: Task, G: np.ndarray, share: float) -> None:
 
 def unreached(task: Task, t: float, q: np.ndarray, target: Target) -> InputError:
     """Return which closure stays open, or how far the end-effector is off, at pose q (R,)."""
-    error, loops = task.constraints.error(q[None], target)[0], task.constraints.loops
+    error, loops = task.constraints.at(q[None]).error(target)[0], task.constraints.loops
     gaps, (place, turn) = loops.by_tie(error[: loops.count]), np.split(error[loops.count :], [3])
     if max(gaps, default=0.0) > 0.1 * np.abs(error).max():
         worst = int(np.argmax(gaps))

@@ -45,38 +45,71 @@ def body_gradient(
     loads = inward_pass(tree, links)
     zeta = np.ascontiguousarray(multipliers.T)
     moves, ends = _virtual_motion(tree, links, zeta, drives)
-    by_motion: dict[int, np.ndarray] = {}
     by_rotation = _by_rotation(tree, links, moves, zeta)
-    none = np.zeros((0, len(q)))
+    by_motion: dict[int, np.ndarray] = {}
     gradient: dict[int, ShapeIntegrals] = {}
     for i in reversed(tree.order):
-        link, own, dim = links[i], zeta[tree.slices[i]], tree.dim
-        by = link.body.motion_gradient(moves[i], own)
-        outboard: dict[int, np.ndarray] = {}
+        link, own = links[i], zeta[tree.slices[i]]
+        by_motion[i] = link.body.motion_gradient(moves[i], own)
+        by_displacement: dict[int, np.ndarray] = {}
         for s, interface in link.interfaces.items():
-            on_interface = np.zeros_like(by)
-            for k in tree.hanging[i, s]:
-                on_interface += links[k].joint.motion_gradient(by_motion[k])
-                if (rotor := links[k].rotor) is not None:
-                    on_interface += np.einsum("ijn,in->jn", rotor.load_by_motion, ends[i, s])
-                    on_interface += rotor.force_by_motion[:, None] * drives[:, tree.rotors[k]]
-            if s in link.carried:
-                on_interface += link.carried[s].motion_gradient(ends[i, s], none)
-            by += interface.motion_gradient(on_interface)
-            if not link.body.is_flexible:
-                continue
-            load, turning = loads.outboard[i][s], carried_load(link, loads.outboard[i], s)
-            weights = np.empty((dim.b, 4, zeta.shape[1]))
-            weights[:, :3] = interface.displacement_gradient(on_interface)
-            weights[:, 3] = interface.coefficients(load)
-            displaced = product(interface.V, own)
-            weights[:, 0] += interface.load_gradient(load, turning, moves[i], displaced)
-            if (i, s) in by_rotation:
-                weights[dim.d :, 0] += by_rotation[i, s]
-            outboard[s] = weights
-        by_motion[i] = by
-        gradient[i] = link.body.integral_gradient(moves[i], own, outboard)
+            by = _by_interface_motion(tree, links, (i, s), by_motion, ends, drives)
+            by_motion[i] += interface.motion_gradient(by)
+            if link.body.is_flexible:
+                weights = _by_displacement(link, s, by, loads.outboard[i], moves[i], own)
+                if (i, s) in by_rotation:
+                    weights[tree.dim.d :, 0] += by_rotation[i, s]
+                by_displacement[s] = weights
+        gradient[i] = link.body.integral_gradient(moves[i], own, by_displacement)
     return [gradient[i] for i in range(len(links))]
+
+
+def _by_interface_motion(
+    tree: Mechanism,
+    links: list[Link],
+    site: Site,
+    by_motion: dict[int, np.ndarray],
+    ends: dict[Site, np.ndarray],
+    drives: np.ndarray,
+) -> np.ndarray:
+    """Return the derivative (d + 2 r, n) by an interface's motion, of all that it carries."""
+    (i, s), dim = site, tree.dim
+    by = np.zeros((dim.b + dim.r, len(drives)))
+    for k in tree.hanging[site]:
+        by += links[k].joint.motion_gradient(by_motion[k])
+        if (rotor := links[k].rotor) is not None:
+            by += np.einsum("ijn,in->jn", rotor.load_by_motion, ends[site])
+            by += rotor.force_by_motion[:, None] * drives[:, tree.rotors[k]]
+    if s in links[i].carried:
+        none = np.zeros((0, len(drives)))
+        by += links[i].carried[s].motion_gradient(ends[site], none)
+    return by
+
+
+def _by_displacement(
+    link: Link,
+    s: int,
+    by_motion: np.ndarray,
+    loads: dict[int, np.ndarray],
+    virtual: np.ndarray,
+    zeta: np.ndarray,
+) -> np.ndarray:
+    """Return the derivatives (b, 4, n) by (u, theta), its rates and its variation.
+
+    Args:
+        link: a flexible body.
+        s: its interface.
+        by_motion: derivatives by the interface's motion (d + 2 r, n).
+        loads: of the body's interfaces.
+        virtual: displacement and rotation of the body (d + r, n).
+        zeta: multipliers (q, n) of its rows.
+    """
+    interface, turning = link.interfaces[s], carried_load(link, loads, s)
+    moved = product(interface.V, zeta)
+    by_rates = interface.displacement_gradient(by_motion)
+    by_rates[:, 0] += interface.load_gradient(loads[s], turning, virtual, moved)
+    variation = interface.coefficients(loads[s])
+    return np.concatenate([by_rates, variation[:, None]], axis=1)
 
 
 def _by_rotation(

@@ -309,8 +309,8 @@ def integrated(
     X, V, MV = arm.points, basis.V, basis.MV
     q = V.shape[2]
     rigid = arm.rigid_inertia  # M [1, X], per component
-    MX, MV_flat = rigid[:, :, 1], MV.reshape(-1, q)
-    EX, EV = _applied(E, X), _applied(E, V).reshape(len(E), -1, q)
+    MX, MV_flat = rigid[:, :, 1], MV.reshape(X.size, q)
+    EX, EV = _applied(E, X), _applied(E, V).reshape(len(E), X.size, q)
     parts = (
         rigid[:, 0, 0].sum(),
         MX.sum(axis=0),

@@ -1,7 +1,7 @@
 """Tangent of inverse dynamics: its derivative by coordinates and their rates.
 
 The derivatives of frames' motions by all coordinates inboard of them go outwards along the tree as
-motions do, those of loads inwards; every body adds what its own coordinates do to both.
+motions do, those of loads by all coordinates inwards; every body adds what its own coordinates do.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Tangent:
 
     def step_mean(self, stages: int, keep: np.ndarray) -> Tangent:
         """Return its mean over every `stages` instants, by some of the coordinates, ascending."""
-        kept = self.matrix[:, :, self.order[keep]]
+        kept = self.matrix.take(self.order[keep], axis=2)
         mean = kept.reshape(-1, stages, *kept.shape[1:]).mean(axis=1)
         return Tangent(mean, self.own[keep], np.arange(len(keep)))
 
@@ -126,23 +126,8 @@ def _columns(
     return places, np.array([places[k] for k in wanted], dtype=int)
 
 
-@dataclass(frozen=True, eq=False)
-class _LoadDerivative:
-    """Derivatives of the load on a frame or an interface, in its components.
-
-    Attributes:
-        by_motion: by its own motion, all that hangs on it moving along (n, d + r, d + 2 r).
-        by_columns: by the columns from `first` on (n, d + r, .).
-        first: where those that do not move it begin.
-    """
-
-    by_motion: np.ndarray
-    by_columns: np.ndarray
-    first: int
-
-
 class _Passes:
-    """Both passes.
+    """Both passes; derivatives have a column for each coordinate, its rate and acceleration.
 
     Attributes:
         matrix: (n, R + N, 3 S), of R rigid coordinates asked for.
@@ -161,58 +146,41 @@ class _Passes:
         self.kept = [keep[a:b] - part.start for (a, b), part in parts]
         self.count, rows = links[0].body.a.shape[1], len(asked) + tree.num_coordinates
         self.matrix = np.zeros((self.count, rows, 3 * len(self.order)))
-        # Of the motions of interfaces by all columns before their body's and by these.
+        # Derivatives of motions by the columns up to the last one that moves them.
+        self.frames: dict[int, np.ndarray] = {}
         self.ends: dict[Site, np.ndarray] = {}
         self.own: dict[int, slice] = {}  # columns of a body's coordinates
         self._outwards()
-        self.on_carriers: dict[int, _LoadDerivative] = {}
+        self.on_carriers: dict[int, np.ndarray] = {}  # derivatives of loads (n, d + r, 3 S)
         self._inwards()
 
     def _outwards(self) -> None:
         tree = self.tree
-        cart = tree.cart is not None and 0 in self.rows
-        ground = np.zeros((self.count, self.dim.b + self.dim.r, 3 * cart))
+        stop = 3 * (tree.cart is not None and 0 in self.rows)
+        ground = np.zeros((self.count, self.dim.b + self.dim.r, stop))
         ground[:, 0, 2::3] = 1.0
         self.ends[GROUND, 0] = ground
-        stop = ground.shape[2]
         for i in tree.order:
             link, joint, kept = self.links[i], tree.joints[i], self.kept[i]
             stop += 3 * sum(k in self.rows for k in {joint.coordinate, tree.rotors.get(i)})
+            frame = self.frames[i] = np.zeros((*ground.shape[:2], stop))
+            carrier = self.ends[joint.parent, joint.interface]
+            np.matmul(link.joint.transform, carrier, out=frame[:, :, : carrier.shape[2]])
+            if (columns := self._of(joint.coordinate)) is not None:
+                frame[:, :, columns] += by_instant(link.joint.by_coordinates[:, :, 0])
             self.own[i] = slice(stop, stop + 3 * len(kept))
             stop = self.own[i].stop
             for s, interface in link.interfaces.items():
-                end = self.ends[i, s] = self._moved(i, interface.transform, stop)
+                end = self.ends[i, s] = np.zeros((*ground.shape[:2], stop))
+                np.matmul(interface.transform, frame, out=end[:, :, : frame.shape[2]])
                 if link.body.is_flexible:
                     by_own = link.body.by_rates(interface.by_coordinates, interface.places, kept)
                     end[:, :, self.own[i]] = by_own.reshape(*end.shape[:2], -1)
 
-    def _carrier(self, i: int) -> np.ndarray:
-        """Return the derivatives of the motion of what carries body i."""
-        joint = self.tree.joints[i]
-        return self.ends[joint.parent, joint.interface]
-
-    def _moved(self, i: int, left: np.ndarray, width: int) -> np.ndarray:
-        """Return matrices (n, m, .) times the derivatives of a frame's motion."""
-        out = np.zeros((self.count, left.shape[1], width))
-        self._add_moved(i, left, out, alone=True)
-        return out
-
-    def _add_moved(self, i: int, left: np.ndarray, out: np.ndarray, alone: bool) -> None:
-        """Add matrices (n, m, .) times the derivatives of the motion of a body's frame."""
-        carrier = self._carrier(i)
-        by_carrier = left @ self.links[i].joint.transform
-        _add_product(by_carrier, carrier, out[:, :, : carrier.shape[2]], alone)
-        if (by_joint := self._joint_columns(i)) is not None:
-            out[:, :, by_joint] += left @ self._by_joint(i)
-
-    def _joint_columns(self, i: int) -> slice | None:
-        """Return the columns of the coordinate of a body's joint, if it is asked for."""
-        place = self.places.get(self.tree.joints[i].coordinate)
+    def _of(self, coordinate: int | None) -> slice | None:
+        """Return the columns of a rigid coordinate, if it is asked for."""
+        place = self.places.get(coordinate)
         return None if place is None else slice(3 * place, 3 * place + 3)
-
-    def _by_joint(self, i: int) -> np.ndarray:
-        """Return the derivatives of a frame's motion by its joint's coordinate (n, d + 2 r, 3)."""
-        return self.links[i].joint.by_coordinates[:, :, 0].transpose(2, 0, 1)
 
     def _inwards(self) -> None:
         for i in reversed(self.tree.order):
@@ -223,115 +191,84 @@ class _Passes:
             if self.links[i].body.is_flexible:
                 self._add_rows(i, outboard)
             if felt:
-                self.on_carriers[i] = self._on_carrier(i, outboard)
-        if self.rows:
-            on_ground = self._on_interface((GROUND, 0))
-            if self.tree.cart is not None and 0 in self.rows:
-                self.matrix[:, 0, on_ground.first :] += on_ground.by_columns[:, 0]
-                self.matrix[:, 0, 2] += on_ground.by_motion[:, 0, 0] + self.tree.cart
+                self.on_carriers[i] = self._on_carrier(i, self._on_frame(i, outboard))
+        if not self.rows:
+            return
+        on_ground = self._on_interface((GROUND, 0))
+        if self.tree.cart is not None and 0 in self.rows:
+            self.matrix[:, 0] += on_ground[:, 0]
+            self.matrix[:, 0, 2] += self.tree.cart
 
-    def _first(self, width: int) -> int:
-        """Return the first column by which loads behind a frame of so many are differentiated."""
-        return 0 if self.tree.forces else width  # those of the world turn with what is inboard
-
-    def _on_interface(self, site: Site) -> _LoadDerivative:
-        """Return the derivative of the load on an interface by all that is not inboard."""
+    def _on_interface(self, site: Site) -> np.ndarray:
+        """Return the derivative of the load on an interface, in its components."""
         (i, s), tree, end = site, self.tree, self.ends[site]
-        first = self._first(end.shape[2])
-        hanging = [self.on_carriers[k] for k in tree.hanging[site]]
-        by_motion = np.zeros((self.count, self.dim.b, end.shape[1]))
-        by_motion += sum(one.by_motion for one in hanging)
-        if hanging:
-            by_columns = sum((one.by_columns for one in hanging[1:]), hanging[0].by_columns)
-        else:
-            by_columns = np.zeros((self.count, self.dim.b, self.matrix.shape[2] - first))
+        out = np.zeros((self.count, self.dim.b, self.matrix.shape[2]))
+        moved = out[:, :, : end.shape[2]]
         for k in tree.hanging[site]:
+            out += self.on_carriers[k]
             if (rotor := self.links[k].rotor) is None:
                 continue
-            by_motion += by_instant(rotor.load_by_motion)
-            if (row := self.rows.get(tree.rotors[k])) is not None:
-                place = 3 * self.places[tree.rotors[k]]
-                by_motor = rotor.load_by_motor.transpose(2, 0, 1)
-                by_columns[:, :, place - first : place - first + 3] += by_motor
-                self.matrix[:, row, : end.shape[2]] += rotor.force_by_motion @ end
-                self.matrix[:, row, place + 2] += rotor.force_by_motor
+            moved += by_instant(rotor.load_by_motion) @ end
+            if (columns := self._of(tree.rotors[k])) is not None:
+                out[:, :, columns] += by_instant(rotor.load_by_motor)
+                row = self.matrix[:, self.rows[tree.rotors[k]]]
+                row[:, : end.shape[2]] += rotor.force_by_motion @ end
+                row[:, columns.stop - 1] += rotor.force_by_motor
         if i != GROUND and s in self.links[i].carried:
-            by_motion += by_instant(self.links[i].carried[s].load_by_motion)
-        return _LoadDerivative(by_motion, by_columns, first)
+            moved += by_instant(self.links[i].carried[s].load_by_motion) @ end
+        return out
 
-    def _add_rows(self, i: int, outboard: dict[int, _LoadDerivative]) -> None:
+    def _add_rows(self, i: int, outboard: dict[int, np.ndarray]) -> None:
         """Add the derivative of a body's elastic rows."""
-        link, kept, part = self.links[i], self.kept[i], self.tree.slices[i]
-        body, loads, columns = link.body, self.loads.outboard[i], self.own[i]
+        link, kept, part, frame = self.links[i], self.kept[i], self.tree.slices[i], self.frames[i]
+        body, loads = link.body, self.loads.outboard[i]
         rows = self.matrix[:, len(self.rows) + part.start : len(self.rows) + part.stop]
-        by_motion = by_instant(body.rows_by_motion.swapaxes(0, 1))
+        rows[:, :, : frame.shape[2]] += by_instant(body.rows_by_motion.swapaxes(0, 1)) @ frame
         own = body.rows_by_rates(kept, interface_coefficients(link, loads))
-        own = own.reshape(*rows.shape[:2], -1)
         for s, interface in link.interfaces.items():
-            V, turning, on = by_instant(interface.V), carried_load(link, loads, s), outboard[s]
-            Vt, by_end = V.swapaxes(1, 2), interface.of_coefficients @ on.by_motion
-            by_load = Vt @ interface.of_coefficients
-            by_motion += Vt @ (by_end @ interface.transform)
-            _add_product(by_load, on.by_columns, rows[:, :, on.first :], len(outboard) == 1)
-            by_own = by_end @ self.ends[i, s][:, :, columns]
+            V, turning = by_instant(interface.V), carried_load(link, loads, s)
+            Vt = V.swapaxes(1, 2)
+            rows += (Vt @ interface.of_coefficients) @ outboard[s]
             by_displacement = interface.coefficients_by_coordinates(loads[s], turning)
-            by_own[:, :, ::3] += by_instant(by_displacement) @ V[:, :, kept]
-            own += Vt @ by_own
+            own[..., 0] += Vt @ (by_instant(by_displacement) @ V[:, :, kept])
             if s in link.applied:
-                given = by_instant(interface.coefficients(_given(link, s)))
-                self._add_turned(i, Vt @ given, rows)
-        rows[:, :, columns] += own
-        self._add_moved(i, by_motion, rows, alone=not self.tree.forces)
+                rows[:, :, : frame.shape[2] : 3] += (
+                    Vt @ by_instant(interface.coefficients(_given(link, s))) @ self._turned(i)
+                )
+        rows[:, :, self.own[i]] += own.reshape(*rows.shape[:2], -1)
 
-    def _on_carrier(self, i: int, outboard: dict[int, _LoadDerivative]) -> _LoadDerivative:
-        """Return the derivative of what a body and all behind it ask of what carries it.
-
-        The row of the joint's drive follows from the same products.
-        """
-        link, kept, own, b = self.links[i], self.kept[i], self.own[i], self.dim.b
-        body, joint, loads = link.body, link.joint, self.loads.outboard[i]
-        carrier, row = self._carrier(i), self.rows.get(joint.joint.coordinate)
-        left, first = joint.of_loads, self._first(carrier.shape[2])
-        if row is not None:
-            axis = np.broadcast_to(joint.drive_axis, (self.count, 1, b))
-            left = np.concatenate([np.broadcast_to(left, (self.count, b, b)), axis], axis=1)
-        by_motion = by_instant(body.load_by_motion)
-        by_own = np.zeros((self.count, b, 3 * len(kept)))
-        if body.is_flexible:
-            by_own = body.load_by_rates(kept).reshape(by_own.shape)
-        out = np.zeros((self.count, left.shape[1], self.matrix.shape[2] - first))
+    def _on_frame(self, i: int, outboard: dict[int, np.ndarray]) -> np.ndarray:
+        """Return the derivative of what a body and all behind it ask of its frame."""
+        link, kept, frame, loads = self.links[i], self.kept[i], self.frames[i], self.loads.outboard
+        out = np.zeros((self.count, self.dim.b, self.matrix.shape[2]))
+        moved, own = out[:, :, : frame.shape[2]], out[:, :, self.own[i]]
+        moved += by_instant(link.body.load_by_motion) @ frame
+        if link.body.is_flexible:
+            own += link.body.load_by_rates(kept).reshape(own.shape)
         for s, interface in link.interfaces.items():
-            of_loads, on = interface.of_loads, outboard[s]
-            by_motion += of_loads @ (on.by_motion @ interface.transform)
-            by_own += of_loads @ (on.by_motion @ self.ends[i, s][:, :, own])
-            behind = out[:, :, on.first - first :]
-            _add_product(left @ of_loads, on.by_columns, behind, len(outboard) == 1)
-            if body.is_flexible:
-                turning = carried_load(link, loads, s)
-                by_displacement = by_instant(interface.load_by_coordinates(loads[s], turning))
-                by_own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
+            out += interface.of_loads @ outboard[s]
+            if link.body.is_flexible:
+                turning = carried_load(link, loads[i], s)
+                by_displacement = by_instant(interface.load_by_coordinates(loads[i][s], turning))
+                own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
             if s in link.applied:
-                given = by_instant(self.dim.shifted(interface.place, _given(link, s)))
-                self._add_turned(i, left @ given, out)
-        out[:, :, own.start - first : own.stop - first] += left @ by_own
-        by_motion = left @ by_motion
-        by_carrier = by_motion @ joint.transform
-        if (columns := self._joint_columns(i)) is not None:
-            by_joint = out[:, :, columns.start - first : columns.stop - first]
-            by_joint += by_motion @ self._by_joint(i)
-            load = joint.in_carrier(self.loads.joints[i])
-            if row is not None:
-                self.matrix[:, row, : carrier.shape[2]] += (by_carrier[:, b:] @ carrier)[:, 0]
-                self.matrix[:, row, first:] += out[:, b]
-            by_joint[:, :b, 0] += joint.load_by_coordinates(load, load)[:, 0].T
-        return _LoadDerivative(by_carrier[:, :b], out[:, :b], first)
+                given = self.dim.shifted(interface.place, _given(link, s))
+                moved[:, :, ::3] += by_instant(given) @ self._turned(i)
+        return out
 
-    def _add_turned(self, i: int, left: np.ndarray, out: np.ndarray) -> None:
-        """Add matrices (n, m, r) times the derivatives of a body's rotation by coordinates."""
-        # They are those of its spin by their rates.
-        spin = np.eye(self.dim.b + self.dim.r)[self.dim.d : self.dim.b]
-        turned = self._moved(i, left @ spin, self.own[i].start)
-        out[:, :, 0 : self.own[i].start : 3] += turned[:, :, 1::3]
+    def _on_carrier(self, i: int, on_frame: np.ndarray) -> np.ndarray:
+        """Return the same of what carries it, in its components; add the row of the drive."""
+        joint = self.links[i].joint
+        out: np.ndarray = joint.of_loads @ on_frame
+        if (columns := self._of(joint.joint.coordinate)) is not None:
+            self.matrix[:, self.rows[joint.joint.coordinate]] += joint.drive_axis @ on_frame
+            load = joint.in_carrier(self.loads.joints[i])
+            out[:, :, columns.start] += joint.load_by_coordinates(load, load)[:, 0].T
+        return out
+
+    def _turned(self, i: int) -> np.ndarray:
+        """Return the derivative of a body's rotation: that of its spin by their rates."""
+        return self.frames[i][:, self.dim.d : self.dim.b, 1::3]
 
 
 def _given(link: Link, s: int) -> np.ndarray:
@@ -340,11 +277,3 @@ def _given(link: Link, s: int) -> np.ndarray:
     force, moment = np.split(link.applied[s].in_world, [dim.d])
     of_moment = dim.by_spin(moment) if dim.r > 1 else np.zeros((1, 1, moment.shape[1]))
     return -np.concatenate([dim.by_spin(force), of_moment])
-
-
-def _add_product(A: np.ndarray, B: np.ndarray, out: np.ndarray, alone: bool) -> None:
-    """Add A B; where it is alone nothing stands there yet."""
-    if alone:
-        np.matmul(A, B, out=out)
-    else:
-        out += A @ B

@@ -18,7 +18,7 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, CRISP_NEWTON_ITERATIONS
+from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, NEWTON_ITERATIONS
 from dolfinopt.parallel import together
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import Evaluation, evaluate
@@ -106,7 +106,7 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
         return None
     cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
     steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
-    with suppress(ConvergenceError), counted(CRISP_NEWTON_ITERATIONS * steps):
+    with suppress(ConvergenceError), counted(NEWTON_ITERATIONS * steps):
         return evaluator.evaluate_densities(cut, simulated=True)
     return None
 
@@ -194,14 +194,35 @@ def straight_bars(
 
 def _bar(arm: Arm, fraction: float) -> np.ndarray:
     """Return the densities (n_cells,) of a bar that fills this fraction of an arm's volume."""
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        size = 0.5 * (low + high)
+        short = arm.volume_fraction(drawn(arm, "bar", size)) < fraction
+        low, high = (size, high) if short else (low, size)
+    return drawn(arm, "bar", high)
+
+
+def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
+    """Return the densities (n_cells,) of a straight member within an arm's box of cells.
+
+    Cells that its surface cuts are filled in part.
+
+    Args:
+        arm: of cells along, over the height, and of solids over the thickness.
+        kind: "bar": the arm's section times `size`; "tube": walls of `size` half heights, in the
+            plane flanges; "truss": such flanges, and as thick diagonals of 45 degrees between them.
+        size: from 0 to 1, solid.
+    """
     mesh, one = arm.mesh, arm.scene.arms[arm.places[0]]
     assert one.cells is not None
     sides = np.array([one.height, one.thickness][: mesh.dim - 1])
-    half = sides / np.array(one.cells[1:]) / sides  # a cell, of the section's half
-    away = (2.0 * np.abs(mesh.centroid[:, 1:]) / sides).max(axis=1)
-    low, high, least = 0.0, 1.0, arm.scene.design.minimum
-    for _ in range(BISECTIONS):
-        size = 0.5 * (low + high)
-        x = mesh.keep(np.clip(0.5 + (size - away) / (2.0 * half.max()), least, 1.0))
-        low, high = (size, high) if arm.volume_fraction(x) < fraction else (low, size)
-    return x
+    across = 2.0 * mesh.centroid[:, 1:] / sides
+    away = np.abs(across).max(axis=1)  # of the axis, 1 at the surface
+    inside = size - away if kind == "bar" else size - (1.0 - away)
+    if kind == "truss":
+        phase = np.mod(mesh.centroid[:, 0] / one.height, 2.0)
+        diagonal = 1.0 - 2.0 * np.abs(phase - 1.0)
+        flanges = size - (1.0 - np.abs(across[:, 0]))
+        inside = np.maximum(flanges, 0.5 * size - np.abs(across[:, 0] - diagonal) / np.sqrt(2.0))
+    cell = 2.0 / min(one.cells[1:])  # in half heights
+    return mesh.keep(np.clip(0.5 + inside / cell, arm.scene.design.minimum, 1.0))

@@ -8,19 +8,17 @@ doi:10.1007/s00158-017-1884-0.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.measured import AT_BOUND_SHARE
+from dolfinopt.optimization.measured import ROOM_SHARE
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, problem_of
-from dolfinopt.optimization.residual import Sum, kkt_residual
-from dolfinopt.parallel import sum_over_arms
+from dolfinopt.optimization.residual import kkt_residual
+from dolfinopt.parallel import on_root
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.constraints import violated
 from dolfinopt.responses.response import needs
@@ -77,54 +75,33 @@ class Certificate:
 
 
 def judge(
-    x: np.ndarray,
-    xmin: np.ndarray,
-    xmax: np.ndarray,
-    exact: Problem,
-    frozen: np.ndarray | None,
-    parts: Mapping[int, slice],
-    total: Sum,
+    x: np.ndarray, xmin: np.ndarray, xmax: np.ndarray, exact: Problem, frozen: np.ndarray | None
 ) -> Certificate:
-    """Return the certificate of x from gradients (collective).
+    """Return the certificate of x from gradients.
 
     Args:
-        x, xmin, xmax: (n,) this rank's variables.
+        x, xmin, xmax: (n,) variables and bounds.
         exact: the problem at x with its exact gradients.
         frozen: (n,) the objective's gradient with frozen loads; None where nothing is frozen.
-        parts, total: as for `kkt_residual`.
     """
-    where = x, xmin, xmax
-    residual = kkt_residual(*where, exact.df0dx, exact.f, exact.dfdx, parts, total).rms
+    residual = kkt_residual(x, xmin, xmax, exact.df0dx, exact.f, exact.dfdx).rms
     angle = ratio = np.nan
     if frozen is not None:
-        angle, ratio = _compared(*where, exact.df0dx, frozen, parts, total)
+        width = xmax - xmin
+        scale = width * (np.minimum(x - xmin, xmax - x) > ROOM_SHARE * width)
+        angle, ratio = compared(exact.df0dx * scale, frozen * scale)
     return Certificate(residual, angle, ratio, violated=violated(exact.limits))
 
 
-def _compared(
-    x: np.ndarray,
-    xmin: np.ndarray,
-    xmax: np.ndarray,
-    exact: np.ndarray,
-    frozen: np.ndarray,
-    parts: Mapping[int, slice],
-    total: Sum,
-) -> tuple[float, float]:
-    """Return angle, degrees, and ratio of lengths over the free variables; nan if there is none."""
-    width = xmax - xmin
-    room = np.minimum(x - xmin, xmax - x)
-    free = (width > 0.0) & (room > AT_BOUND_SHARE * width)
-    g, h = np.where(free, exact * width, 0.0), np.where(free, frozen * width, 0.0)
-    gg, hh = total({k: np.array([g[p] @ g[p], h[p] @ h[p]]) for k, p in parts.items()})
-    if not (gg > 0.0 and hh > 0.0):
+def compared(exact: np.ndarray, frozen: np.ndarray) -> tuple[float, float]:
+    """Return the angle between two gradients, degrees, and the ratio of their lengths, or nan."""
+    size, other = np.linalg.norm(exact), np.linalg.norm(frozen)
+    if size == 0.0 or other == 0.0:
         return np.nan, np.nan
     # From the diagonals of the rhombus: a cosine would lose angles below 1e-6 degrees to rounding.
-    g, h = g / np.sqrt(gg), h / np.sqrt(hh)
-    across, along = total(
-        {k: np.array([np.sum((g - h)[p] ** 2), np.sum((g + h)[p] ** 2)]) for k, p in parts.items()}
-    )
-    angle = 2.0 * np.arctan2(np.sqrt(across), np.sqrt(along))
-    return float(np.degrees(angle)), float(np.sqrt(hh / gg))
+    a, b = exact / size, frozen / other
+    angle = 2.0 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))
+    return float(np.degrees(angle)), float(other / size)
 
 
 def without_exact_gradient(scene: Scene) -> str:
@@ -150,10 +127,10 @@ def certify(
 
     Args:
         evaluator: of the iterations.
-        x: (n,) this rank's design variables.
+        x: (n,) design variables.
         nominal, problem: at x.
     """
-    scene, comm = evaluator.scene, evaluator.partition.world
+    scene = evaluator.scene
     if missing := without_exact_gradient(scene):
         return Certificate(missing=missing, violated=violated(problem.limits))
     begun = time.perf_counter()
@@ -167,12 +144,15 @@ def certify(
         exact, with_frozen_loads = (other, problem) if used == "esl" else (problem, other)
         if scene.objective.has_esl_gradient:
             frozen = with_frozen_loads.df0dx
-    variables, total = evaluator.variables, partial(sum_over_arms, evaluator.partition)
-    bounds = variables.xmin, variables.xmax
-    found = judge(x, *bounds, exact, frozen, variables.slices, total)
-    seconds = comm.bcast(time.perf_counter() - begun, root=0)
-    stationary = bool(found.kkt <= scene.optimizer.kkt_tolerance)
-    return replace(found, seconds=seconds, stationary=stationary)
+    variables = evaluator.variables
+
+    def judged() -> Certificate:
+        found = judge(x, variables.xmin, variables.xmax, exact, frozen)
+        stationary = bool(found.kkt <= scene.optimizer.kkt_tolerance)
+        return replace(found, seconds=time.perf_counter() - begun, stationary=stationary)
+
+    certificate: Certificate = on_root(evaluator.partition.world, judged)
+    return certificate
 
 
 def _problem_by(

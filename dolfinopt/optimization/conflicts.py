@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from dolfinopt.optimization.measured import OPPOSING_SHARE, REACHED_LIMIT_SHARE
 from dolfinopt.optimization.problem import Problem
-from dolfinopt.optimization.residual import Sum, kkt_residual
+from dolfinopt.optimization.residual import kkt_residual
 from dolfinopt.responses.constraints import Limit
 
 
@@ -17,10 +15,8 @@ def conflict_sentences(
     x: np.ndarray,
     xmin: np.ndarray,
     xmax: np.ndarray,
-    parts: Mapping[int, slice],
-    total: Sum,
 ) -> str:
-    """Say what holds the violated limits back, a sentence each; "" if all are met (collective).
+    """Say what holds the violated limits back, a sentence each; "" if all are met.
 
     Of a design whose violation no step lessens: else nothing is known of what is out of reach. Of
     every violated limit f the residual of min f subject to the other limits is taken, with its
@@ -29,7 +25,7 @@ def conflict_sentences(
 
     Args:
         problem: at x.
-        x, xmin, xmax, parts, total: as for `kkt_residual`.
+        x, xmin, xmax: as for `kkt_residual`.
     """
     # All of the volume is no limit that could be relaxed, but that of a solid arm.
     full = [one.quantity == "volume_fraction" and one.limit >= 1.0 for one in problem.limits]
@@ -42,23 +38,13 @@ def conflict_sentences(
         row = int(np.flatnonzero(own)[np.argmax(problem.f[own])])
         others = np.flatnonzero(~own & (problem.f >= -REACHED_LIMIT_SHARE) & eased[problem.rows])
         g, rows = problem.dfdx[row], problem.dfdx[others]
-        left = kkt_residual(x, xmin, xmax, g, np.zeros(len(others)), rows, parts, total)
-        sizes = _sizes(np.vstack([g, rows]) * (xmax - xmin), parts, total)
+        left = kkt_residual(x, xmin, xmax, g, np.zeros(len(others)), rows)
+        sizes = np.sqrt(np.square(np.vstack([g, rows]) * (xmax - xmin)).mean(axis=1))
         strong = left.multipliers * sizes[1:] > OPPOSING_SHARE
         opposed = {problem.limits[k] for k in problem.rows[others[strong]]}
         names = [one for one in problem.limits if one in opposed]
         found[_sentence(limit, names)] = None
     return "; ".join(found)
-
-
-def _sizes(g: np.ndarray, parts: Mapping[int, slice], total: Sum) -> np.ndarray:
-    """Return the root mean square of gradients (k, n), the same on all ranks (k,)."""
-    squares = {
-        k: np.append((g[:, part] ** 2).sum(axis=1), part.stop - part.start)
-        for k, part in parts.items()
-    }
-    *sums, count = total(squares)
-    return np.asarray(np.sqrt(np.array(sums) / count))
 
 
 def _sentence(limit: Limit, others: list[Limit]) -> str:

@@ -164,21 +164,19 @@ class Evaluator:
             self.solutions = self.trajectory.solutions
         analysed = self.scene, self.partition, self.arms, self.trajectory, self.profile
         collect = self.projection.patterns.collect
-        objective = collect(gradient(*analysed))
+        by_cells = [collect(gradient(*analysed))]
         rows = constraint_gradients(*analysed, measured=evaluation.responses)
-        smooth = [collect(row.smooth) for row in rows]
+        by_cells += [collect(row.smooth) for row in rows]
+        backward = {}
         with together(self.partition.world):
-            by_x = [
-                self.variables.by_x(by, design) / row.limit
-                for by, row in zip(smooth, rows, strict=True)
-            ]
-            return EvaluatedDesign(
-                design,
-                evaluation,
-                self.variables.by_x(objective, design),
-                np.array(by_x).reshape(len(rows), self.variables.size),
-                np.array([row.response.declared.of_nominal for row in rows], dtype=bool),
-            )
+            for k, arm in self.variables.arms.items():
+                none = np.zeros(arm.mesh.num_cells)
+                by = [arm.backward(one[k], design[k]) if k in one else none for one in by_cells]
+                backward[k] = np.stack(by, axis=1)
+        by_x = np.ascontiguousarray(self.variables.join(backward).T)
+        limits = np.array([row.limit for row in rows])
+        of_nominal = np.array([row.response.declared.of_nominal for row in rows], dtype=bool)
+        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None], of_nominal)
 
 
 def densities(design: Mapping[int, PhysicalDesign]) -> dict[int, np.ndarray]:

@@ -12,14 +12,15 @@ from dolfinopt.arms.arm import Patterns
 from dolfinopt.dynamics.measured import AIM
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
+from dolfinopt.optimization.certificate import compared
 from dolfinopt.optimization.measured import (
-    FORCE_ROUNDING,
     INSIDE_MARGIN,
     OBJECTIVE_ROUNDING,
     PASSING_RATE,
     STEP_RATIO,
 )
-from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
+from dolfinopt.optimization.variables import Variables
+from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.evaluation import evaluate, gradient
@@ -89,41 +90,39 @@ def taylor_test(
         InputError: the scene's objective has no exact gradient.
     """
     check_exact(scene)
-    exact = _with(scene, gradient="exact")
-    designed = {k: arm for k, arm in arms.items() if k in scene.designed}
+    exact, variables = _with(scene, gradient="exact"), Variables(scene, partition, arms)
+    given = variables.join({k: x[k] for k in variables.arms})
+    inside = INSIDE_MARGIN + (1.0 - 2.0 * INSIDE_MARGIN) * given
     patterns = Patterns(scene, partition, arms)
-    x = {k: INSIDE_MARGIN + (1.0 - 2.0 * INSIDE_MARGIN) * x[k] for k in designed}
-    x_phys = _physical(partition, arms, patterns, x)
+
+    def slope_of(one: Scene) -> np.ndarray:
+        """Return a gradient by x, of the scene's kind."""
+        cells = patterns.collect(gradient(one, partition, arms, base, profile))
+        with together(partition.world):
+            parts = variables.split(inside).items()
+            by = {k: arms[k].backward(cells[k], arms[k].filtered(x)) for k, x in parts}
+        return variables.join(by)
+
+    x_phys = _physical(variables, patterns, inside)
     evaluation, base = evaluate(exact, partition, arms, x_phys, profile, simulated=False)
-    cells = patterns.collect(gradient(exact, partition, arms, base, profile))
-    slope = _by_x(partition, designed, cells, x)
-    frozen = None
+    slope, frozen = slope_of(exact), None
     if needs(scene, "motion"):
         if scene.objective.has_esl_gradient:
-            esl = _with(scene, gradient="esl")
-            cells = patterns.collect(gradient(esl, partition, arms, base, profile))
-            frozen = _by_x(partition, designed, cells, x)
+            frozen = slope_of(_with(scene, gradient="esl"))
         error = max(one.error for one in (evaluation, *evaluation.scenarios))
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    of_forces = "effort_weights" in scene.objective.response.options
-    share = FORCE_ROUNDING if of_forces else OBJECTIVE_ROUNDING
-    value = _fixed_objective(exact, partition, arms, patterns, profile, base)
-    here = value(x)
-    rounding = share * abs(here)
+    value = _fixed_objective(exact, variables, arms, patterns, profile, base)
+    here = value(inside)
     rows = []
-    for name, direction in _directions(scene, designed).items():
-        along = _dot(partition, slope, direction)
-        frozen_along = np.nan if frozen is None else _dot(partition, frozen, direction)
-        remainders = tuple(
-            abs(value({k: x[k] + h * direction[k] for k in x}) - here - h * along) for h in STEPS
-        )
-        rows.append(TaylorRow(name, along, frozen_along, remainders, _rate(remainders, rounding)))
-    if frozen is None:
-        return TaylorTest(tuple(rows), np.nan, np.nan)
-    lengths = [np.sqrt(_dot(partition, g, g)) for g in (slope, frozen)]
-    cosine = _dot(partition, slope, frozen) / (lengths[0] * lengths[1])
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    return TaylorTest(tuple(rows), angle, lengths[1] / lengths[0])
+    for name, parts in _directions(scene, variables.arms).items():
+        d = variables.join(parts)
+        along = float(slope @ d)
+        remainders = tuple(abs(value(inside + h * d) - here - h * along) for h in STEPS)
+        rate = _rate(remainders, OBJECTIVE_ROUNDING * abs(here))
+        beside = np.nan if frozen is None else float(frozen @ d)
+        rows.append(TaylorRow(name, along, beside, remainders, rate))
+    angle, ratio = (np.nan, np.nan) if frozen is None else compared(slope, frozen)
+    return TaylorTest(tuple(rows), angle, ratio)
 
 
 def check_exact(scene: Scene) -> None:
@@ -149,40 +148,28 @@ def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None 
     return scene.model_copy(update=update)
 
 
-def _physical(
-    partition: Partition, arms: Mapping[int, Arm], patterns: Patterns, x: Cells
-) -> dict[int, np.ndarray]:
-    with together(partition.world):
-        mine = {k: arms[k].physical(values) for k, values in x.items()}
+def _physical(variables: Variables, patterns: Patterns, x: np.ndarray) -> dict[int, np.ndarray]:
+    with together(variables.partition.world):
+        mine = {k: variables.arms[k].physical(part) for k, part in variables.split(x).items()}
     return patterns.spread(mine)
-
-
-def _by_x(
-    partition: Partition, arms: Mapping[int, Arm], gradient: Cells, x: Cells
-) -> dict[int, np.ndarray]:
-    with together(partition.world):
-        return {k: arm.backward(gradient[k], arm.filtered(x[k])) for k, arm in arms.items()}
-
-
-def _dot(partition: Partition, a: Cells, b: Cells) -> float:
-    return float(sum_over_arms(partition, {k: np.array(a[k] @ b[k]) for k in a}))
 
 
 def _fixed_objective(
     scene: Scene,
-    partition: Partition,
+    variables: Variables,
     arms: Mapping[int, Arm],
     patterns: Patterns,
     profile: Profile,
     base: Trajectory | None,
-) -> Callable[[Cells], float]:
+) -> Callable[[np.ndarray], float]:
     """Return J(x), of a motion with the load cases and time steps of `base`."""
     # Of the error that is aimed at, so that every scenario keeps its steps.
     error, solutions = AIM * scene.simulation.tolerance, () if base is None else base.solutions
     start, response = [replace(one, error=error) for one in solutions], objective_of(scene)
+    partition = variables.partition
 
-    def value(x: Cells) -> float:
-        x_phys = _physical(partition, arms, patterns, x)
+    def value(x: np.ndarray) -> float:
+        x_phys = _physical(variables, patterns, x)
         evaluation, trajectory = evaluate(
             scene, partition, arms, x_phys, profile, start, simulated=False
         )

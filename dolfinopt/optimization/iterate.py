@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
-from mpi4py import MPI
 
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
@@ -17,18 +14,17 @@ from dolfinopt.optimization.measured import (
     LEAP_FACTOR,
     LEAST_REACH,
     MERIT_RISE,
+    NEWTON_ITERATIONS,
     REACH_GROWTH,
-    RETURNED_REACH,
     SHORTER_REACH,
     SHORTER_STEP,
     STEP_ATTEMPTS,
-    STEP_NEWTON_ITERATIONS,
 )
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
 from dolfinopt.optimization.residual import Residual, kkt_residual
 from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Progress
-from dolfinopt.parallel import sum_over_arms
+from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.constraints import EXCESS, tightest
 from dolfinopt.responses.static import cell_volumes
 
@@ -37,7 +33,7 @@ class Iterate:
     """A design, evaluated, and what the method of moving asymptotes remembers.
 
     Attributes:
-        x, state: this rank's design variables (n,), and what MMA remembers.
+        x, state: design variables (n,), and what MMA remembers; the same on all ranks.
         problem, designs: at x; the designs that x stands for, the nominal one last.
         best, progress: the best design so far, and the course of the iterations.
         iteration, change: updates made, and the largest change of a variable in the last one.
@@ -52,11 +48,10 @@ class Iterate:
     designs: list[EvaluatedDesign]
 
     def __init__(self, evaluator: Evaluator, x: np.ndarray):
-        """Take what evaluates designs, and the variables (n,) of this rank."""
+        """Take what evaluates designs, and the variables (n,)."""
         self.evaluator, self.scene = evaluator, evaluator.scene
         self.variables, self.projection = evaluator.variables, evaluator.projection
         self.world = evaluator.partition.world
-        self.total = partial(sum_over_arms, evaluator.partition)
         self.x, self.state = x, initial_state(x)
         self.best, self.progress = Best.none(x), Progress()
         self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
@@ -104,7 +99,7 @@ class Iterate:
             return False
         self.return_to_best()
         self.returned_to = self.best.iteration
-        self.state, self.reach = initial_state(self.x), RETURNED_REACH
+        self.state, self.reach = initial_state(self.x), SHORTER_STEP
         self.progress, self.stuck = self.progress.anew(), ""
         return True
 
@@ -127,7 +122,7 @@ class Iterate:
     def _restore_best(self) -> None:
         if self.best.iteration >= 0:
             self.x = self.best.x.copy()
-            self.projection.restore((self.best.beta, self.best.thresholds))
+            self.projection.beta = self.best.beta
 
     def _set(self, designs: list[EvaluatedDesign]) -> None:
         self.designs = designs
@@ -141,7 +136,7 @@ class Iterate:
         new = Best(
             self.x.copy(),
             self.iteration,
-            *self.projection.state,
+            self.projection.beta,
             float(self.problem.values[0]),
             self.problem.excess,
             crisp=projected and self._volumes()[2] <= GREY_SHARE,
@@ -156,40 +151,40 @@ class Iterate:
 
         A step whose motion cannot be simulated, or that makes the objective or a limit twice as
         bad, is made a quarter as long, three times; where that does not help, x stays and `stuck`
-        says why. The next steps are half as long where the merit rose, else longer again.
+        says why. The next steps are half as long where the merit rose, else longer again, but not
+        as long as the projection becomes steeper.
         """
         size = abs(self.problem.f0) or 1.0
-        merit, before, start = self.problem.merit(size), self.projection.state, self.evaluator.start
+        merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
         rises = self.projection.rises(self.problem.excess)
         for attempt in range(STEP_ATTEMPTS):
             shorter = SHORTER_STEP**attempt
             new, after = self._proposed(shorter * self.reach * self.projection.move)
             if rises:
-                self.projection.advance(self.variables.split(new))
+                self.projection.advance()
             designs = self._tried(new)
             if designs is not None:
                 self._go_on(new, after, designs, rises)
-                if not rises:
-                    self._adapt_reach(shorter, self.problem.merit(size) > merit + MERIT_RISE)
+                rose = self.problem.merit(size) > merit + MERIT_RISE
+                growth = 1.0 if rises else REACH_GROWTH
+                factor = shorter * (SHORTER_REACH if rose else growth)
+                # A sharp projection leaps however short the step: without a least one it settles.
+                sharp = self.scene.design.projection and self.projection.complete
+                self.reach = min(1.0, max(0.0 if sharp else LEAST_REACH, factor * self.reach))
                 return
-            self.projection.restore(before)
+            self.projection.beta = before
             rises = False  # the shorter step is one of the same projection
         self.evaluator.restart(start)
         self.evaluate_again()
         self.stuck = self.stuck or "every step, however short, makes it twice as bad"
 
-    def _adapt_reach(self, shorter: float, rose: bool) -> None:
-        factor = shorter * (SHORTER_REACH if rose else REACH_GROWTH)
-        self.reach = min(1.0, max(LEAST_REACH, factor * self.reach))
-
     def _tried(self, new: np.ndarray) -> list[EvaluatedDesign] | None:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
         self.stuck = ""
-        own = np.abs(new - self.x).max() if len(new) else 0.0
-        self.change = float(self.world.allreduce(own, op=MPI.MAX))
+        self.change = float(np.abs(new - self.x).max())
         steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
         try:
-            with counted(STEP_NEWTON_ITERATIONS * steps if steps else np.inf):
+            with counted(NEWTON_ITERATIONS * steps if steps else np.inf):
                 designs = self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.stuck = str(error)
@@ -212,21 +207,16 @@ class Iterate:
 
     def _proposed(self, move: float) -> tuple[np.ndarray, MMAState]:
         """Return MMA's next design, and what it remembers then (collective)."""
-        problem, curved = self.problem, self.curved
+        problem, bounds = self.problem, (self.variables.xmin, self.variables.xmax)
+        gradients = problem.df0dx, problem.f, problem.dfdx
+        widest = CURVED_ASYMPTOTE_DISTANCE if self.curved else LARGEST_ASYMPTOTE_DISTANCE
+
+        def stepped() -> tuple[np.ndarray, MMAState]:
+            return mma_step(self.x, *gradients, *bounds, self.state, move=move, widest=widest)
+
         with self.evaluator.profile.phase("mma"):
-            return mma_step(
-                self.x,
-                problem.df0dx,
-                problem.f,
-                problem.dfdx,
-                self.variables.xmin,
-                self.variables.xmax,
-                self.state,
-                move=move,
-                widest=CURVED_ASYMPTOTE_DISTANCE if curved else LARGEST_ASYMPTOTE_DISTANCE,
-                comm=self.world,
-                pieces=self.variables.pieces,
-            )
+            found: tuple[np.ndarray, MMAState] = on_root(self.world, stepped)
+        return found
 
     # -- measures ----------------------------------------------------------------------------
 
@@ -260,22 +250,16 @@ class Iterate:
             kind = arms[k].kind
             filled, x = kind.filled(x_phys[k]), kind.share(x_phys[k])
             parts[k] = np.array([volume.sum(), volume @ filled, volume @ (4.0 * x * (1.0 - x))])
-        total, volume, grey = self.total(parts)
+        total, volume, grey = sum_over_arms(self.evaluator.partition, parts)
         return float(total), float(volume / total), float(grey / total)
 
     def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
         variables, problem = self.variables, self.problem
-        return kkt_residual(
-            self.x,
-            variables.xmin,
-            variables.xmax,
-            problem.df0dx,
-            problem.f,
-            problem.dfdx,
-            variables.slices,
-            self.total,
-        )
+        bounds = variables.xmin, variables.xmax
+        gradients = problem.df0dx, problem.f, problem.dfdx
+        found: Residual = on_root(self.world, kkt_residual, self.x, *bounds, *gradients)
+        return found
 
     # -- memory ------------------------------------------------------------------------------
 
@@ -297,12 +281,11 @@ class Iterate:
             progress=self.progress,
             solutions=self.evaluator.initial_solutions,
             beta=self.projection.beta,
-            thresholds=self.projection.thresholds,
         )
 
     def restore(self, memory: IterateMemory) -> None:
         """Go back to what `memory` describes; `evaluate_again` is to follow."""
-        columns = self.variables.join(memory.cells).reshape(-1, 6)
+        columns = self.variables.join(memory.cells)
         self.x, x_old1, x_old2, low, upp, best = (column.copy() for column in columns.T)
         self.state = MMAState(memory.mma_steps, x_old1, x_old2, low, upp, memory.multipliers)
         self.best, self.progress = memory.best.with_variables(best), memory.progress
@@ -312,7 +295,7 @@ class Iterate:
             arm.initial_vectors = memory.modes[k]
         self.iteration, self.change, self.reach = memory.iteration, memory.change, memory.reach
         self.returned_to = memory.returned_to
-        self.projection.restore((memory.beta, memory.thresholds))
+        self.projection.beta = memory.beta
 
 
 def leaps(before: np.ndarray, after: np.ndarray) -> bool:

@@ -31,7 +31,7 @@ from dolfinopt.optimization.measured import (
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
 from dolfinopt.optimization.stopping import StopCode, ending, stop_code
-from dolfinopt.parallel import Partition, together
+from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import log
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
@@ -288,7 +288,10 @@ class _Run:
         one, v = self.iterate, self.evaluator.variables
         if code is StopCode.ITERATIONS and one.problem.excess > 0.0:
             return "let the optimisation go on (optimizer.max_iterations)"
-        return conflict_sentences(one.problem, one.x, v.xmin, v.xmax, v.slices, one.total)
+        found: str = on_root(
+            self.partition.world, conflict_sentences, one.problem, one.x, v.xmin, v.xmax
+        )
+        return found
 
     # -- history -----------------------------------------------------------------------------
 

@@ -9,14 +9,13 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 SHORTER_REACH = 0.5  # on the move limit where the merit rose
 REACH_GROWTH = 1.2  # on it where it did not
 LEAST_REACH = 0.05  # of the scene's move limit
-RETURNED_REACH = 0.25  # of it, after the search has gone back to the best design
 MERIT_RISE = 1e-3  # of the merit, from which on it counts as risen
-SHORTER_STEP = 0.25  # on a step without a motion, or that leaps
+SHORTER_STEP = 0.25  # on a step without a motion, or that leaps; reach after a return to the best
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
 LEAP_FACTOR = 2.0  # on a limit, or on the objective of a design that keeps all: leads nowhere
-# For each time step of the last motion before a step is given up; most designs take 3 to 10,
+# For each time step of the last motion before a design is given up; most take 3 to 10,
 # machines 16 to 44, what falls apart thousands.
-STEP_NEWTON_ITERATIONS = 100.0
+NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --
 
@@ -38,13 +37,11 @@ ERODED_LIMIT_FACTOR = 1.3
 # -- Residual and endings (stopping, loop) --
 
 FREE_SET_ROUNDS = 10  # of choosing the variables with room; two or three are the rule
-# Of the scaled Gram matrix: constraints whose gradients say the same.
-DEPENDENT_EIGENVALUE_SHARE = 1e-12
+# Of the largest curvature: constraints whose gradients say the same.
+DEPENDENT_SHARE = 1e-12
 ROOM_SHARE = 1e-3  # of their range that variables are away from both bounds that can move
 # Of the range, step of the variable that moves most: what bounds nearer than that hold.
 TRIAL_STEP_SHARE = 0.1
-# Of the norm that stands for the largest: 20 % above it at most, of 1e5 cells.
-LARGEST_EXPONENT = 64
 # Grayness above which a projection has not done its work: 2 % of the cells at 1/2.
 GREY_SHARE = 0.02
 WINDOW = 20  # iterations in which a run that goes on gains `optimizer.tolerance`; 10 end rods early
@@ -60,13 +57,9 @@ CHECKPOINT_SECONDS = 2.0
 
 # -- What is known of a finished design (certificate) --
 
-AT_BOUND_SHARE = 1e-3  # of its range: a variable nearer to a bound counts as held by it
 # On the accuracy of coordinates chosen for the initial design; those of an optimised one err 1.7 to
 # 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
 COORDINATE_RESERVE_FACTOR = 3.0
-# For each step of the final design's motion before the cut design's is given up; machines take 16
-# to 44.
-CRISP_NEWTON_ITERATIONS = 400.0
 
 COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a twentieth
 
@@ -74,8 +67,7 @@ COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a
 
 STEP_RATIO = 4.0  # of one step to the next: remainders of second order fall by 16
 INSIDE_MARGIN = 0.05  # design variables are moved this far inside [0, 1]: steps must not leave it
-OBJECTIVE_ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
-FORCE_ROUNDING = 1e-9  # the same of drive forces, which are made of accelerations
+OBJECTIVE_ROUNDING = 1e-9  # part of the objective that Newton's tolerance leaves open
 PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 
 # -- Approximation and its dual (mma); what is Svanberg's stands there --
@@ -95,15 +87,12 @@ PENALTY_LIMIT = 1e9  # of the elastic price
 # change the design.
 MULTIPLIER_FLOOR = 1e-5
 FIRST_DUAL_RADIUS = 10.0  # of the trust region in these units: about a decade of every multiplier
-LARGEST_DUAL_RADIUS = 1000.0  # three decades
-LEAST_DUAL_STEP = 1e-14  # in these units: the rounding of the multipliers
 DUAL_EVALUATIONS = 300  # at most; 4 to 5 are the rule
-DUAL_ROUNDING = 1e-14  # of its value relative to its terms: some ten units of the last place
+DUAL_ROUNDING = 1e-14  # of its value relative to its terms, and of multipliers
 ACTIVE_MULTIPLIER = 1e-7 * MULTIPLIER_FLOOR  # smaller ones move no variable
 # Of an active constraint relative to its terms; only constraints that nearly repeat each other come
 # near.
 COMPLEMENTARITY_REST = 1e-6
-DUAL_REGULARISATION = 1e-12  # of its curvature, for constraints that say the same
 FLAT_GRADIENT_SHARE = 1e-6  # added to the curvature of a flat dual; vanishes at the maximum
 # Variables at a time, whose temporaries stay in the cache (96 kB): nearly three times as fast at 19
 # 200 variables.

@@ -1,4 +1,4 @@
-"""Method of moving asymptotes: one step, variables distributed over MPI ranks.
+"""Method of moving asymptotes: one step.
 
 The method is that of K. Svanberg, Int. J. Numer. Meth. Engng 24 (1987) 359-373,
 doi:10.1002/nme.1620240207, with the asymptote rules, move limits and artificial variables of his
@@ -17,28 +17,24 @@ which has no difference of large numbers, and whose minimiser over s_j costs one
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.measured import (
     ACTIVE_MULTIPLIER,
     BLOCK_ENTRIES,
     COMPLEMENTARITY_REST,
+    DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
-    DUAL_REGULARISATION,
     DUAL_ROUNDING,
     FIRST_ASYMPTOTE_DISTANCE,
     FIRST_DUAL_RADIUS,
     FLAT_GRADIENT_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
-    LARGEST_DUAL_RADIUS,
     LEAST_ASYMPTOTE_DISTANCE,
-    LEAST_DUAL_STEP,
     MULTIPLIER_FLOOR,
     PENALTY_LIMIT,
     REST_MOVE_SHARE,
@@ -98,8 +94,6 @@ def mma_step(
     first: float = FIRST_ASYMPTOTE_DISTANCE,
     widest: float = LARGEST_ASYMPTOTE_DISTANCE,
     prices: npt.ArrayLike | None = None,
-    comm: MPI.Comm | None = None,
-    pieces: Mapping[int, int] | None = None,
 ) -> tuple[Array, MMAState]:
     """Minimise Svanberg's convex approximation of min f0(x), f_i(x) <= 0, xmin <= x <= xmax.
 
@@ -110,191 +104,97 @@ def mma_step(
     constraints contradict each other they are violated at a cost of c_i y_i + y_i^2 / 2.
 
     Args:
-        x: (n,) design, this rank's variables.
+        x: (n,) design.
         df0dx: (n,) gradient of the objective.
-        f: (m,) values of the constraints, the same on all ranks.
+        f: (m,) values of the constraints.
         dfdx: (m, n) gradients of the constraints.
         xmin, xmax: (n,) or scalar bounds; a variable with xmin == xmax stays.
         state: what the step before returned, or `initial_state(x)`.
         move: largest step of a variable, in units of its range.
         first, widest: distance of the asymptotes in the first two steps, and the largest one, in
-            these units. Wide ones make the approximation
-            nearly linear, which lets curved constraints be left again and again.
+            these units. Wide ones make the approximation nearly linear, which lets curved
+            constraints be left again and again.
         prices: (m,) of a unit of every f_i, in units of f0: with them the approximation is that of
             f0 + sum_i price_i max(0, f_i). By default c_i = 1000.
-        comm: communicator over which the variables are distributed; None: all are here.
-        pieces: number and length of the consecutive pieces of this rank's variables. Sums are
-            taken piece by piece and added in the order of their numbers: as long as no piece is
-            divided, the result has the same bits however the pieces are dealt out. By default a
-            rank's variables are one piece.
 
     Returns:
         The new design (n,) and the state for the next step; both are new arrays.
 
     Raises:
-        ValueError: an input has the wrong shape, is not finite, or x leaves its bounds; raised
-            on all ranks together.
+        ValueError: an input has the wrong shape, is not finite, or x leaves its bounds.
         ConvergenceError: the approximation could not be solved.
 
     Source: doi:10.1002/nme.1620240207 and Svanberg's notes of 2007.
     """
-    x, xmin, xmax = (np.asarray(v, dtype=np.float64) for v in (x, xmin, xmax))
-    given = _Given(
-        x,
-        np.asarray(df0dx, dtype=np.float64),
-        np.asarray(f, dtype=np.float64),
-        np.asarray(dfdx, dtype=np.float64),
-        xmin if xmin.ndim else np.full(x.shape, xmin),
-        xmax if xmax.ndim else np.full(x.shape, xmax),
-        state,
-        move,
-        first,
-        widest,
-        None if prices is None else np.asarray(prices, dtype=np.float64),
-        {0 if comm is None else comm.rank: x.size} if pieces is None else dict(pieces),
+    x, f = np.array(x, dtype=np.float64), np.asarray(f, dtype=np.float64)
+    low, high = (np.broadcast_to(np.asarray(one, np.float64), x.shape) for one in (xmin, xmax))
+    with np.errstate(over="ignore", invalid="ignore"):  # found by `_check`
+        gradients = np.vstack((df0dx, dfdx)) * (high - low)
+    _check(x, low, high, f, gradients)
+    width = np.where(high > low, high - low, 1.0)  # passive: no gradient and no room, any unit does
+    distance = _asymptote_distances(x, width, state, first, widest)
+    step = np.minimum(_LARGEST_STEP, move / distance)
+    s_min = -np.minimum(step, (x - low) / (distance * width))
+    s_max = np.minimum(step, (high - x) / (distance * width))
+    largest = np.abs(gradients).max(axis=1, initial=0.0)
+    active = largest > 0.0
+    active[0] = True  # an objective without gradient still holds the variables in place
+    scale = np.where(largest > 0.0, largest, 1.0)[active]
+    # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
+    with np.errstate(over="ignore"):
+        normalised = np.clip(f[active[1:]] / scale[1:], -1e30, 1e30)
+    penalty = np.full(normalised.size, _PENALTY)
+    if prices is not None:
+        dear = np.asarray(prices, dtype=np.float64)[active[1:]] * scale[1:] / scale[0]
+        penalty = np.clip(dear, MULTIPLIER_FLOOR, PENALTY_LIMIT)
+    dual = _Dual(gradients[active] / scale[:, None], distance, s_min, s_max, normalised, penalty)
+    known = state.multipliers.shape == f.shape
+    point = _solve_dual(dual, state.multipliers[active[1:]] if known else np.ones(penalty.size))
+    multipliers = np.zeros(f.size)
+    multipliers[active[1:]] = point.multipliers
+    distance = distance * width
+    new = np.clip(x + distance * np.concatenate(point.steps), low, high)
+    after = MMAState(
+        state.iteration + 1, x, state.x_old1.copy(), x - distance, x + distance, multipliers
     )
-    f_agreed, largest = _agree(given, comm)
-    active = largest[1:] > 0.0
-    dual = _Dual(given, f_agreed, largest, comm)
-    known = state.multipliers.shape == active.shape
-    point = _solve_dual(dual, state.multipliers[active] if known else np.ones(active.sum()))
-    multipliers = np.zeros(active.size)
-    multipliers[active] = point.multipliers
-    return _conclude(given, dual, point, multipliers)
+    return new, after
 
 
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """Hold the inputs of a step as arrays; `_fault` says what is wrong with them."""
-
-    x: Array
-    df0dx: Array
-    f: Array
-    dfdx: Array
-    xmin: Array
-    xmax: Array
-    state: MMAState
-    move: float
-    first: float
-    widest: float
-    prices: Array | None
-    pieces: Mapping[int, int]
-
-    def gradients(self, columns: slice) -> Array:
-        """Return (1 + m, columns) derivatives per range of the variable: 0 where it is passive."""
-        both: Array = np.vstack((self.df0dx[columns], self.dfdx[:, columns]))
-        with np.errstate(over="ignore"):  # found by `_agree`
-            both *= self.xmax[columns] - self.xmin[columns]
-        return both
-
-    def blocks(self) -> list[tuple[int, slice]]:
-        """Cut the pieces into blocks of about BLOCK_ENTRIES entries of `gradients`.
-
-        Returns:
-            The number of its piece and the variables of every block.
-        """
-        columns = max(BLOCK_ENTRIES // (1 + self.f.size), 256)
-        blocks, first = [], 0
-        for number, length in self.pieces.items():
-            last = first + length
-            blocks += [
-                (number, slice(k, min(k + columns, last))) for k in range(first, last, columns)
-            ]
-            first = last
-        return blocks
-
-
-def _fault(given: _Given) -> str:
-    """Say what is wrong with the inputs on this rank; empty if nothing is."""
-    n, m = given.x.size, given.f.size
-    shapes = {"x": (n,), "df0dx": (n,), "f": (m,), "dfdx": (m, n), "xmin": (n,), "xmax": (n,)}
-    for name, shape in shapes.items():
-        value = getattr(given, name)
-        if value.shape != shape:
-            return f"{name} has shape {value.shape}, expected {shape}"
-        if not np.isfinite(value).all():
-            where = np.argwhere(~np.isfinite(value))[0].tolist()
-            return f"{name} is not finite, first at index {where}: {value[tuple(where)]}"
-    for name in ("x_old1", "x_old2", "low", "upp"):
-        value = getattr(given.state, name)
-        if value.shape != (n,) or not np.isfinite(value).all():
-            return f"state.{name} does not hold {n} finite numbers"
-    if sum(given.pieces.values()) != n:
-        return f"pieces hold {sum(given.pieces.values())} variables, x {n}"
-    if given.widest < given.first:
-        return f"widest is {given.widest}, expected at least {given.first}"
-    if not 0.0 < given.move <= 1.0:
-        return f"move is {given.move}, expected 0 < move <= 1"
-    outside = (given.x < given.xmin) | (given.x > given.xmax)
+def _check(x: Array, low: Array, high: Array, f: Array, gradients: Array) -> None:
+    """Raise ValueError where the inputs do not belong together, or are not finite."""
+    if gradients.shape != (1 + f.size, x.size):
+        raise ValueError(f"MMA: {gradients.shape} gradients of {f.size} constraints, {x.size} x")
+    for name, values in {"x": x, "f": f, "gradients times ranges": gradients}.items():
+        if not np.isfinite(values).all():
+            where = np.argwhere(~np.isfinite(values))[0].tolist()
+            raise ValueError(f"MMA: {name} not finite, first at {where}")
+    outside = ~((low <= x) & (x <= high))
     if outside.any():
         j = int(np.flatnonzero(outside)[0])
-        return f"x[{j}] = {given.x[j]} is not between {given.xmin[j]} and {given.xmax[j]}"
-    return ""
+        raise ValueError(f"MMA: x[{j}] = {x[j]} is not between {low[j]} and {high[j]}")
 
 
-def _agree(given: _Given, comm: MPI.Comm | None) -> tuple[Array, Array]:
-    """Return rank 0's f (m,) and the largest |gradient| of f0, f_i (1 + m,) over all ranks."""
-    # A fault of one rank is raised on all, so that none waits for the others. Likewise the
-    # constraints are taken from one rank: they steer the iteration, which must not branch.
-    fault = _fault(given)
-    largest = np.zeros(1 + given.f.size)
-    if not fault:
-        for _, columns in given.blocks():
-            np.maximum(largest, np.abs(given.gradients(columns)).max(axis=1), out=largest)
-        if not np.isfinite(largest).all():
-            fault = "a gradient times the range of its variable overflows"
-    report = (fault, given.f, largest, set(given.pieces))
-    reports = [report] if comm is None else comm.allgather(report)
-    known: set[int] = set()
-    for rank, (text, f, _, numbers) in enumerate(reports):
-        if not text and f.shape != reports[0][1].shape:
-            text = f"f has shape {f.shape}, {reports[0][1].shape} on rank 0"
-        if not text and known & numbers:
-            text = f"piece {min(known & numbers)} is on another rank, too"
-        known |= numbers
-        if text:
-            raise ValueError(f"MMA: {text}" + (f" (rank {rank})" if len(reports) > 1 else ""))
-    return reports[0][1], np.max([values for _, _, values, _ in reports], axis=0)
-
-
-def _asymptote_distance(given: _Given, columns: slice, width: Array) -> Array:
-    """Return the distance of the asymptotes from x in units of the range `width`."""
-    state = given.state
+def _asymptote_distances(
+    x: Array, width: Array, state: MMAState, first: float, widest: float
+) -> Array:
+    """Return the distances of the asymptotes from x in units of the ranges `width`."""
     if state.iteration < 2:
-        return np.full(width.shape, given.first)
-    last = (given.x[columns] - state.x_old1[columns]) / width
-    before = (state.x_old1[columns] - state.x_old2[columns]) / width
+        return np.full(width.shape, first)
+    last, before = (x - state.x_old1) / width, (state.x_old1 - state.x_old2) / width
     moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE
     factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
-    distance = factor * (state.upp[columns] - state.low[columns]) / (2.0 * width)
-    return np.minimum(np.maximum(distance, LEAST_ASYMPTOTE_DISTANCE), given.widest)
+    distance = factor * (state.upp - state.low) / (2.0 * width)
+    return np.clip(distance, LEAST_ASYMPTOTE_DISTANCE, widest)
 
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Hold the approximation in some variables: G, H (1 + m, b), bounds of s and distance (b,)."""
+    """Hold the approximation in some variables: G, H (1 + m, b) and bounds of s (b,)."""
 
     G: Array
     H: Array
     s_min: Array
     s_max: Array
-    distance: Array
-
-
-def _block(given: _Given, columns: slice, active: npt.NDArray[np.bool_], scale: Array) -> _Block:
-    """Build the approximation of the objective and the active constraints in some variables."""
-    room_down = given.x[columns] - given.xmin[columns]
-    room_up = given.xmax[columns] - given.x[columns]
-    width = given.xmax[columns] - given.xmin[columns]
-    width[width == 0.0] = 1.0  # passive: no gradient and no room, any unit does
-    relative = _asymptote_distance(given, columns, width)
-    distance = relative * width
-    step = np.minimum(_LARGEST_STEP, given.move / relative)
-    G = given.gradients(columns)[active] / scale[:, None]
-    H = relative * (CURVATURE * np.abs(G) + 2.0 * _RAA0)
-    G *= relative
-    s_min, s_max = -np.minimum(step, room_down / distance), np.minimum(step, room_up / distance)
-    return _Block(G, H, s_min, s_max, distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,36 +215,25 @@ class _Dual:
     # with G_j = G_0j + sum_i l_i G_ij and H_j likewise. The inner minimum is at
     # s = -G / (H + sqrt(H^2 - G^2)), cut off at the bounds of s.
 
-    def __init__(self, given: _Given, f: Array, largest: Array, comm: MPI.Comm | None):
-        active = largest > 0.0
-        active[0] = True  # an objective without gradient still holds the variables in place
-        scale = np.where(largest > 0.0, largest, 1.0)[active]
-        # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
-        with np.errstate(over="ignore"):
-            self.f = np.clip(f[active[1:]] / scale[1:], -1e30, 1e30)
-        self.penalty = np.full(self.f.size, _PENALTY)
-        if given.prices is not None:
-            self.penalty = np.clip(
-                given.prices[active[1:]] * scale[1:] / scale[0], MULTIPLIER_FLOOR, PENALTY_LIMIT
-            )
-        self.comm = comm
-        self.numbers = list(given.pieces)
-        self.blocks = [(k, _block(given, columns, active, scale)) for k, columns in given.blocks()]
-        totals = {number: np.zeros(scale.size) for number in given.pieces}
-        for number, block in self.blocks:
-            totals[number] += block.H.sum(axis=1)
+    def __init__(
+        self, g: Array, distance: Array, s_min: Array, s_max: Array, f: Array, penalty: Array
+    ):
+        self.f, self.penalty, self.blocks = f, penalty, list[_Block]()
+        size = max(BLOCK_ENTRIES // len(g), 256)
+        for k in range(0, max(len(distance), 1), size):
+            part = slice(k, k + size)
+            H = distance[part] * (CURVATURE * np.abs(g[:, part]) + 2.0 * _RAA0)
+            self.blocks.append(_Block(distance[part] * g[:, part], H, s_min[part], s_max[part]))
         # Sizes of the sums, to know when what is left of them is rounding.
-        self.size = _sum(totals, comm)
-        self.size[1:] += np.abs(self.f)
+        self.size: Array = np.sum([one.H.sum(axis=1) for one in self.blocks], axis=0)
+        self.size[1:] += np.abs(f)
 
     def at(self, multipliers: Array) -> _DualPoint:
         """Evaluate the dual function at multipliers (m,)."""
         m = multipliers.size
-        weights = np.concatenate(([1.0], multipliers))
-        parts = {number: np.zeros(1 + m + m * m) for number in self.numbers}
+        weights, sums = np.append(1.0, multipliers), np.zeros(1 + m + m * m)
         steps = []
-        for number, block in self.blocks:
-            sums = parts[number]
+        for block in self.blocks:
             G, H = weights @ block.G, weights @ block.H
             root = np.sqrt((H - G) * (H + G))
             unbounded = -G / (H + root)
@@ -357,7 +246,6 @@ class _Dual:
             compliance = (s == unbounded) * 2.0 / (gap * gap * root)
             sums[1 + m :] += ((half_slope * compliance) @ half_slope.T).ravel()
             steps.append(s)
-        sums = _sum(parts, self.comm)
         violation = np.maximum(multipliers - self.penalty, 0.0)
         constraints = self.f + sums[1 : 1 + m]
         value = sums[0] + multipliers @ constraints - 0.5 * violation @ violation
@@ -366,21 +254,6 @@ class _Dual:
         known = np.abs(gradient) > 4.0 * np.finfo(float).eps * (self.size[1:] + multipliers)
         gradient[~known] = 0.0
         return _DualPoint(multipliers, steps, value, gradient, sums[1 + m :].reshape(m, m))
-
-
-def _sum(parts: Mapping[int, Array], comm: MPI.Comm | None) -> Array:
-    """Add the pieces' arrays in the order of their numbers, to the same bits on every rank."""
-    # The sums steer the iteration: an allreduce is neither bound to give every rank the same
-    # rounding nor to give one rank the rounding of two.
-    everywhere = dict(parts)
-    if comm is not None and comm.size > 1:
-        for other in comm.allgather(everywhere):
-            everywhere.update(other)
-    first, *rest = (everywhere[number] for number in sorted(everywhere))
-    total: Array = first.copy()
-    for part in rest:
-        total += part
-    return total
 
 
 def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
@@ -395,7 +268,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     evaluations, kinked = 1, False
     while multipliers.size and evaluations < DUAL_EVALUATIONS:
         z = _newton_step(point, radius, dual.penalty)
-        if np.abs(z).max() <= LEAST_DUAL_STEP:
+        if np.abs(z).max() <= DUAL_ROUNDING:
             break
         trial = dual.at(_stepped(point.multipliers, z, dual.penalty))
         evaluations += 1
@@ -410,7 +283,6 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
                 trial = replace(trial, curvature=mean_curvature)
             point = trial
             radius = np.where(rise_there >= 0.0, np.maximum(radius, 4.0 * np.abs(z)), radius)
-            radius = np.minimum(radius, LARGEST_DUAL_RADIUS)
         else:
             # The multipliers that turned the derivative go less far. What was met on the way enters
             # the curvature: on a ridge between two kinks either side alone points off the ridge.
@@ -472,9 +344,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     m = gradient.size
     # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
     # is flat; the relative part is for equivalent constraints.
-    diagonal = (
-        DUAL_REGULARISATION * np.diag(curvature) + FLAT_GRADIENT_SHARE * np.abs(gradient) + _TINY
-    )
+    diagonal = DEPENDENT_SHARE * np.diag(curvature) + FLAT_GRADIENT_SHARE * np.abs(gradient) + _TINY
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)
     fixed = ((lower == 0.0) & (gradient <= 0.0)) | ((upper == 0.0) & (gradient >= 0.0))
@@ -501,22 +371,3 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
             break
         fixed[k] = False
     return z
-
-
-def _conclude(
-    given: _Given, dual: _Dual, point: _DualPoint, multipliers: Array
-) -> tuple[Array, MMAState]:
-    """Return the design at the solution of the dual, and the state for the next step."""
-    empty: list[Array] = [np.empty(0)]
-    distance = np.concatenate([block.distance for _, block in dual.blocks] or empty)
-    x_new = given.x + distance * np.concatenate(point.steps or empty)
-    x_new = np.minimum(np.maximum(x_new, given.xmin), given.xmax)
-    state = MMAState(
-        iteration=given.state.iteration + 1,
-        x_old1=given.x.copy(),
-        x_old2=given.state.x_old1.copy(),
-        low=given.x - distance,
-        upp=given.x + distance,
-        multipliers=multipliers,
-    )
-    return x_new, state

@@ -1,4 +1,4 @@
-"""The projection's steepness and thresholds, as they change over the iterations."""
+"""The projection's steepness, as it changes over the iterations."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ if TYPE_CHECKING:
 
 
 class Projection:
-    """Owns the projection's beta and thresholds; without a projection both stay as they are.
+    """Owns the projection's beta; without a projection it stays as it is.
 
     Attributes:
         beta: steepness; grows from 1 to design.sharpness.
         patterns: arms that repeat another's design.
-        thresholds: eta of every arm of this rank with design variables. Held during a step: a
-            threshold that followed x would be one more way to stay grey.
     """
 
     def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
@@ -31,8 +29,7 @@ class Projection:
         self.scene, self.partition, self.arms = scene, partition, arms
         self.beta = 1.0
         self.patterns = Patterns(scene, partition, arms)
-        designed = [k for k in arms if k in scene.designed]
-        self.thresholds: dict[int, float] = dict.fromkeys(designed, 0.5)
+        self.designed = [k for k in arms if k in scene.designed]  # of this rank
 
     @property
     def complete(self) -> bool:
@@ -45,15 +42,6 @@ class Projection:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
         return self.scene.optimizer.move * min(1.0, (GENTLE_SHARPNESS / self.beta) ** 0.5)
 
-    @property
-    def state(self) -> tuple[float, dict[int, float]]:
-        """Steepness and thresholds, for `restore`."""
-        return self.beta, dict(self.thresholds)
-
-    def restore(self, state: tuple[float, Mapping[int, float]]) -> None:
-        """Go back to what `state` was."""
-        self.beta, self.thresholds = state[0], dict(state[1])
-
     def physical_designs(
         self, x: Mapping[int, np.ndarray]
     ) -> dict[int, tuple[PhysicalDesign, ...]]:
@@ -62,10 +50,7 @@ class Projection:
         Of all arms of this rank; those that repeat another's design have its densities.
         """
         with together(self.partition.world):
-            designs = {
-                k: self.arms[k].physical_designs(x[k], self.beta, eta)
-                for k, eta in self.thresholds.items()
-            }
+            designs = {k: self.arms[k].physical_designs(x[k], self.beta) for k in self.designed}
         if not self.patterns.repeats:
             return designs
         count = 3 if self.scene.design.projection == "robust" else 1
@@ -79,7 +64,7 @@ class Projection:
     def smoothed(self, x: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
         """Return what is projected, of all arms of this rank (collective)."""
         with together(self.partition.world):
-            smooth = {k: self.arms[k].smoothed(x[k]) for k in self.thresholds}
+            smooth = {k: self.arms[k].smoothed(x[k]) for k in self.designed}
         return self.patterns.spread(smooth)
 
     def rises(self, excess: float) -> bool:
@@ -90,15 +75,11 @@ class Projection:
         """
         return not self.complete and excess <= WAITING_EXCESS
 
-    def advance(self, x: Mapping[int, np.ndarray]) -> None:
-        """Raise beta, and move the thresholds so that the volume of x stays (collective).
+    def advance(self) -> None:
+        """Raise beta.
 
-        A little in every iteration: doubled at once, beta cuts members whose x is near the
-        threshold, and what is grey then stays so.
+        A little in every iteration: doubled at once, it cuts members whose x is near the threshold,
+        and what is grey then stays so.
         """
         design = self.scene.design
         self.beta = min(2.0 ** (1.0 / design.continuation) * self.beta, design.sharpness)
-        with together(self.partition.world):
-            self.thresholds = {
-                k: self.arms[k].preserving_threshold(x[k], self.beta) for k in self.thresholds
-            }

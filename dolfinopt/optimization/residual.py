@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from dolfinopt.optimization.measured import (
-    DEPENDENT_EIGENVALUE_SHARE,
+    DEPENDENT_SHARE,
     FREE_SET_ROUNDS,
-    LARGEST_EXPONENT,
     ROOM_SHARE,
     TRIAL_STEP_SHARE,
 )
-
-Sum = Callable[[Mapping[int, np.ndarray]], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,20 +20,18 @@ class Residual:
 
     Attributes:
         rms: root mean square over the variables that can move.
-        largest: of any of them, over the largest of the objective's gradient.
         multipliers: (m,) of the constraints, for the objective scaled to a root mean square of 1.
         scale: that root mean square of its gradient, by which they are in the objective's unit.
     """
 
     rms: float
-    largest: float
     multipliers: np.ndarray
     scale: float = 0.0
 
     @classmethod
     def unknown(cls) -> Residual:
         """Return that of a design without gradients."""
-        return cls(np.nan, np.nan, np.empty(0))
+        return cls(np.nan, np.empty(0))
 
 
 def kkt_residual(
@@ -47,10 +41,8 @@ def kkt_residual(
     df0dx: np.ndarray,
     f: np.ndarray,
     dfdx: np.ndarray,
-    parts: Mapping[int, slice],
-    total: Sum,
 ) -> Residual:
-    """Return the Karush-Kuhn-Tucker residual of min f0, f_i <= 0, xmin <= x <= xmax (collective).
+    """Return the Karush-Kuhn-Tucker residual of min f0, f_i <= 0, xmin <= x <= xmax.
 
     With y the variables in units of their range and L = df0dy + sum_i l_i df_idy, the projected
     gradient is s = (y - P(y - t L)) / t, P the projection on the bounds and t |L| at most a tenth:
@@ -68,11 +60,9 @@ def kkt_residual(
     Calamai & More, Math. Program. 39 (1987) 93-116, doi:10.1007/BF02592073.
 
     Args:
-        x, xmin, xmax: (n,) this rank's variables.
+        x, xmin, xmax: (n,) variables and bounds.
         df0dx, dfdx: (n,), (m, n) gradients of objective and constraints.
-        f: (m,) values of the constraints, relative, the same on all ranks.
-        parts: this rank's variables arm by arm.
-        total: adds an array an arm to the same bits on all ranks.
+        f: (m,) values of the constraints, relative.
 
     Returns:
         The residual; 0 for an objective without gradient.
@@ -83,71 +73,51 @@ def kkt_residual(
     down, up = (x - xmin) / unit, (xmax - x) / unit
     roomy = free & (np.minimum(down, up) > ROOM_SHARE)
     g0, g = df0dx * width, dfdx * width
-
-    def added(*terms: np.ndarray) -> np.ndarray:
-        """Return the sums of (n,) terms over all variables."""
-        return total({k: np.array([one[part].sum() for one in terms]) for k, part in parts.items()})
-
-    def largest(term: np.ndarray) -> float:
-        """Return the largest |term|, see `LARGEST_EXPONENT`."""
-        return float(added(np.abs(term) ** LARGEST_EXPONENT)[0] ** (1.0 / LARGEST_EXPONENT))
-
-    square, count = added(g0**2, free)
+    square = g0 @ g0
     if square == 0.0:
-        return Residual(0.0, 0.0, np.zeros(f.size))
+        return Residual(0.0, np.zeros(f.size))
     if not np.isfinite(square):
-        return Residual(np.inf, np.inf, np.zeros(f.size))
-    scale = float(np.sqrt(square / count))
+        return Residual(np.inf, np.zeros(f.size))
+    scale = float(np.sqrt(square / free.sum()))
     g0 = g0 / scale
     slack = np.maximum(-f, 0.0)
-    best, inside = Residual(np.inf, np.inf, np.zeros(f.size)), roomy
+    best, inside = Residual(np.inf, np.zeros(f.size)), roomy
     for _ in range(FREE_SET_ROUNDS):
-        movable = inside | roomy
-        n = max(1.0, float(added(movable)[0]))
-        found = _multipliers(g0, g, inside, slack / np.sqrt(n), parts, total)
+        count = max(1, np.count_nonzero(inside | roomy))
+        found = _multipliers(g0, g, inside, slack / np.sqrt(count))
         L = g0 + found @ g
-        t = TRIAL_STEP_SHARE / (largest(L) or 1.0)
+        t = TRIAL_STEP_SHARE / (np.abs(L).max() or 1.0)
         moving = free & (t * L <= down) & (t * L >= -up)
         step = np.where(moving, L, np.clip(t * L, -up, down) / t)
         movable = roomy | (step != 0.0)
-        sums = added(step**2, np.where(movable, g0, 0.0) ** 2, movable)
-        own = float(sums[0] + ((found * slack) ** 2).sum() / max(1.0, sums[2]))
+        count = max(1, np.count_nonzero(movable))
+        own = float(step @ step + np.square(found * slack).sum() / count)
         if own == 0.0:
-            return Residual(0.0, 0.0, found, scale)
-        rms = np.sqrt(own / sums[1]) if sums[1] > 0.0 else np.inf
+            return Residual(0.0, found, scale)
+        moved = np.where(movable, g0, 0.0)
+        rms = float(np.sqrt(own / (moved @ moved))) if moved.any() else np.inf
         if rms < best.rms:
-            most = largest(np.where(movable, g0, 0.0)) or 1.0
-            best = Residual(float(rms), largest(step) / most, found, scale)
-        changed = added(moving != inside)
-        if changed[0] == 0 or f.size == 0:
+            best = Residual(rms, found, scale)
+        if f.size == 0 or (moving == inside).all():
             break
         inside = moving
     return best
 
 
 def _multipliers(
-    g0: np.ndarray,
-    g: np.ndarray,
-    inside: np.ndarray,
-    slack: np.ndarray,
-    parts: Mapping[int, slice],
-    total: Sum,
+    g0: np.ndarray, g: np.ndarray, inside: np.ndarray, slack: np.ndarray
 ) -> np.ndarray:
     """Return l >= 0 that makes |g0 + l g|^2 + |l slack|^2 least over the variables inside."""
     m = len(g)
     if m == 0:
         return np.zeros(0)
-    sums = {}
-    for k, part in parts.items():
-        chosen = g[:, part] * inside[part]
-        sums[k] = np.column_stack([chosen @ chosen.T, chosen @ g0[part]])
-    added = total(sums)
-    gram, right = added[:, :m] + np.diag(slack**2), -added[:, m]
+    chosen = g * inside
+    gram, right = chosen @ chosen.T + np.diag(slack**2), -chosen @ g0
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0.0] = 1.0
     # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
     values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > DEPENDENT_EIGENVALUE_SHARE * values[-1]
+    kept = values > DEPENDENT_SHARE * values[-1]
     if not kept.any():
         return np.zeros(m)
     root = np.sqrt(values[kept])

@@ -91,7 +91,6 @@ class Best:
         x: (n,) this rank's variables.
         iteration: updates made; -1 of none.
         beta: steepness of the projection.
-        thresholds: per arm its eta.
         objective: what is minimised.
         excess: largest relative violation of a limit.
         crisp: whether nearly all of it is solid or void.
@@ -100,7 +99,6 @@ class Best:
     x: np.ndarray
     iteration: int
     beta: float
-    thresholds: Mapping[int, float]
     objective: float
     excess: float
     crisp: bool = False
@@ -108,7 +106,7 @@ class Best:
     @classmethod
     def none(cls, x: np.ndarray) -> Best:
         """Return what every design betters."""
-        return cls(x, -1, 0.0, {}, np.inf, np.inf)
+        return cls(x, -1, 0.0, np.inf, np.inf)
 
     @property
     def rank(self) -> tuple[bool, float, float]:
@@ -183,7 +181,6 @@ class IterateMemory:
         progress: the course of the iterations.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
-        thresholds: per arm its eta.
     """
 
     iteration: int
@@ -199,7 +196,6 @@ class IterateMemory:
     progress: Progress
     solutions: tuple[Solution, ...]
     beta: float
-    thresholds: Mapping[int, float]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import PhysicalDesign
-from dolfinopt.parallel import Partition
+from dolfinopt.parallel import Partition, gather_cells, on_all_ranks
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -16,55 +15,39 @@ if TYPE_CHECKING:
 
 
 class Variables:
-    """This rank's design variables as one vector, arms one behind the other.
+    """The design variables as one vector, the same on all ranks, arms one behind the other.
 
     Arms that repeat another's design have none.
 
     Attributes:
-        size: n, number of this rank's variables.
+        size: n, their number.
         xmin, xmax: (n,) bounds; equal where a cell stays solid or void.
         initial: (n,) of the design to begin with, whatever the bounds.
-        slices: part of the vector that belongs to each arm.
-        pieces: sizes of these parts by a number that is the same order on any number of ranks.
+        arms: this rank's arms that have variables.
     """
 
     def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
-        self.partition = partition
-        arms = {k: arm for k, arm in arms.items() if k in scene.designed}
-        sizes = [arm.mesh.num_cells for arm in arms.values()]
-        ends = np.cumsum([0, *sizes])
-        # Whole arms add up in the same order on any number of ranks; parts of one are numbered on.
-        first = partition.comm.rank * len(scene.arms)
-        self.pieces = {first + k: size for k, size in zip(arms, sizes, strict=True)}
-        self.slices = {k: slice(a, b) for k, a, b in zip(arms, ends[:-1], ends[1:], strict=True)}
-        self.arms = arms
-        self.size = int(ends[-1])
-        self.xmin = np.full(self.size, scene.design.minimum)
-        self.xmax, self.initial = np.ones(self.size), np.empty(self.size)
-        for k, part in self.slices.items():
-            mesh = arms[k].mesh
-            self.xmin[part] = mesh.keep(self.xmin[part])
-            self.xmax[part] = mesh.keep(self.xmax[part])
-            self.initial[part] = scene.initial(k)
+        """Take this rank's arms (collective)."""
+        self.partition, comm = partition, partition.comm
+        self.arms = {k: arm for k, arm in arms.items() if k in scene.designed}
+        sizes = {k: arm.mesh.num_cells for k, arm in self.arms.items()}
+        before = comm.exscan(sum(sizes.values())) or 0  # of an arm that ranks share
+        every = on_all_ranks(partition, {k: comm.allreduce(size) for k, size in sizes.items()})
+        ends = np.cumsum([0, *every.values()]).tolist()
+        first = {k: end + before for k, end in zip(every, ends, strict=False)}
+        self.size: int = ends[-1]
+        self._parts = {k: slice(first[k], first[k] + size) for k, size in sizes.items()}
+        meshes = {k: arm.mesh for k, arm in self.arms.items()}
+        least = scene.design.minimum
+        self.xmin = self.join({k: m.keep(np.full(sizes[k], least)) for k, m in meshes.items()})
+        self.xmax = self.join({k: m.keep(np.ones(sizes[k])) for k, m in meshes.items()})
+        self.initial = self.join({k: np.full(sizes[k], scene.initial(k)) for k in meshes})
 
     def split(self, x: np.ndarray) -> dict[int, np.ndarray]:
-        """Return each arm's part."""
-        return {k: x[part] for k, part in self.slices.items()}
+        """Return the parts of this rank's arms."""
+        return {k: x[part] for k, part in self._parts.items()}
 
     def join(self, parts: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return the parts as one vector."""
-        return np.concatenate([parts[k] for k in self.slices] or [np.empty(0)])
-
-    def by_x(
-        self, by_cells: Mapping[int, np.ndarray], designs: Mapping[int, PhysicalDesign]
-    ) -> np.ndarray:
-        """Return a gradient by x (n,) from that by the physical densities.
-
-        Of arms with variables; what others that repeat their designs add is in it already, see
-        `Patterns.collect`.
-        """
-        found = np.zeros(self.size)
-        for k, part in self.slices.items():
-            if k in by_cells:
-                found[part] = self.arms[k].backward(by_cells[k], designs[k])
-        return found
+        """Return the parts of all ranks as one array (n, ...) (collective)."""
+        every = self.partition.world.bcast(gather_cells(self.partition, parts), root=0)
+        return np.concatenate(list(every.values()))

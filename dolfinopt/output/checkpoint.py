@@ -16,7 +16,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Memory, Progress
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
-from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
+from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, program, with_digests
@@ -240,8 +240,6 @@ def arrays_of(
     columns: dict[str, Mapping[int, Any]] = {
         "centroid": gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()}),
         "cells": gather_cells(partition, memory.cells),
-        "threshold": gather_arms(partition, memory.thresholds),
-        "best_threshold": gather_arms(partition, memory.best.thresholds or memory.thresholds),
         "points": gather_cells(partition, points),
     }
     for j, by_arm in enumerate(known):
@@ -294,11 +292,8 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
     change, reach, returned_to, mma_steps = arrays["last"].tolist()
     objectives, excesses = map(tuple, arrays["course"].tolist())
     best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
-    iteration = best["iteration"] = int(best["iteration"])
+    best["iteration"] = int(best["iteration"])
     best["crisp"] = bool(best["crisp"])
-    thresholds = {k: float(arrays[f"arm{k}/best_threshold"]) for k in cells}
-    if iteration < 0:
-        thresholds = {}
     return {
         "iteration": int(arrays["iteration"]),
         "change": change,
@@ -309,11 +304,10 @@ def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str,
         "cells": cells,
         "modes": modes,
         "multipliers": arrays["multipliers"],
-        "best": Best(x=np.empty(0), thresholds=thresholds, **best),
+        "best": Best(x=np.empty(0), **best),
         "progress": Progress(objectives, excesses, int(arrays["since"])),
         "solutions": tuple(solutions),
         "beta": float(arrays["sharpness"]),
-        "thresholds": {k: float(arrays[f"arm{k}/threshold"]) for k in cells},
     }
 
 

@@ -36,7 +36,7 @@ from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
-from dolfinopt.responses.stress_report import ArmStress
+from dolfinopt.responses.stress_report import ArmStress, unjudged
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.version import __version__
@@ -332,6 +332,7 @@ def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
         *_unstiffened(stiffening_of(run.arms)),
         *torsion_warnings(run.trajectory),
         *_limits_exceeded(run.trajectory),
+        *unjudged(run.scene),
         *_on_closures(run.scene, run.trajectory),
         *([] if (rest := forced_rest(run.scene)) is None else [rest]),
         *([] if is_grey(run.scene, _grayness(traits)) else _contact_warnings(run, traits)),

@@ -29,7 +29,7 @@ from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.responses.constraints import Limit, limits_of
-from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report
+from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report, unjudged
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 if sys.version_info >= (3, 11):
@@ -388,9 +388,8 @@ class Check:
         """Whether the part's largest stress does not depend on the mesh."""
         limited = any(one.quantity == STRESS for one in self.part.limits)
         refines = all(one.kind == "triangles" for one in self.meshes.values())
-        return abs(self.refinement[STRESS]) <= (
-            SETTLED_LIMITED if limited and refines else SETTLED_STRESS
-        )
+        settled = SETTLED_LIMITED if limited and refines else SETTLED_STRESS
+        return self.part.stress is None or abs(self.refinement[STRESS]) <= settled
 
     @property
     def loss(self) -> str:
@@ -418,14 +417,14 @@ class Check:
         if self.coarse is not None:
             change = ", ".join(
                 f"{name} by {_percent(100.0 * self.refinement[name])}"
-                for name in (*self._judged, STRESS)
+                for name in (*self._judged, *([] if self.part.stress is None else [STRESS]))
             )
             found.append(f"mesh: the last refinement changed {change}")
         if self.part.stress is not None:
             found.append(
                 f"largest stress of the part: {_told(self.part.stress, self.part.stressed)}"
             )
-        return found
+        return [*found, *unjudged(self.part.trajectory.scene)]
 
     @property
     def warnings(self) -> list[str]:

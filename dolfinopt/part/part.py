@@ -252,6 +252,11 @@ def _made(
     if mesh.wall is not None:
         from dolfinopt.part.hollow import make_hollow_part
 
+        if angle := scene.material_of(index).angle:
+            raise InputError(
+                f"arm {mesh.name!r}: angle = {angle:.4g}: expected 0 for a part, whose mesh does "
+                "not tell fibres that wind about the wall"
+            )
         return make_hollow_part(mesh, design[0], curves)
     if scene.arms[index].is_solid:
         from dolfinopt.part.domain import domain_in_scene

@@ -77,6 +77,8 @@ def stress_of_parts(
 ) -> dict[int, PartStress]:
     """Return the stress of every part by its place in the chain, on this rank alone.
 
+    Of materials of which von Mises's stress tells whether they yield.
+
     Args:
         arms: meshed in quadratic triangles or tetrahedra, of solid material, reduced.
         trajectory: of these arms; of scenarios the worst counts.
@@ -87,6 +89,8 @@ def stress_of_parts(
     motions = motions_of(trajectory)
     found: dict[int, PartStress] = {}
     for k, loads in arm_loads(scene, motions).items():
+        if not arms[k].solid.law.has_strength:
+            continue
         state = arms[k].current
         points = parts[k].stress(state, state.load_fields_of(every_instant(loads)))
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
@@ -152,7 +156,7 @@ class CornerStress(PointStress):
         by_own = by[:, at] * self.shares.ravel()[:, None]
         apart = np.einsum("cim,cim->i", by_own, self.own @ columns - (self.A @ columns)[:, at])
         by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area
-        young = state.solid.young_modulus
+        young = state.solid.modulus
         operator = young * stress_operator(state.elastic.operators, self.vertices)
         by_u = self.fields.stress_transposed(operator, by_own)
         stress = StressProduct(self.vertices, young * by_own, partial(self.fields.displacements, a))
@@ -178,7 +182,7 @@ def mean_at_corners(
     mesh, fields = state.mesh, fields or state.load_fields
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
     operator = stress_operator(state.elastic.operators, vertices)
-    own = fields.stress(state.solid.young_modulus * operator)
+    own = fields.stress(state.solid.modulus * operator)
     points = mesh.mesh.geometry.x[:, : mesh.dim]
     area = (mesh.area[:, None] * counts).ravel()
     shares = area / np.bincount(corners.ravel(), area, len(points))[corners.ravel()]

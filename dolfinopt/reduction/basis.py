@@ -15,9 +15,7 @@ from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     EXACT_TOLERANCE,
-    ORTHONORMAL_ROUNDS_LIMIT,
     ROUNDING_LENGTH_SHARE,
-    ROUNDING_SHARE,
 )
 
 
@@ -160,7 +158,7 @@ def orthonormalise(
 ) -> Expansion:
     """Orthonormalise the columns of W against V and one another in the inner product of M.
 
-    Block Gram-Schmidt in two rounds, and more where the check at its end asks for them.
+    Block Gram-Schmidt in two rounds, up to four where the check at its end asks for them.
     Source: Giraud et al., Numer. Math. 101 (2005) 87-100, doi:10.1007/s00211-005-0615-4.
 
     Args:
@@ -177,9 +175,9 @@ def orthonormalise(
     Q, R, kept = _qr(arm, W - combine(V, by_V), deflation * size)
     if len(kept) == 0:
         return Expansion(Q, Q, by_V, kept)
-    for _ in range(ORTHONORMAL_ROUNDS_LIMIT):
+    for _ in range(4):
         # Differences of nearly equal fields have lost the rigid motion of the interface.
-        Q = arm.expand(_interior(arm, Q), arm.coordinates(Q))
+        Q = arm.expand(interior_rows(arm, Q), arm.coordinates(Q))
         h = dot(arm, MV, Q)
         Q, again, still = _qr(arm, Q - combine(V, h), np.full(len(kept), ROUNDING_LENGTH_SHARE))
         by_V, R, kept = by_V + h @ R, again @ R, kept[still]
@@ -276,7 +274,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > ROUNDING_SHARE * shares[-1]:  # not a number included
+            if not shares[0] > EXACT_TOLERANCE * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:
@@ -293,7 +291,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     none = np.empty((*V.shape[:2], 0))
     V = orthonormalise(arm, combine(V, y), none, none).Q
     outboard = arm.coordinates(V)
-    V = arm.expand(_interior(arm, V), outboard)
+    V = arm.expand(interior_rows(arm, V), outboard)
     MV = arm.mass_times(V)
     sign = orient(arm, V, MV)
     stiffness = np.diag(np.diag(arm.energy_matrix(V)))
@@ -301,7 +299,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     return Basis(V * sign, MV * sign, stiffness, outboard * sign, start)
 
 
-def _interior(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
+def interior_rows(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
     """Return the owned interior rows (num_interior, k) of nodal fields."""
     return field[arm.interior_nodes].reshape(arm.num_interior, field.shape[2])
 

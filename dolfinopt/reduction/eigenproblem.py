@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +12,12 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import Columns, ElasticArm, Rows
-from dolfinopt.parallel import on_root
 from dolfinopt.reduction.measured import (
     EIGENVALUE_GAP,
     EXACT_TOLERANCE,
-    GUARD_VECTORS,
     ITERATIONS_LIMIT,
     LOST_MODE_SHARE,
     RAMP_SHARE,
-    ROUNDING_SHARE,
     VECTOR_TOLERANCE,
     WARM_STEPS,
 )
@@ -59,6 +56,12 @@ class Pencil:
         arm = self.arm
         return arm.num_interior + (arm.rigid.shape[2] if self.is_last else 0)
 
+    @property
+    def size(self) -> int:
+        """Rows of all ranks."""
+        free = self.arm.rigid.shape[2]
+        return self.arm.num_dofs - (0 if self.is_free else free)
+
     def split(self, V: np.ndarray) -> Rows:
         """Return interior rows, and the outboard coordinates (b, k) on every rank."""
         arm, size = self.arm, self.arm.num_interior
@@ -88,9 +91,14 @@ class Pencil:
             outboard += self.carried @ self.split(V)[1]
         return self.joined(interior, outboard)
 
+    @property
+    def tolerance(self) -> float:
+        """Relative residual of solutions and eigenpairs: nearly all digits, where a factor is."""
+        return VECTOR_TOLERANCE if self.arm.is_iterative else EXACT_TOLERANCE
+
     def inverse(self, R: np.ndarray) -> np.ndarray:
-        """Return (T'KT)^-1 R, to nearly all digits."""
-        return self._inverse(lambda F: self.arm.solve(F, EXACT_TOLERANCE), R)
+        """Return (T'KT)^-1 R, to the tolerance."""
+        return self._inverse(lambda F: self.arm.solve(F, self.tolerance), R)
 
     def precondition(self, R: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 R, or an approximation of it where solutions are iterative."""
@@ -176,8 +184,8 @@ def complement_solve(
 def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> Pairs:
     """Return the `count` smallest eigenvalues of K phi = lambda M phi and their vectors.
 
-    With a factor at hand from the modes of a nearby problem by `modes_from`, otherwise or where
-    that gives up by SLEPc's Krylov-Schur on K^-1 M; where solutions are iterative by `lobpcg`.
+    From the modes of a nearby problem by `modes_from`; without these, or where that gives up, or
+    with options of the user, by SLEPc's Krylov-Schur on K^-1 M.
 
     Args:
         pencil: K and M, symmetric positive definite.
@@ -193,11 +201,8 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
     arm = pencil.arm
     with arm.profile.phase("eigenproblem"):
         pairs = None
-        if not user_options(OPTIONS):
-            if arm.is_iterative:
-                pairs = lobpcg(pencil, count, start, VECTOR_TOLERANCE)
-            elif start is not None and start.shape[1] > 0:
-                pairs = modes_from(pencil, count, start)
+        if start is not None and start.shape[1] > 0 and not user_options(OPTIONS):
+            pairs = modes_from(pencil, count, start)
         if pairs is None:
             pairs = _from_cold(pencil, count)
     arm.profile.counts.eigenproblems += 1
@@ -211,10 +216,9 @@ def lowest_eigenpairs(pencil: Pencil, count: int, start: np.ndarray | None) -> P
 
 def _from_cold(pencil: Pencil, count: int) -> Pairs:
     """Return up to `count` pairs by SLEPc, see `lowest_eigenpairs`."""
-    with closing(_Search(pencil, pencil.mass)) as search:
-        found = search.largest(count, _ramp(pencil), EXACT_TOLERANCE)
-        if len(found[0]) == count:  # nothing tells from cold how many modes have one frequency
-            found = search.without_gaps(*found)
+    found = _largest(pencil, pencil.mass, count, _ramp(pencil), pencil.tolerance)
+    if len(found[0]) == count:  # nothing tells from cold how many modes have one frequency
+        found = _without_gaps(pencil, *found)
     inverse, vectors = found
     # K-orthonormal; of far apart eigenvalues not M-orthogonal to all digits.
     return 1.0 / inverse, orthonormal(pencil, vectors)
@@ -252,8 +256,8 @@ def largest_eigenpairs(
     """
     arm = pencil.arm
     first = _ramp(pencil) if start is None else _initial(pencil, start)
-    with arm.profile.phase("eigenproblem"), closing(_Search(pencil, product)) as search:
-        pairs = search.largest(count, first, tolerance, absolute=True)
+    with arm.profile.phase("eigenproblem"):
+        pairs = _largest(pencil, product, count, first, tolerance, absolute=True)
     arm.profile.counts.eigenproblems += 1
     if len(pairs[0]) < count:
         raise ConvergenceError(
@@ -289,7 +293,7 @@ def _noise(pencil: Pencil, count: int) -> np.ndarray:
     return np.modf(np.abs(waves) * 43758.5453)[0] - 0.5
 
 
-# -- with a factor, from the modes of a nearby problem -------------------------------------------
+# -- from the modes of a nearby problem ----------------------------------------------------------
 
 
 def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
@@ -318,7 +322,7 @@ def modes_from(pencil: Pencil, count: int, start: np.ndarray) -> Pairs | None:
         if m >= count:
             theta, y = np.linalg.eigh(T[:m, :m], UPLO="U")
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
-            if (length * np.abs(y[-1]) <= EXACT_TOLERANCE * theta).all():
+            if (length * np.abs(y[-1]) <= pencil.tolerance * theta).all():
                 pairs = 1.0 / theta, (y.T @ Q[:m]).T
                 close = np.diff(pairs[0]) <= EIGENVALUE_GAP * pairs[0][1:]
                 return None if close.any() or _passes_over(pencil, pairs, start) else pairs
@@ -356,187 +360,113 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
     return not bool((inverse * values[-1] <= (1.0 + EIGENVALUE_GAP) * left[new]).all())
 
 
-# -- without a factor: locally optimal block conjugate gradients ---------------------------------
-#
-# Source: Knyazev, SIAM J. Sci. Comput. 23 (2001) 517-541, doi:10.1137/S1064827500366124; bases made
-# orthonormal as in Hetmaniuk & Lehoucq, J. Comput. Phys. 218 (2006) 324-332,
-# doi:10.1016/j.jcp.2006.02.007.
-
-
-def lobpcg(pencil: Pencil, count: int, start: np.ndarray | None, tolerance: float) -> Pairs | None:
-    """Return the lowest eigenvalues (count,) and M-orthonormal vectors; None if that fails.
-
-    A pair is found once its residual, in the norm of the preconditioner, is below the tolerance
-    times the square root of its eigenvalue: about the error of the vector in energy.
-
-    Args:
-        pencil: K and M.
-        count: number of eigenpairs.
-        start: (rows, k) vectors of a nearby problem, or None.
-        tolerance: relative.
-    """
-    m = count + GUARD_VECTORS
-    known = np.empty((pencil.rows, 0)) if start is None else start[:, :m]
-    noise = _noise(pencil, m - known.shape[1])
-    S = _products(pencil, np.hstack([known, pencil.precondition(pencil.precondition(noise))]))
-    P = [np.empty((pencil.rows, 0))] * 3
-    for _ in range(ITERATIONS_LIMIT):
-        C, values = _ritz(pencil, S)
-        C, values = C[:, :m], values[:m]
-        # The next directions: what the new vectors have of the last residuals and directions.
-        P = [part[:, m:] @ C[m:] for part in S]
-        X, KX, MX = _products(pencil, S[0] @ C)  # combined ones drift by rounding
-        R = KX - MX * values
-        W = pencil.precondition(R)
-        size = pencil.total(np.einsum("nk,nk->k", R, W))
-        if not np.isfinite(size).all():
-            return None
-        if (np.sqrt(np.maximum(size, 0.0)) <= tolerance * np.sqrt(values))[:count].all():
-            return values[:count], X[:, :count]
-        new = _products(pencil, W - X @ pencil.total(MX.T @ W))
-        S = [np.concatenate(parts, axis=1) for parts in zip((X, KX, MX), new, P, strict=True)]
-    return None
-
-
-def _products(pencil: Pencil, V: np.ndarray) -> list[np.ndarray]:
-    """Return V, K V, M V."""
-    return [V, pencil.stiffness(V), pencil.mass(V)]
-
-
-def _ritz(pencil: Pencil, space: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients of all Ritz vectors of S, given S, K S and M S, and their values."""
-    S, KS, MS = space
-    K, M = (pencil.total(S.T @ product) for product in (KS, MS))
-    K, M = 0.5 * (K + K.T), 0.5 * (M + M.T)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))
-
-    def solved() -> tuple[np.ndarray, np.ndarray]:
-        lengths, basis = np.linalg.eigh(M * np.outer(scale, scale))
-        kept = lengths > ROUNDING_SHARE * lengths[-1]
-        T = (scale[:, None] * basis[:, kept]) / np.sqrt(lengths[kept])
-        values, vectors = np.linalg.eigh(T.T @ K @ T)
-        return T @ vectors, values
-
-    # One rank decides how many vectors are independent, and when the search ends.
-    found: tuple[np.ndarray, np.ndarray] = on_root(pencil.arm.comm, solved)
-    return found
-
-
 # -- by SLEPc -----------------------------------------------------------------------------------
 
 
-class _Search:
-    """The largest eigenvalues of A phi = mu K phi, by Krylov-Schur on K^-1 A."""
+def _largest(
+    pencil: Pencil,
+    product: Columns,
+    count: int,
+    first: np.ndarray,
+    tolerance: float,
+    known: np.ndarray | None = None,
+    absolute: bool = False,
+) -> Pairs:
+    """Return up to `count` largest values of A phi = mu K phi, descending, by Krylov-Schur.
 
-    def __init__(self, pencil: Pencil, product: Columns):
-        self.pencil = pencil
-        self.stiffness = _matrix(pencil, pencil.stiffness)
-        self.matrix = _matrix(pencil, product)
+    Args:
+        pencil: K.
+        product: A times columns.
+        count: that are wanted.
+        first: (rows,) the first vector of the subspace.
+        tolerance: of the eigenvalues' residuals.
+        known: (rows, k) vectors to which the new ones, K-orthonormal, are K-orthogonal.
+        absolute: whether the tolerance is not relative to each eigenvalue.
+    """
+    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
+    # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
+    # have, need more vectors, not more restarts.
+    for space, restarts in ((max(count + 4, 2 * count), 25), (4 * count + 100, 100)):
+        with _solver(pencil, product, min(count, pencil.size), min(space, pencil.size)) as eps:
+            eps.setTolerances(tolerance, restarts)
+            if absolute:
+                eps.setConvergenceTest(SLEPc.EPS.Conv.ABS)
+            pairs = _solved(pencil, eps, count, first, known)
+        if len(pairs[0]) == count:
+            break
+    return pairs
 
-    def close(self) -> None:
-        """Destroy the matrices: they would keep the arm's design, and PETSc keeps them."""
-        self.stiffness.destroy()
-        self.matrix.destroy()
 
-    def largest(
-        self,
-        count: int,
-        first: np.ndarray,
-        tolerance: float,
-        beside: np.ndarray | None = None,
-        absolute: bool = False,
-    ) -> Pairs:
-        """Return up to `count` values, descending, and K-orthonormal vectors.
+@contextmanager
+def _solver(pencil: Pencil, product: Columns, count: int, space: int) -> Iterator[SLEPc.EPS]:
+    stiffness, matrix = _matrix(pencil, pencil.stiffness), _matrix(pencil, product)
+    eps = SLEPc.EPS().create(pencil.arm.comm)
+    eps.setOptionsPrefix(OPTIONS)
+    eps.setOperators(matrix, stiffness)
+    eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+    eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
+    eps.setDimensions(count, space)
+    transform = eps.getST()
+    transform.setType(SLEPc.ST.Type.SHIFT)
+    ksp = _as_ksp(stiffness, pencil.inverse)
+    transform.setKSP(ksp)
+    yield eps
+    # PETSc keeps what Python forgets, and with it the arm's design: 5 MB of 400 x 24 cells.
+    for one in (eps, transform, ksp, stiffness, matrix):
+        one.destroy()
 
-        Args:
-            count: that are wanted.
-            first: (rows,) the first vector of the subspace.
-            tolerance: of the eigenvalues' residuals.
-            beside: (rows, k) vectors to which the new ones are K-orthogonal.
-            absolute: whether the tolerance is not relative to each eigenvalue.
-        """
-        # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
-        # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
-        # have, need more vectors, not more restarts.
-        spaces = ((max(count + 4, 2 * count), 25), (2 * count + 20, 50), (4 * count + 100, 100))
-        for space, restarts in spaces[0 if beside is None else 1 :]:
-            with self._solver(count, space, absolute) as eps:
-                eps.setTolerances(tolerance, restarts)
-                pairs = self._solved(eps, count, first, beside)
-            if len(pairs[0]) == count:
-                break
-        return pairs
 
-    @contextmanager
-    def _solver(self, count: int, space: int, absolute: bool) -> Iterator[SLEPc.EPS]:
-        eps = SLEPc.EPS().create(self.pencil.arm.comm)
-        eps.setOptionsPrefix(OPTIONS)
-        eps.setOperators(self.matrix, self.stiffness)
-        eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
-        eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
-        size = self.stiffness.getSize()[0]
-        eps.setDimensions(min(count, size), min(size, space))
-        if absolute:
-            eps.setConvergenceTest(SLEPc.EPS.Conv.ABS)
-        transform = eps.getST()
-        transform.setType(SLEPc.ST.Type.SHIFT)
-        ksp = _as_ksp(self.stiffness, self.pencil.inverse)
-        transform.setKSP(ksp)
-        yield eps
-        # PETSc keeps what Python forgets, and with it the arm's design: 5 MB of 400 x 24 cells.
-        for one in (eps, transform, ksp):
-            one.destroy()
+def _solved(
+    pencil: Pencil, eps: SLEPc.EPS, count: int, first: np.ndarray, known: np.ndarray | None
+) -> Pairs:
+    vector = eps.getOperators()[0].createVecLeft()
+    given = [_filled(vector, first)]
+    eps.setInitialSpace(given)
+    if known is not None:
+        space = [_filled(vector, column) for column in known.T]
+        eps.setDeflationSpace(space)
+        given += space
+    with obeying_options(OPTIONS):
+        eps.setFromOptions()
+        eps.solve()
+    found = min(eps.getConverged(), count)
+    values, vectors = np.empty(found), np.empty((pencil.rows, found))
+    for k in range(found):
+        values[k] = eps.getEigenpair(k, vector).real
+        vectors[:, k] = vector.array
+    for one in (vector, *given):
+        one.destroy()
+    order = np.argsort(-values, kind="stable")
+    return values[order], vectors[:, order]
 
-    def _solved(
-        self, eps: SLEPc.EPS, count: int, first: np.ndarray, beside: np.ndarray | None
-    ) -> Pairs:
-        vector = self.stiffness.createVecLeft()
-        given = [_filled(vector, first)]
-        eps.setInitialSpace(given)
-        if beside is not None:
-            known = [_filled(vector, column) for column in beside.T]
-            eps.setDeflationSpace(known)
-            given += known
-        with obeying_options(OPTIONS):
-            eps.setFromOptions()
-            eps.solve()
-        found = min(eps.getConverged(), count)
-        values, vectors = np.empty(found), np.empty((self.pencil.rows, found))
-        for k in range(found):
-            values[k] = eps.getEigenpair(k, vector).real
-            vectors[:, k] = vector.array
-        for one in (vector, *given):
-            one.destroy()
+
+def _without_gaps(pencil: Pencil, values: np.ndarray, vectors: np.ndarray) -> Pairs:
+    """Return as many pairs of K^-1 M, with those in place that a search passed over.
+
+    A Krylov subspace holds one vector of every eigenvalue but for rounding. What is left is
+    searched in the K-complement of what is known, until it lies below.
+
+    Raises:
+        ConvergenceError: that search does not converge.
+    """
+    # Another vector each time: one that has been used holds no more than rounding of the same
+    # frequency's other modes.
+    for first in _noise(pencil, len(values)).T:
+        if pencil.size == len(values):
+            break  # all there are
+        more, vector = _largest(pencil, pencil.mass, 1, first, pencil.tolerance, vectors)
+        if len(more) == 0:
+            raise ConvergenceError(
+                f"arm {pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
+                "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"
+            )
+        if more[0] <= (1.0 + EIGENVALUE_GAP) * values[-1]:
+            break
+        values = np.append(values[:-1], more)
+        vectors = np.column_stack([vectors[:, :-1], vector])
         order = np.argsort(-values, kind="stable")
-        return values[order], vectors[:, order]
-
-    def without_gaps(self, values: np.ndarray, vectors: np.ndarray) -> Pairs:
-        """Return as many pairs, with those in place that a search passed over.
-
-        A Krylov subspace holds one vector of every eigenvalue but for rounding. What is left is
-        searched in the K-complement of what is known, until it lies below.
-
-        Raises:
-            ConvergenceError: that search does not converge.
-        """
-        # Another vector each time: one that has been used holds no more than rounding of the same
-        # frequency's other modes.
-        for first in _noise(self.pencil, len(values)).T:
-            if self.stiffness.getSize()[0] == len(values):
-                break  # all there are
-            more, vector = self.largest(1, first, EXACT_TOLERANCE, vectors)
-            if len(more) == 0:
-                raise ConvergenceError(
-                    f"arm {self.pencil.arm.mesh.name!r}: modes of nearly equal frequency do not "
-                    "all converge; ask for fewer reduction.coordinates or raise interpolation.floor"
-                )
-            if more[0] <= (1.0 + EIGENVALUE_GAP) * values[-1]:
-                break
-            values = np.append(values[:-1], more)
-            vectors = np.column_stack([vectors[:, :-1], vector])
-            order = np.argsort(-values, kind="stable")
-            values, vectors = values[order], vectors[:, order]
-        return values, vectors
+        values, vectors = values[order], vectors[:, order]
+    return values, vectors
 
 
 class _Product:

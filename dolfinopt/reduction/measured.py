@@ -8,18 +8,16 @@ Each stands with its unit, what it rules, and what was measured.
 # Relative residual of solutions and eigenpairs that are to be right to nearly all digits. Vectors
 # are then right to about 1e-10, which keeps designs equal to 1e-8 on any number of ranks; each
 # further digit costs a fraction of a step. Two rounds of Gram and Schmidt leave 1e-15 to 1e-14.
-EXACT_TOLERANCE = 1e-12
 # Part of a length or energy, of the largest, below which what is left of a vector beside others is
-# rounding: that leaves 1e-16 of dependent ones, independent ones have 1e-2.
-ROUNDING_SHARE = 1e-12
-# Relative, in energy, of what needs fewer digits: modes without a factor and their adjoints, from
+# rounding, too: that leaves 1e-16 of dependent ones, independent ones have 1e-2.
+EXACT_TOLERANCE = 1e-12
+# Relative, of what needs fewer digits: modes without a factor and the adjoints of modes, from
 # which gradients are right to it, more than an optimiser can use.
 VECTOR_TOLERANCE = 1e-8
-ITERATIONS_LIMIT = 500  # of conjugate gradients for modes and their adjoints
+ITERATIONS_LIMIT = 500  # of conjugate gradients for the adjoints of modes
 
 # -- eigenproblem --------------------------------------------------------------------------------
 
-GUARD_VECTORS = 3  # beyond those that are wanted: the last ones converge slowly
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 EIGENVALUE_GAP = 1e-6
@@ -43,4 +41,3 @@ KRYLOV_BLOCKS_LIMIT = 60
 DEFLATION_SHARE = 1e-10
 # A second round leaves columns their length; what shrinks below this was rounding in the first.
 ROUNDING_LENGTH_SHARE = 0.1
-ORTHONORMAL_ROUNDS_LIMIT = 4  # two are the rule

@@ -22,6 +22,7 @@ from dolfinopt.reduction.basis import (
     frame_fields,
     frame_loads,
     interface_loads,
+    interior_rows,
     orient,
     orthonormalise,
     ritz,
@@ -32,7 +33,6 @@ from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     EXACT_TOLERANCE,
     KRYLOV_BLOCKS_LIMIT,
-    ROUNDING_SHARE,
 )
 
 # -- by modes: Craig-Bampton (constraint and fixed-interface modes), modes of a free arm ----------
@@ -192,7 +192,7 @@ def krylov_adjoint(
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
-    inner = arm.comm.allreduce(basis.V[arm.interior_nodes].reshape(interior.shape).T @ interior)
+    inner = arm.comm.allreduce(interior_rows(arm, basis.V).T @ interior)
     inner += basis.outboard.T @ outboard
     weighted = arm.restrict(basis.MV)
     interior = (interior - weighted[0] @ inner) @ turn.T
@@ -309,7 +309,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     """
     arm.profile.counts.reductions += 1
     first = arm.static_response(*_inputs(arm))
-    space = InverseSpace(arm, first, ROUNDING_SHARE)
+    space = InverseSpace(arm, first, EXACT_TOLERANCE)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
     for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()

@@ -125,7 +125,7 @@ def stressed_modulus(state: DesignState) -> StressedModulus:
     With r = E / E_0 less that of void, and e = `VOID_STRESS_SHARE`, s = E_0 r^2 (1 + e) / (r + e):
     Young's where there is material, and less than any share of it towards void.
     """
-    law, solid, e = state.scene.interpolation, state.solid.young_modulus, VOID_STRESS_SHARE
+    law, solid, e = state.scene.interpolation, state.solid.modulus, VOID_STRESS_SHARE
     void = interpolate(np.zeros(1), law.law, law.penalty, law.floor).stiffness
     r = state.elastic.young / solid - void
     share = (1.0 + e) * r / (r + e)
@@ -180,7 +180,7 @@ def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuc
     scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
     loads, found = _loads(scene, trajectory), list[LeastBuckling]()
     for k, arm in arms.items():
-        for one in _of_design(arm.current, loads[k], trajectory):
+        for one in _of_design(arm.current, loads[k]):
             mu, motion = float(one.modes.inverse[0]), motions[one.loads.motion]
             factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
             found.append(LeastBuckling(factor, one.loads.place, float(motion.t[one.instant])))
@@ -195,27 +195,17 @@ def _loads(scene: Scene, trajectory: Trajectory) -> dict[int, Loads]:
     motions = motions_of(trajectory)
 
     def stiffer(one: ArmLoads) -> float:
-        other = motions[one.motion].scene.material_of(one.place).young_modulus
-        return other / scene.material_of(one.place).young_modulus
+        other = motions[one.motion].scene.material_of(one.place).modulus
+        return other / scene.material_of(one.place).modulus
 
     every = arm_loads(scene, motions)
     return {k: [(one, stiffer(one)) for one in each] for k, each in every.items()}
 
 
-def _known(state: DesignState | None, trajectory: Trajectory | None) -> list[Pressed] | None:
-    """Return what is known of a design in this motion."""
-    kept = None if state is None else state.kept.get(Buckling.declared.name)
-    return kept[1] if kept is not None and kept[0] is trajectory else None
-
-
-def _of_design(state: DesignState, loads: Loads, trajectory: Trajectory | None) -> list[Pressed]:
+def _of_design(state: DesignState, loads: Loads) -> list[Pressed]:
     """Return the instants of all arms with a design (collective on its ranks)."""
-    known = _known(state, trajectory) if trajectory is not None else None
-    if known is None:
-        with state.elastic.profile.phase("buckling"):
-            known = [each for one in loads for each in pressed(state, *one)]
-        state.kept[Buckling.declared.name] = trajectory, known
-    return known
+    with state.elastic.profile.phase("buckling"):
+        return [each for one in loads for each in pressed(state, *one)]
 
 
 # -- as objective and as limit -------------------------------------------------------------------
@@ -264,20 +254,17 @@ class Buckling(Response):
     def _found(self, analysis: Analysis) -> dict[int, list[Pressed]]:
         """Return the instants of this rank's designs, once for value and gradient (collective)."""
         designs, world = analysis.designs, analysis.partition.world
-        first = next(iter(designs.values()), None)
-        # The root, which has an arm and the trajectory, speaks for all: they work in step.
-        if world.bcast(_known(first, analysis.trajectory) is not None, root=0):
-            return {k: state.kept[self.name][1] for k, state in designs.items()}
 
         def loads() -> dict[int, Loads]:
             assert analysis.trajectory is not None
             return _loads(analysis.scene, analysis.trajectory)
 
-        every: dict[int, Loads] = on_root(world, loads)
-        with together(world):
-            return {
-                k: _of_design(state, every[k], analysis.trajectory) for k, state in designs.items()
-            }
+        def find() -> dict[int, list[Pressed]]:
+            every: dict[int, Loads] = on_root(world, loads)
+            with together(world):
+                return {k: _of_design(state, every[k]) for k, state in designs.items()}
+
+        return self.once(analysis, find)
 
     def _values(
         self, analysis: Analysis, found: Mapping[int, list[Pressed]]

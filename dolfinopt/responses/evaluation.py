@@ -15,14 +15,13 @@ import numpy as np
 from dolfinopt.arms.arm import chain_of, stiffening_of
 from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.simulation import simulate, simulate_all
+from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part, shape_integrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import Basis
 from dolfinopt.responses.measured import (
     NEGLECTED_DEVIATION_SHARE,
     STIFFENING_INSTANTS,
@@ -43,7 +42,6 @@ from dolfinopt.responses.response import (
     objective_of,
 )
 from dolfinopt.scene.load import Scene, pose_scenarios
-from dolfinopt.scene.tables.responses import asked
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -141,63 +139,9 @@ def evaluate(
     if simulated or needs(scene, "motion"):
         decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
         owned = _reduced(partition, arms, x_phys)
-        motion, trajectory = _simulated(scene, scene, partition, owned, profile, start)
+        motion, trajectory = _simulated(scene, partition, owned, profile, start)
     analysis = analysis_of(scene, partition, arms, trajectory, profile)
     return _measured(analysis, motion), trajectory
-
-
-def evaluate_batch(
-    scenes: Sequence[Scene],
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Cells,
-    profile: Profile,
-) -> list[tuple[Evaluation, Trajectory | None] | ConvergenceError]:
-    """Evaluate one design in many scenes, whose motions are simulated in one batch (collective).
-
-    Args:
-        scenes: of one reduction, in which the arms are the same, see `Arm.under`; or, if nothing
-            but their motion is asked for, scaled, see `scenarios.factors`.
-        partition: which ranks do which arm.
-        arms: this rank's, in the first scene.
-        x_phys: their physical densities (n_cells,).
-        profile: of this rank.
-
-    Returns:
-        What `evaluate` does of every scene, or the error that it would raise.
-
-    Raises:
-        InputError: as `evaluate` does.
-    """
-    _check_densities(partition, arms, x_phys)
-    try:
-        with together(partition.world):
-            for k, arm in arms.items():
-                arm.set_design(x_phys[k])
-        decided = stiffening_of_each(
-            [(one, *pose_scenarios(one)) for one in scenes], partition, arms
-        )
-    except ConvergenceError as error:
-        return [error] * len(scenes)
-    found: dict[int, tuple[Evaluation, Trajectory | None] | ConvergenceError] = {}
-    bodies: dict[bool, Mapping[int, ShapeIntegrals]] = {}
-    for i in sorted(range(len(scenes)), key=lambda i: decided[i].on):  # bodies differ
-        scene, on = scenes[i], decided[i].on
-        try:
-            if on not in bodies:
-                for arm in arms.values():
-                    arm.set_stiffening(decided[i])
-                bodies[on] = _reduced(partition, arms, x_phys)
-            motion, trajectory = _simulated(scenes[0], scene, partition, bodies[on], profile)
-            under = arms
-            if any(one.needs and "motion" not in one.needs for one in asked(scene)):
-                with together(partition.world):
-                    under = {k: arm.under(scene) for k, arm in arms.items()}
-            analysis = analysis_of(scene, partition, under, trajectory, profile)
-            found[i] = _measured(analysis, motion), trajectory
-        except ConvergenceError as error:
-            found[i] = error
-    return [found[i] for i in range(len(scenes))]
 
 
 def analysis_of(
@@ -331,16 +275,13 @@ def _reduced(
 
 
 def _simulated(
-    first: Scene,
     scene: Scene,
     partition: Partition,
     owned: Mapping[int, ShapeIntegrals],
     profile: Profile,
-    starts: Sequence[Solution] = (),
+    starts: Sequence[Solution],
 ) -> tuple[Motion, Trajectory | None]:
-    """Simulate a scene and its scenarios, with the bodies of `first` (collective).
-
-    The trajectory is the root's.
+    """Simulate a scene and its scenarios (collective); the trajectory is the root's.
 
     Raises:
         ConvergenceError: on all ranks.
@@ -348,18 +289,15 @@ def _simulated(
     kept: list[Trajectory] = []
 
     def run() -> Motion:
-        moved: list[Trajectory] = []
-        known = list(starts)
-        for number, one in enumerate((scene, *pose_scenarios(scene))):
+        others = pose_scenarios(scene)
+        first = starts[0] if starts else None
+        moved = [simulate(scene, chain_of(scene, owned), profile, first)]
+        for number, one in enumerate(others, 1):
             # Scenarios begin with the scene's motion unless theirs is known.
-            start = known[number] if number < len(known) else None
-            if start is None and moved:
-                start = moved[0].solution
-            bodies = chain_of(one, owned) if one is first else bodies_in(first, one, owned)
+            start = starts[number] if number < len(starts) else moved[0].solution
             # The nominal machine's feed-forward is kept where the motion is the same.
-            same = bool(moved) and one.motion == scene.motion
-            held = moved[0].feed_forward if same else None
-            moved.append(simulate(one, bodies, profile, start, held))
+            held = moved[0].feed_forward if one.motion == scene.motion else None
+            moved.append(simulate(one, bodies_in(scene, one, owned), profile, start, held))
         kept.append(replace(moved[0], scenarios=tuple(moved[1:])))
         with profile.phase("objective"):
             return _motion(kept[0])
@@ -415,7 +353,7 @@ def decide_stiffening(
     """
     if partition.world.allreduce(all(arm.stiffening is not None for arm in arms.values()), min):
         return
-    [found] = stiffening_of_each([scenes], partition, arms)
+    found = _stiffening(scenes, partition, arms)
     for arm in arms.values():
         arm.set_stiffening(found)
 
@@ -433,70 +371,39 @@ def reconsider_stiffening(
     known = partition.world.bcast(stiffening_of(arms), root=0)
     if scenes[0].simulation.stiffening != "auto" or known is None or known.on:
         return False
-    [found] = stiffening_of_each([scenes], partition, arms)
+    found = _stiffening(scenes, partition, arms)
     for arm in arms.values():
         arm.set_stiffening(found)
     return found.on
 
 
-def stiffening_of_each(
-    groups: Sequence[Sequence[Scene]], partition: Partition, arms: Mapping[int, Arm]
-) -> list[Stiffening]:
-    """Return what is decided for each group of scenes on its own (collective).
-
-    Args:
-        groups: scenes of the same arms; those of a group are decided together.
-        partition: which ranks do which arm.
-        arms: this rank's, with a design.
-    """
-    stated = not any(group[0].simulation.stiffening == "auto" for group in groups)
-    if stated and not groups[0][0].estimates_stiffening:
-        return [Stiffening(None, group[0].simulation.stiffening is True) for group in groups]
+def _stiffening(
+    scenes: Sequence[Scene], partition: Partition, arms: Mapping[int, Arm]
+) -> Stiffening:
+    """Return what is decided for scenes of the same arms together (collective)."""
+    stated = scenes[0].simulation.stiffening
+    if stated != "auto" and not scenes[0].estimates_stiffening:
+        return Stiffening(None, stated is True)
     with together(partition.world):
-        mine = {k: _static_body(arm, simulated=not stated) for k, arm in arms.items()}
+        mine = {k: arm.current.static_body for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
-    found: list[Stiffening] = on_root(partition.world, _decided, groups, owned)
+    found: Stiffening = on_root(partition.world, _decided, scenes, owned)
     return found
 
 
-def _static_body(arm: Arm, simulated: bool) -> ShapeIntegrals:
-    """Return the body in the static modes of its outboard interface: they need no eigenproblem."""
-    # What the inertia of the modes stiffens is not needed for the estimate alone.
-    state = arm.current
-    elastic, static = state.elastic, state.elastic.constraint_modes()
-    none = np.empty((len(static.interior), 0))
-    weighted = elastic.mass_times(static.field)
-    basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)
-    damping = state.scene.damping.stiffness_proportional
-    loads = state.unit_loads
-    if simulated:
-        loads = loads.with_modes(static.field, weighted)
-    return shape_integrals(elastic, basis, damping, loads)
-
-
-def _decided(
-    groups: Sequence[Sequence[Scene]], owned: Mapping[int, ShapeIntegrals]
-) -> list[Stiffening]:
-    """Return what is decided for each group."""
-    first, found = groups[0][0], []
-    for group in groups:
-        asked = group[0].simulation.stiffening
-        estimate = max(_change(one, bodies_in(first, one, owned)) for one in group)
-        if asked != "auto":
-            found.append(Stiffening(estimate, asked))
-            continue
-        if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
-            found.append(Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE))
-            continue
-        bodies = [bodies_in(first, one, owned) for one in group]
-        neglected = _neglected(group, bodies)
-        on = (
-            estimate >= STIFFENING_UNKNOWN_CHANGE
-            if neglected is None
-            else neglected > NEGLECTED_DEVIATION_SHARE
-        )
-        found.append(Stiffening(estimate, on, neglected))
-    return found
+def _decided(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> Stiffening:
+    """Return what is decided by the bodies of the arms' designs."""
+    stated = scenes[0].simulation.stiffening
+    bodies = [bodies_in(scenes[0], one, owned) for one in scenes]
+    estimate = max(map(_change, scenes, bodies))
+    if stated != "auto":
+        return Stiffening(estimate, stated)
+    if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
+        return Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE)
+    neglected = _neglected(scenes, bodies)
+    if neglected is None:
+        return Stiffening(estimate, estimate >= STIFFENING_UNKNOWN_CHANGE)
+    return Stiffening(estimate, neglected > NEGLECTED_DEVIATION_SHARE, neglected)
 
 
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
@@ -509,13 +416,12 @@ def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> fl
     """Return what share of the largest deviation linear bodies miss; None if one cannot move."""
     # Simulated beside the run: the comparison is none of its simulations.
     profile = Profile()
-    linear = [[linear_part(body) for body in chain] for chain in bodies]
     largest = 0.0
-    pairs = zip(
-        simulate_all(group, bodies, profile), simulate_all(group, linear, profile), strict=True
-    )
-    for stiffened, without in pairs:
-        if isinstance(stiffened, ConvergenceError) or isinstance(without, ConvergenceError):
+    for scene, chain in zip(group, bodies, strict=True):
+        try:
+            stiffened = simulate(scene, chain, profile)
+            without = simulate(scene, [linear_part(body) for body in chain], profile)
+        except ConvergenceError:
             return None
         moved, other = _displacements(stiffened), _displacements(without.at(stiffened.t))
         size = np.linalg.norm(moved, axis=-1).max(initial=0.0)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.arms.arm import fixed_body
+from dolfinopt.arms.arm import chain_of
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.arms.modes import Chain, LoadedModes, RigidIntegrals, rigid_integrals
+from dolfinopt.arms.modes import FrozenTree, LoadedModes
 from dolfinopt.motion.build import rigid_motion
 from dolfinopt.multibody.build import build_mechanism
+from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.products import Products
 from dolfinopt.responses.response import (
@@ -25,12 +27,6 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import joint_parts
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.modes import FrozenTree
-
-NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
 
 def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
@@ -89,11 +85,11 @@ class Eigenfrequency(Response):
                 own[place] = period_gradient(by_place[place], one, by_values, analysis.by)
         by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
         rows = []
-        zero = [np.zeros_like(one.matrix()) for one in chain.carried()]
+        zero = list(map(np.zeros_like, chain.carried()))
         with together(partition.world):
             for place, matrix in by_carried.items():
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
-                by_body: dict[int, Any] = by_owner(scene, chain.cotangents(carried))
+                by_body = by_owner(scene, chain.cotangents(carried))
                 row = {
                     k: rigid_gradient(state, by_body[k], analysis.by)
                     if _counts(by_body[k])
@@ -113,75 +109,28 @@ class Eigenfrequency(Response):
         return np.array(measured.smooth) * (np.array(measured.values) / limits) ** 2
 
 
-def _counts(by_body: Any) -> bool:
-    """Return whether derivatives by a rigid body's integrals are more than zero."""
-    if isinstance(by_body, RigidIntegrals):
-        return by_body != NOTHING
-    return bool(by_body.mass or by_body.w.any() or by_body.W.any())
-
-
-def _frozen(analysis: Analysis) -> Chain | FrozenTree:
-    """Freeze the mechanism in the pose in which its arms vibrate (collective)."""
-    return FROZEN[analysis.scene.dimension](analysis)
-
-
-def _chain(analysis: Analysis) -> Chain:
-    """Freeze the arms of the plane at the elbow angle at which they vibrate (collective)."""
+def _frozen(analysis: Analysis) -> FrozenTree:
+    """Freeze the machine at the elbow angle, or in the middle of its motion (collective)."""
     scene, partition = analysis.scene, analysis.partition
     with together(partition.world):
-        mine = {k: rigid_integrals(one.elastic) for k, one in analysis.designs.items()}
-    owned = on_all_ranks(partition, mine)
-
-    def freeze() -> Chain:
-        bodies, outboard_points = [], []
-        for place, owner in enumerate(scene.owners):
-            if owner is not None:
-                bodies.append(owned[owner])
-                outboard_points.append(complex(scene.arms[place].length, 0.0))
-            else:
-                body = fixed_body(scene, place)
-                moment, inertia = complex(*body.w[:, 0]), float(body.W[0, 0, 0])
-                bodies.append(RigidIntegrals(body.mass, moment, inertia))
-                outboard_points.append(complex(*body.outboard_point))
-        angle = scene.objective.elbow_angle
-        if angle is None:
-            middle = np.array([0.5 * scene.motion.duration])
-            angles = [float(value) for value in rigid_motion(middle, scene).q[0, 1:]]
-        else:
-            angles = [angle] * len(bodies)
-        rotors = [*(one.rotor for one in joint_parts(scene)[1:]), 0.0]  # of the next arm's joint
-        loads = [
-            RigidIntegrals(arm.joint_mass, 0j, arm.joint_inertia + rotor)
-            for arm, rotor in zip(scene.arms, rotors, strict=True)
-        ]
-        loads[-1] = loads[-1] + RigidIntegrals(scene.payload.mass, 0j, scene.payload.moment)
-        return Chain(bodies, outboard_points, angles, loads, scene.objective.attached)
-
-    return on_root(partition.world, freeze)
-
-
-def _tree(analysis: Analysis) -> FrozenTree:
-    """Freeze the machine in space in the pose at the middle of its motion (collective)."""
-    from dolfinopt.arms.modes import FrozenTree, rigid_integrals_in_space
-
-    scene, partition = analysis.scene, analysis.partition
-    with together(partition.world):
-        mine = {k: rigid_integrals_in_space(one.elastic) for k, one in analysis.designs.items()}
+        mine = {k: state.rigid_body for k, state in analysis.designs.items()}
     owned = on_all_ranks(partition, mine)
 
     def freeze() -> FrozenTree:
-        bodies = [
-            fixed_body(scene, place) if owner is None else owned[owner]
-            for place, owner in enumerate(scene.owners)
-        ]
-        motion = rigid_motion(np.array([0.5 * scene.motion.duration]), scene)
-        rigid = build_mechanism(scene, bodies).rigid  # its bearings, too
-        return FrozenTree(rigid, motion, scene.objective.attached)
+        rigid = build_mechanism(scene, chain_of(scene, owned)).rigid  # its bearings, too
+        if scene.objective.elbow_angle is None:
+            motion = rigid_motion(np.array([0.5 * scene.motion.duration]), scene)
+        else:
+            angles = np.full((1, rigid.num_rigid), scene.objective.elbow_angle)
+            motion = RigidMotion(angles, 0.0 * angles, 0.0 * angles)
+        return FrozenTree(replace(rigid, forces=()), motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)
 
 
-FROZEN: dict[int, Callable[[Analysis], Chain | FrozenTree]] = {2: _chain, 3: _tree}
+def _counts(by_body: ShapeIntegrals) -> bool:
+    """Return whether derivatives by a rigid body's integrals are more than zero."""
+    return bool(by_body.mass or by_body.w.any() or by_body.W.any())
 
 
 def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, DesignState]:
@@ -193,7 +142,7 @@ def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, Des
     }
 
 
-def _modes(designs: Mapping[int, DesignState], chain: Chain | FrozenTree) -> dict[int, LoadedModes]:
+def _modes(designs: Mapping[int, DesignState], chain: FrozenTree) -> dict[int, LoadedModes]:
     """Return the loaded modes of arms by their place in the chain; within `together`."""
     carried = chain.carried()
     return {place: one.loaded_modes(place, carried[place]) for place, one in designs.items()}

@@ -115,7 +115,7 @@ class _Machines:
     def simulated(self, method: str, count: int) -> StateSpace:
         """Return the machine about its own motion with so many coordinates (collective)."""
         bases = self.reductions.reduced(method, count)
-        owned = gather_arms(self.partition, self.reductions.bodies(bases))
+        owned = self.reductions.bodies(bases)
         if count > self._count:
             self._count, self._bases = count, bases
             self._motion.clear()
@@ -162,27 +162,16 @@ class _Machines:
         """Return the machine with so many coordinates about the richest motion (collective)."""
         if (method, count) not in self._known:
             bases = self.reductions.reduced(method, count)
-            bodies = gather_arms(self.partition, self.reductions.bodies(bases))
-            with together(self.partition.world):
-                mine = {k: self._change(k, basis) for k, basis in bases.items()}
-            changes = gather_arms(self.partition, mine)
-            found = on_root(self.partition.world, self._changed, bodies, changes)
+            bodies = self.reductions.bodies(bases)
+            energies = gather_arms(self.partition, self.reductions.energies(bases, self._bases))
+            found = on_root(self.partition.world, self._changed, bodies, energies)
             self._known[method, count] = found
         return self._known[method, count]
 
-    def _change(self, k: int, new: Basis) -> np.ndarray:
-        """Return C (q', q), which makes of an arm's coordinates the nearest in another basis.
-
-        Nearest in energy; collective on the arm.
-        """
-        elastic, count = self.reductions.arms[k].elastic, new.V.shape[2]
-        energy = elastic.energy_matrix(np.concatenate([new.V, self._bases[k].V], axis=2))
-        return np.linalg.solve(energy[:count, :count], energy[:count, count:])
-
     def _changed(
-        self, owned: Mapping[int, ShapeIntegrals], changes: Mapping[int, np.ndarray]
+        self, owned: Mapping[int, ShapeIntegrals], energies: Mapping[int, np.ndarray]
     ) -> StateSpace:
-        """Return the machine of other bodies, bent as in the motion (root only)."""
+        """Return the machine of other bodies, bent as in the motion: nearest in energy (root)."""
         [seen] = self._motion
         known, system = seen.problem, build_system(self.scene, chain_of(self.scene, owned))
         old, owners = np.stack(seen.unknowns), self.scene.owners
@@ -193,7 +182,11 @@ class _Machines:
         for place, (before, after) in enumerate(parts):
             owner = owners[place] if place < len(owners) else None  # of bearings, rigid arms
             own = old[:, :, before]
-            new[:, :, after] = own if owner is None else own @ changes[owner].T
+            if owner is not None:
+                count = owned[owner].num_modes
+                few, both = np.split(energies[owner][:count], [count], axis=1)
+                own = own @ np.linalg.solve(few, both).T
+            new[:, :, after] = own
         return linear_model(self.scene, system, self.t, (new[0], new[1], new[2]))
 
 

@@ -37,7 +37,7 @@ P_MEAN_STRIDE = 2  # of the screened instants every second one makes up the p-me
 # bounded, not computed.
 NEGLIGIBLE_DIRECTION_SHARE = 1e-4
 NEGLIGIBLE_COLUMNS_SHARE = 1e-13  # relative square below which a combination of columns is none
-MAP_ERROR_SHARE = 1e-3  # of the largest length, the error of a map of all points
+MAP_ERROR_SHARE = 1e-3  # of the largest length, a map's error; with 0 it takes three times as long
 COARSE_INSTANTS = 200  # at most, at which all points are looked at first
 BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
 # Of one block, so that it stays in the cache.

@@ -7,7 +7,7 @@ count as they are, and so does what a basis without constraint modes misses of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,10 +15,9 @@ import numpy as np
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
-from dolfinopt.dynamics.simulation import simulate_all
+from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
@@ -148,7 +147,7 @@ class _Comparison:
         x_phys: Mapping[int, np.ndarray],
         profile: Profile,
     ):
-        self.partition, self.arms, self.profile = partition, arms, profile
+        self.partition, self.profile = partition, profile
         self.method = scene.reduction.method
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
         with together(partition.world):
@@ -172,19 +171,25 @@ class _Comparison:
             motions = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do
-        with together(self.partition.world):
-            both = {k: np.concatenate([b.V, self.bases[k].V], axis=2) for k, b in bases.items()}
-            mine = {k: self.arms[k].elastic.energy_matrix(V) for k, V in both.items()}
-        energy = gather_arms(self.partition, mine)
-        return on_root(self.partition.world, _largest, self.scenes, motions, self.motions, energy)
+        energy = gather_arms(self.partition, self.reductions.energies(bases, self.bases))
+
+        def largest() -> float:
+            pairs = zip(motions, self.motions, strict=True)
+            return max(_distance(self.scenes[0], *pair, energy) for pair in pairs)
+
+        return on_root(self.partition.world, largest)
 
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
-        owned = gather_arms(self.partition, self.reductions.bodies(bases))
-        kept: list[Trajectory] = []
-        on_root(
-            self.partition.world, lambda: kept.extend(_simulate(self.scenes, owned, self.profile))
-        )
+        owned = self.reductions.bodies(bases)
+        (scene, *others), kept = self.scenes, list[Trajectory]()
+
+        def move() -> None:
+            kept.append(simulate(scene, chain_of(scene, owned), self.profile))
+            for one in others:
+                kept.append(simulate(one, bodies_in(scene, one, owned), self.profile))
+
+        on_root(self.partition.world, move)
         return kept
 
 
@@ -196,35 +201,13 @@ def _timed(scene: Scene) -> Scene:
     return scene.model_copy(update={"simulation": simulation})
 
 
-def _simulate(
-    scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals], profile: Profile
-) -> list[Trajectory]:
-    """Simulate a scene and its scenarios."""
-    scene, *others = scenes
-    bodies = [chain_of(scene, owned), *(bodies_in(scene, other, owned) for other in others)]
-    found = []
-    for one in simulate_all(scenes, bodies, profile):
-        if isinstance(one, ConvergenceError):
-            raise one
-        found.append(one)
-    return found
-
-
-def _largest(
-    scenes: Sequence[Scene],
-    few: Sequence[Trajectory],
-    many: Sequence[Trajectory],
-    energy: Mapping[int, np.ndarray],
-) -> float:
-    """Return the error of the worst scenario."""
-    # energy: of every design V' K V of both bases, one behind the other.
-    return max(_distance(scenes[0], *pair, energy) for pair in zip(few, many, strict=True))
-
-
 def _distance(
     scene: Scene, few: Trajectory, many: Trajectory, energy: Mapping[int, np.ndarray]
 ) -> float:
-    """Return max_t |u_few - u_many| / max_t |u_many| of the worst arm, |u|^2 = u' K u."""
+    """Return max_t |u_few - u_many| / max_t |u_many| of the worst arm, |u|^2 = u' K u.
+
+    By the energies V' K V of both bases, one behind the other.
+    """
     errors, sizes = [], []
     t = max(few.t, many.t, key=len)  # the faster of the two motions may be looked at more closely
     few, many = few.at(t), many.at(t)

@@ -9,8 +9,10 @@ from collections.abc import Mapping
 from sys import maxsize
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
-from dolfinopt.parallel import Partition, together
+from dolfinopt.parallel import Partition, gather_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis
 from dolfinopt.scene.load import Scene
@@ -56,7 +58,7 @@ class Reductions:
             }
 
     def bodies(self, bases: Mapping[int, Basis]) -> dict[int, ShapeIntegrals]:
-        """Return this rank's bodies with these bases (collective)."""
+        """Return the bodies of all arms with these bases, on the root (collective)."""
         found = {}
         with together(self.partition.world):
             for k, basis in bases.items():
@@ -64,7 +66,17 @@ class Reductions:
                 if arm.stiffened:
                     loads = arm.current.unit_loads.with_modes(basis.V, basis.MV)
                 found[k] = shape_integrals(arm.elastic, basis, self._damping, loads)
-        return found
+        return gather_arms(self.partition, found)
+
+    def energies(
+        self, bases: Mapping[int, Basis], others: Mapping[int, Basis]
+    ) -> dict[int, np.ndarray]:
+        """Return V' K V of the modes V of two bases, one behind the other (collective)."""
+        with together(self.partition.world):
+            return {
+                k: self.arms[k].elastic.energy_matrix(np.concatenate([a.V, others[k].V], axis=2))
+                for k, a in bases.items()
+            }
 
 
 def _leading(basis: Basis, count: int) -> Basis:

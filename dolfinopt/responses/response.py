@@ -146,6 +146,17 @@ class Response(ABC):
         Or by other variables of the designs, as `Analysis.by` says.
         """
 
+    def once(self, analysis: Analysis, find: Callable[[], Mapping[int, T]]) -> dict[int, T]:
+        """Return what is found of this rank's designs, once for value and gradient (collective)."""
+        states, trajectory = analysis.designs, analysis.trajectory
+        known = [one.kept.get(self.name) for one in states.values()]
+        hit = all(one is not None and one[0] is trajectory for one in known)
+        # The root, which has an arm and the trajectory, speaks for all: they work in step.
+        if not analysis.partition.world.bcast(hit, root=0):
+            for k, found in find().items():
+                states[k].kept[self.name] = trajectory, found
+        return {k: one.kept[self.name][1] for k, one in states.items()}
+
     def smooth_limits(
         self, analysis: Analysis, measured: Measured, limits: np.ndarray
     ) -> np.ndarray:
@@ -301,7 +312,7 @@ def factors(scene: Scene, other: Scene, index: int) -> Factors:
     thicker = other.arms[index].thickness / scene.arms[index].thickness
     return Factors(
         thicker * there.density / here.density,
-        thicker * there.young_modulus / here.young_modulus,
+        thicker * there.modulus / here.modulus,
         other.damping.stiffness_proportional,
     )
 

@@ -13,17 +13,12 @@ from functools import partial
 import numpy as np
 
 from dolfinopt.arms.design_state import DesignState
-from dolfinopt.arms.modes import LoadedModes, RigidIntegrals
+from dolfinopt.arms.modes import LoadedModes
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.geometric_stiffness import GeometricGradient
 from dolfinopt.fem.stress import DisplacementGradient
-from dolfinopt.multibody.shape_integrals import (
-    ShapeIntegrals,
-    by_modal_loads,
-    mass_partners,
-    rigid_body,
-)
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, by_modal_loads, mass_partners
 from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
 from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
 from dolfinopt.responses.products import By, Pair, Products, by_design
@@ -214,7 +209,7 @@ class PeriodGradient:
     Attributes:
         own: (n_cells,) by its own physical densities, or by other variables of its design, what
             it carries held.
-        carried: (3, 3) by the matrix of what it carries.
+        carried: (b, b) by the matrix of what it carries.
     """
 
     own: np.ndarray
@@ -237,18 +232,13 @@ def period_gradient(
         return PeriodGradient(own, carried)
 
 
-def rigid_gradient(
-    state: DesignState, by_rigid: RigidIntegrals | ShapeIntegrals, by: By = by_design
-) -> np.ndarray:
+def rigid_gradient(state: DesignState, by_rigid: ShapeIntegrals, by: By = by_design) -> np.ndarray:
     """Return the derivative by x_phys of a function of one arm's rigid integrals (n_cells,).
 
     Or by other variables of the design, see `Products`.
     """
-    points, integrals = state.elastic.points, by_rigid
-    if isinstance(integrals, RigidIntegrals):
-        moment = np.array([integrals.moment.real, integrals.moment.imag])
-        integrals = rigid_body(integrals.mass, moment, integrals.inertia, np.zeros(2))
-    partners = mass_partners(points, np.empty((*points.shape, 0)), integrals)
+    points = state.elastic.points
+    partners = mass_partners(points, np.empty((*points.shape, 0)), by_rigid)
     mass = partners.left, partners.right
     return by(state, Products(mass=(mass,), places=partners.by_points))
 

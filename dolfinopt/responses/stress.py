@@ -140,7 +140,7 @@ class CellStress(PointStress):
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to the design, see `PointStress`."""
         x = state.share
-        by_stress = state.solid.young_modulus * self.root[:, None] * by
+        by_stress = state.solid.modulus * self.root[:, None] * by
         operator = state.elastic.substructure.stress_operator
         by_u = self.fields.stress_transposed(operator, by_stress)
         centre = element_centre(state.elastic.operators.cell)
@@ -163,7 +163,7 @@ def cell_stress(state: DesignState, fields: LoadFields, margin: float = 0.0) -> 
         if margin > 0.0:
             weights[substructure.interface_distance < margin] = 0.0
         A = fields.stress(substructure.stress_operator)
-        A *= (state.solid.young_modulus * root * (weights > 0.0))[:, None]
+        A *= (state.solid.modulus * root * (weights > 0.0))[:, None]
         return CellStress(fields, A, weights, root)
 
 
@@ -308,7 +308,7 @@ def _scale(scene: Scene, other: Scene, place: int, body: ShapeIntegrals) -> np.n
     scale[q:] = f.mass / f.stiffness
     outboard = q + counts.frame
     scale[outboard : outboard + counts.outboard] = 1.0 / f.stiffness
-    young = other.material_of(owner).young_modulus / scene.material_of(owner).young_modulus
+    young = other.material_of(owner).modulus / scene.material_of(owner).modulus
     return young * scale
 
 
@@ -342,28 +342,28 @@ class Stress(Response):
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return largest stress and p-mean over all arms and scenarios (collective)."""
-        found = self._found(analysis)
-        return Measured(self.name, ("",), (found.largest,), (found.smooth,))
+        found = next(iter(self._found(analysis).values()), None)
+        sums: _Sums = analysis.partition.world.bcast(found and found.sums, root=0)
+        return Measured(self.name, ("",), (sums.largest,), (sums.smooth,))
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of the p-mean, see `objective.gradient` (collective)."""
         found, p = self._found(analysis), self.options.stress_exponent
         partition, parts = analysis.partition, {}
         with together(partition.world):
-            for k, chosen in found.chosen.items():
-                state = analysis.designs[k]
-                parts[k] = _gradient_of_arm(partition, found, chosen, state, found.cells[k], p)
+            for k, one in found.items():
+                parts[k] = _gradient_of_arm(one, analysis.designs[k], p)
         if self.options.gradient == "esl":
             with together(partition.world):
                 row = {}
                 for k, one in parts.items():
-                    row[k] = _esl_gradient(one, analysis.designs[k], found.cells[k], analysis.by)
+                    row[k] = _esl_gradient(one, analysis.designs[k], found[k].cells, analysis.by)
                 return [row]
         through = {}
         with together(partition.world), analysis.profile.phase("gradient"):
             for k, one in parts.items():
                 if len(one.a):
-                    through[k] = found.cells[k].fields.gradient(one.a, one.by_u)
+                    through[k] = found[k].cells.fields.gradient(one.a, one.by_u)
         mine = {k: parts[k].by_loads(each.by_a) for k, each in through.items()}
         by_body = bodies_by_loads(analysis, mine)
         with together(partition.world):
@@ -384,22 +384,11 @@ class Stress(Response):
         """
         return cell_stress(state, fields, self.options.stress_margin)
 
-    def _found(self, analysis: Analysis) -> _Found:
-        """Return what is known of the design, once for value and gradient (collective)."""
-        first: DesignState | None = next(iter(analysis.designs.values()), None)
-        kept: _Found | None = None if first is None else first.kept.get(self.name)
-        # The root, which has an arm and the trajectory, speaks for all: they work in step.
-        known = kept is not None and kept.trajectory is analysis.trajectory
-        numbers = None if kept is None or not known else kept.numbers
-        numbers = analysis.partition.world.bcast(numbers, root=0)
-        if numbers is not None:
-            return kept or _Found(analysis.trajectory, {}, {}, *numbers)
-        found = self._evaluate(analysis)
-        if first is not None:
-            first.kept[self.name] = found
-        return found
+    def _found(self, analysis: Analysis) -> dict[int, _Found]:
+        """Return what is known of this rank's designs (collective)."""
+        return self.once(analysis, lambda: self._evaluate(analysis))
 
-    def _evaluate(self, analysis: Analysis) -> _Found:
+    def _evaluate(self, analysis: Analysis) -> dict[int, _Found]:
         """Screen all motions for the largest stress, and sum powers (collective)."""
         partition, trajectory = analysis.partition, analysis.trajectory
         p = self.options.stress_exponent
@@ -440,7 +429,8 @@ class Stress(Response):
         total = sum(on_all_ranks(partition, sums).values())
         weight = sum(on_all_ranks(partition, weights).values())
         smooth = largest * (total / weight) ** (1.0 / p) if total else 0.0
-        return _Found(trajectory, cells, chosen, largest, smooth, total, weight)
+        found = _Sums(largest, smooth, total, weight)
+        return {k: _Found(one, chosen[k], found) for k, one in cells.items()}
 
 
 def _screened(
@@ -477,23 +467,24 @@ class _Chosen:
         return _Chosen(self.loads, self.instants[kept], self.values[kept], self.count)
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """What is known of one design; numbers are the same on all ranks."""
+@dataclass(frozen=True)
+class _Sums:
+    """What is known of all designs together."""
 
-    trajectory: Trajectory | None  # of it, on the root
-    cells: Mapping[int, PointStress]  # of this rank's arms
-    chosen: Mapping[int, Sequence[_Chosen]]  # of this rank's arms
     largest: float  # Pa
     smooth: float  # Pa
     # (total / weight)^(1/p) is smooth / largest
     total: float
     weight: float
 
-    @property
-    def numbers(self) -> tuple[float, float, float, float]:
-        """What is the same on all ranks."""
-        return self.largest, self.smooth, self.total, self.weight
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What is known of one design."""
+
+    cells: PointStress
+    chosen: Sequence[_Chosen]
+    sums: _Sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -515,29 +506,23 @@ class _ArmGradient:
         ]
 
 
-def _gradient_of_arm(
-    partition: Partition,
-    found: _Found,
-    chosen: Sequence[_Chosen],
-    state: DesignState,
-    cells: PointStress,
-    p: float,
-) -> _ArmGradient:
+def _gradient_of_arm(found: _Found, state: DesignState, p: float) -> _ArmGradient:
     """Differentiate by what one arm's stress is made of (collective on the arm's ranks)."""
+    cells, chosen, sums = found.cells, found.chosen, found.sums
     a = np.concatenate([one.a for one in chosen])
     by_logs, by_weights = np.zeros((2, len(cells.weights)))
     with state.elastic.profile.phase("stress"):
-        if found.total:
-            factor = float(found.total ** (1.0 / p - 1.0) * found.weight ** (-1.0 / p))
+        if sums.total:
+            factor = float(sums.total ** (1.0 / p - 1.0) * sums.weight ** (-1.0 / p))
             columns = a @ cells.fields.to_columns
-            by, by_logs = cells.power_sum_gradient(columns, found.largest, p)
+            by, by_logs = cells.power_sum_gradient(columns, sums.largest, p)
             by *= factor
             by_logs *= factor
             # Of total / weight, to the power 1 / p: a point's part in either is its weight times a
             # sum.
             counts = cells.weights > 0.0
             np.divide(by_logs, cells.weights, out=by_weights, where=counts)
-            by_weights -= found.smooth / found.weight * sum(one.count for one in chosen)
+            by_weights -= sums.smooth / sums.weight * sum(one.count for one in chosen)
             by_weights *= counts / p
         else:
             by = np.zeros((*cells.A.shape[:2], len(a)))
@@ -692,8 +677,8 @@ def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np
             break
         instants = wider
     by_point, when = np.full(count, -1.0), np.zeros(count, dtype=int)
-    for first in range(0, len(instants), CHUNK_INSTANTS):
-        part = instants[first : first + CHUNK_INSTANTS]
+    for run in _runs(len(instants)):
+        part = instants[run]
         for start in range(0, count, CHUNK_POINTS):
             here = slice(start, start + CHUNK_POINTS)
             squares = _squares(few.B[:, here], few.y[part])
@@ -783,8 +768,7 @@ def _norms(comm: MPI.Comm, A: np.ndarray) -> np.ndarray:
 def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return max_e |A_e a_n| (n,) (collective)."""
     out = np.zeros(len(a))
-    for first in range(0, len(a), CHUNK_INSTANTS):
-        part = slice(first, first + CHUNK_INSTANTS)
+    for part in _runs(len(a)):
         for start in range(0, A.shape[1], CHUNK_POINTS):
             squares = _squares(A[:, start : start + CHUNK_POINTS], a[part])
             np.maximum(out[part], squares.max(axis=0), out=out[part])

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.profiling import Profile
+    from dolfinopt.scene.load import Scene
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ def stress_report(
 ) -> dict[int, ArmStress]:
     """Return the stress of every arm with a design, by its place in the chain (collective).
 
-    Not counted: nothing depends on it.
+    Of materials of which von Mises's stress tells whether they yield. Not counted: nothing depends
+    on it.
 
     Args:
         partition: which ranks do which arm.
@@ -105,6 +107,8 @@ def stress_report(
     values: dict[int, np.ndarray] = {}
     with profile.phase("stress"), together(partition.world):
         for k, arm in arms.items():
+            if not arm.solid.law.has_strength:
+                continue
             state = arm.current
             fields = state.load_fields_of(every_instant(by_owner[k]))
             cells = cell_stress(state, fields, arm.scene.objective.stress_margin)
@@ -156,7 +160,7 @@ def _arm_stress(
     points = stress_points(operators.cell)
     operator = stress_operator(operators, points)
     A = cells.fields.stress(operator)
-    solid = state.solid.young_modulus * cells.root * (cells.weights > 0.0)
+    solid = state.solid.modulus * cells.root * (cells.weights > 0.0)
     A *= np.repeat(solid, len(points))[:, None]
     largest = screen(comm, A, a, coarse)
     places = places_of(operators, points).reshape(-1, state.mesh.dim)
@@ -169,3 +173,9 @@ def _shared(partition: Partition, places: np.ndarray, point: int) -> np.ndarray:
     """Return the place of a point that one rank of the arm knows, on all of them."""
     known = partition.comm.allgather(places[point] if point >= 0 else None)
     return next(one for one in known if one is not None)
+
+
+def unjudged(scene: Scene) -> list[str]:
+    """Return a sentence on the arms whose stress is not told."""
+    names = ", ".join(scene.without_strength)
+    return [f"no stress is told of {names}: no strength criterion is known"] if names else []

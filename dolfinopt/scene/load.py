@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, get_origin
@@ -37,7 +37,6 @@ from dolfinopt.scene.messages import (
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
 from dolfinopt.scene.tables.arms import (
     GEAR_KEYS,
-    MATERIAL_VALUES,
     MAX_ARMS,
     MAX_CELLS,
     MESH_KEYS,
@@ -61,6 +60,7 @@ from dolfinopt.scene.tables.closures import (
 )
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.machine import Force, Joint
+from dolfinopt.scene.tables.material import material_keys
 from dolfinopt.scene.tables.motion import Motion, Reduction
 from dolfinopt.scene.tables.objective import Objective, WorstBy
 from dolfinopt.scene.tables.responses import DECLARED, current_key, read_old_names
@@ -393,14 +393,16 @@ def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
     return inherited
 
 
-def _replaced(arm: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _replaced(arm: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Yield the keys that what an arm states takes the place of."""
     if "cells" in arm:
         yield MESH_KEYS
     if "mesh" in arm:
         yield OF_OTHER_MESHES
     if "material" in arm:
-        yield MATERIAL_VALUES
+        yield material_keys()
+    if "kind" in arm:
+        yield ["material", *material_keys()]
     if "pattern" in arm:
         yield PATTERN_KEYS
     if "gear_stiffness" in arm:
@@ -450,7 +452,7 @@ def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
 def _drop_values(tree: dict[str, Any], loc: Loc) -> None:
     """Let the name of a material at `loc` take the place of the values stated so far."""
     table = tree["arms"][loc[1]] if loc[0] == "arms" else tree["material"]
-    for key in MATERIAL_VALUES if isinstance(table, dict) else ():
+    for key in material_keys() if isinstance(table, dict) else ():
         table.pop(key, None)
 
 

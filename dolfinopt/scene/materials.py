@@ -10,30 +10,35 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class CatalogueMaterial(NamedTuple):
     """One material and where its values are from.
 
     Attributes:
-        young_modulus: Pa.
-        poisson_ratio: dimensionless.
+        young_modulus: Pa; of an orthotropic material E1 and E2.
+        poisson_ratio: dimensionless; nu12.
         density: kg/m3.
-        yield_strength: Pa.
+        yield_strength: Pa; None where no single stress tells it.
         source: standards and data sheets.
+        shear_modulus: G12 of an orthotropic material, Pa.
+        kind: of its law.
     """
 
-    young_modulus: float
+    young_modulus: float | tuple[float, float]
     poisson_ratio: float
     density: float
-    yield_strength: float
+    yield_strength: float | None
     source: str
+    shear_modulus: float | None = None
+    kind: str = "isotropic"
 
     @property
-    def values(self) -> dict[str, float]:
+    def values(self) -> dict[str, Any]:
         """The keys of [material] and their values."""
-        return {key: value for key, value in self._asdict().items() if key != "source"}
+        known = self._asdict().items()
+        return {key: value for key, value in known if key != "source" and value is not None}
 
 
 _ASM2 = "ASM Handbook vol. 2 (1990)"
@@ -94,6 +99,15 @@ CATALOGUE: Mapping[str, CatalogueMaterial] = {
         294e6,
         "T300/5208 in Tsai & Hahn, Introduction to Composite Materials (1980), [0/+-45/90] by "
         "laminate theory; in place of yield the first crack across fibres",
+    ),
+    "CFRP unidirectional": CatalogueMaterial(
+        (181e9, 10.3e9),
+        0.28,
+        1600.0,
+        None,
+        "T300/5208 in Tsai & Hahn, Introduction to Composite Materials (1980)",
+        7.17e9,
+        "orthotropic",
     ),
 }
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.schema import Scene
-from dolfinopt.scene.tables.arms import Arm, Material, check_arm_name, check_material
+from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import (
     Loc,
     Refusal,
@@ -25,6 +25,7 @@ from dolfinopt.scene.tables.base import (
     without_none,
 )
 from dolfinopt.scene.tables.closures import as_written
+from dolfinopt.scene.tables.material import Material, check_material
 from dolfinopt.scene.tables.responses import need_of
 
 _COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
@@ -333,9 +334,10 @@ def _materials(scene: Scene) -> list[str]:
         ):
             value = getattr(solid, key)
             where = f"arms.{arm.name}" if getattr(arm, key) is not None else "material"
-            if not low <= value <= high:
+            values = value if isinstance(value, tuple) else (value,)
+            for one in (one for one in values if not low <= one <= high):
                 found[
-                    f"{where}.{key} = {value:g} {unit} is outside the range of structural "
+                    f"{where}.{key} = {one:g} {unit} is outside the range of structural "
                     f"materials, {low:g} to {high:g} {unit}; check the unit"
                 ] = None
     return list(found)

@@ -19,13 +19,14 @@ from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.tables.arms import MATERIAL_VALUES, Arm, Material
+from dolfinopt.scene.tables.arms import Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
 from dolfinopt.scene.tables.closures import Closures, closing_site
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
 from dolfinopt.scene.tables.joints import interface_number
 from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
+from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
 
@@ -208,6 +209,16 @@ class Scene(Table):
         return (*plane, "thickness") if self.is_spatial else plane
 
     @property
+    def scaling_keys(self) -> tuple[str, ...]:
+        """Keys of material and arms that only scale the integrals of reduced arms.
+
+        The thickness in the plane alone: in space it is one of the cells' sides.
+        """
+        scales = all(self.material_of(k).law.scales for k in self.cell_counts)
+        young = ("young_modulus",) if scales else ()
+        return (*young, "density", *(() if self.is_spatial else ("thickness",)))
+
+    @property
     def movable(self) -> tuple[Joint, ...]:
         """Joints in space that have a coordinate, in their order."""
         return tuple(joint for joint in self.joints if joint.moves)
@@ -300,13 +311,24 @@ class Scene(Table):
         return slice(first, first + len(self.driven))
 
     def material_of(self, index: int) -> Material:
-        """Return the material of arm number `index`: its own values, or else the scene's."""
+        """Return the material of arm number `index`: its own values, or else the scene's.
+
+        An arm of another kind states all values itself.
+        """
         arm, solid = self.arms[index], self.material
+        own = {key: getattr(arm, key) for key in material_keys()}
         if arm.material is not None:
             solid = Material(name=arm.material, **CATALOGUE[arm.material].values)
-        own = {key: getattr(arm, key) for key in MATERIAL_VALUES}
+        elif own["kind"] not in (None, solid.kind):
+            solid = Material.model_construct(**dict.fromkeys(own))
         given = {key: value for key, value in own.items() if value is not None}
         return solid.model_copy(update=given)
+
+    @property
+    def without_strength(self) -> dict[str, str]:
+        """Kind of material by the names of the arms of which no stress tells when they yield."""
+        kinds = {self.arms[k].name: self.material_of(k).law for k in self.cell_counts}
+        return {name: law.kind for name, law in kinds.items() if not law.has_strength}
 
     def to_dict(self) -> dict[str, Any]:
         """Return all resolved values as JSON-able data, from which `scene_from_dict` restores."""

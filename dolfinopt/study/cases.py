@@ -6,9 +6,7 @@ the case is done. Every case runs on one rank alone: its bits do not depend on h
 The ranks are the pool: each takes the next job whose design is there, by creating the job's file in
 a folder of this run (`_Place`). Progress is read from the files that appear.
 
-All that a run lacks of one design with one basis is simulated at once. Such a batch shares its
-steps, which each of its cases depends on within the tolerance; its folders are put in place when
-all of them are written, so that an interrupted batch is computed anew as a whole.
+A folder is put in place when all of it is written.
 """
 
 from __future__ import annotations
@@ -24,7 +22,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
@@ -46,7 +43,7 @@ from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.output.summary import versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.evaluation import Evaluation, evaluate_batch
+from dolfinopt.responses.evaluation import evaluate
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import bodies_in
@@ -61,8 +58,6 @@ SCENARIO = frozenset(
     "motion control closures payload forces damping reduction simulation objective constraints "
     "optimizer scenarios".split()
 )
-# Bases that do not depend on `SCALING`: Krylov's shifts and the Gramian's band are frequencies.
-SCALABLE = ("craig-bampton", "modal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,22 +101,6 @@ class Case:
             return self.key
         free = frozenset() if self.action == "sample" else SCENARIO  # samples are of one scene
         return _digest([self.action, scene_content(self.scene, free), self.design_key])
-
-    @cached_property
-    def batch_key(self) -> str:
-        """Equal where cases are done at once: simulations of the same arms and basis."""
-        scene = self.scene
-        if self.action != "simulate" or scene.reduction.coordinates == "auto":  # each its own
-            return self.key
-        # The balanced reduction's Gramian knows the damping.
-        fixed = {"reduction", "damping"} if scene.reduction.method == "balanced" else {"reduction"}
-        kept = scene_content(scene, SCENARIO - fixed)
-        motion_alone = scene.objective.needs("motion") and not scene.constraints.limits
-        if motion_alone and scene.reduction.method in SCALABLE:
-            for row in (kept["material"], *kept["arms"]):
-                for key in set(SCALING) - set(scene.arm_sizes):
-                    row.pop(key, None)
-        return _digest([kept, self.design_key])
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Case) and self.key == other.key
@@ -223,9 +202,6 @@ def _digest(content: Any) -> str:
 # -- simulating them -------------------------------------------------------------------------
 
 
-# These values of material and arms scale the integrals of the reduced arms; the thickness in the
-# plane alone: in space it is one of the cells' sides.
-SCALING = ("young_modulus", "density", "thickness")
 APART = (
     "motion",
     "payload",
@@ -239,38 +215,25 @@ def simulate_scenarios(
 ) -> Iterator[RankResult | ConvergenceError]:
     """Simulate one design in many scenes, on this rank alone; of one that fails yield its error.
 
-    Arms are meshed, assembled and factorised once; neighbours with the same basis share it and are
-    simulated in one batch, whose time and counts the first of them bears. Scenes differ in
-    `cases.SCENARIO` alone, neighbours also in what `Case.batch_key` allows. No design.npz is the
-    initial design; InputError where one does not fit the arms.
+    Arms are meshed, assembled and factorised once; neighbours share the basis as long as it is the
+    same. Scenes differ in `cases.SCENARIO` alone. No design.npz is the initial design; InputError
+    where one does not fit the arms.
     """
     profile = Profile()
     partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
-    for _, neighbours in groupby(enumerate(scenes), key=lambda numbered: _basis(*numbered)):
-        batch = [scene for _, scene in neighbours]
-        arms = {k: arm.under(batch[0]) for k, arm in arms.items()}
-        every: Sequence[tuple[Evaluation, Trajectory | None] | ConvergenceError]
-        choice = None
+    for scene in scenes:
+        arms = {k: arm.under(scene) for k, arm in arms.items()}
+        place = scene, partition, arms, x_phys
         try:
-            choice = choose_coordinates(batch[0], partition, arms, x_phys, profile)
-            every = evaluate_batch(batch, partition, arms, x_phys, profile)
+            choice = choose_coordinates(*place, profile)
+            found: RankResult | ConvergenceError = simulation_result(
+                *place, *evaluate(*place, profile), profile, choice
+            )
         except ConvergenceError as error:
-            every = [error] * len(batch)
-        for scene, found in zip(batch, every, strict=True):
-            if isinstance(found, ConvergenceError):
-                yield found
-            else:
-                yield simulation_result(scene, partition, arms, x_phys, *found, profile, choice)
-            profile.seconds.clear()  # the account of the next scene; the arms know the profile
-            profile.counts = Counts()
-
-
-def _basis(number: int, scene: Scene) -> Any:
-    """Return what is equal for scenes with one basis; each has its own where it is chosen."""
-    reduction = scene.reduction
-    if reduction.coordinates == "auto":
-        return number
-    return reduction, scene.damping if reduction.method == "balanced" else None
+            found = error
+        yield found
+        profile.seconds.clear()  # the account of the next scene; the arms know the profile
+        profile.counts = Counts()
 
 
 # -- samples ---------------------------------------------------------------------------------
@@ -278,7 +241,7 @@ def _basis(number: int, scene: Scene) -> Any:
 
 def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    scaling = set(SCALING) - set(scene.arm_sizes)
+    scaling = scene.scaling_keys
     parts = [key.split(".") for key in keys]
     return all(
         one[0] in APART or (one[0] in ("material", "arms") and one[-1] in scaling) for one in parts
@@ -324,8 +287,7 @@ IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
 FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
 
-# Cases of the same arms and design, which one rank does in one go: batches, each done at once.
-Job = Sequence[Sequence[Case]]
+Job = Sequence[Case]  # of the same arms and design, which one rank builds once
 
 
 @dataclass(frozen=True)
@@ -422,15 +384,11 @@ def _is_complete(folder: Path) -> bool:
 def _jobs(missing: Iterable[Case], ranks: int) -> list[Job]:
     """Return the jobs, optimisations first, as others wait for them."""
     # All of the same arms and design is one job for each rank, which builds these once.
-    batches: dict[str, list[Case]] = {}
-    for case in missing:
-        batches.setdefault(case.batch_key, []).append(case)
-    groups: dict[str, list[list[Case]]] = {}
-    for batch in batches.values():
-        batch.sort(key=lambda case: case.key)  # whatever the order in which they were asked for
-        groups.setdefault(batch[0].arms_key, []).append(batch)
+    groups: dict[str, list[Case]] = {}
+    for case in sorted(missing, key=lambda case: case.key):  # however they were asked for
+        groups.setdefault(case.arms_key, []).append(case)
     jobs = [group[k::ranks] for group in groups.values() for k in range(min(ranks, len(group)))]
-    return sorted(jobs, key=lambda job: job[0][0].action != "optimize")
+    return sorted(jobs, key=lambda job: job[0].action != "optimize")
 
 
 def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
@@ -439,13 +397,13 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
     try:
         while left:
             place.check()
-            job = next((one for one in left if _is_ready(one[0][0], place)), None)
+            job = next((one for one in left if _is_ready(one[0], place)), None)
             if job is None:
                 time.sleep(IDLE)
                 continue
             left.remove(job)
             try:
-                (place.work / f"{job[0][0].key}.taken").touch(exist_ok=False)
+                (place.work / f"{job[0].key}.taken").touch(exist_ok=False)
             except FileExistsError:  # by another rank
                 continue
             _do(job, place)
@@ -469,18 +427,17 @@ def _is_ready(case: Case, place: _Place) -> bool:
 
 def _do(job: Job, place: _Place) -> None:
     """Do a job; without their design its cases fail."""
-    cases = [case for batch in job for case in batch]
-    action, design = cases[0].action, cases[0].design
+    action, design = job[0].action, job[0].design
     if isinstance(design, Case):
         if failed := place.failure(design):
-            for case in cases:
+            for case in job:
                 place.fail(case, f"{design.label or design.key}: {failed['message']}")
             return
         design = place[design] / "design.npz"
     if action == "optimize":
-        _optimise(cases[0], place)
+        _optimise(job[0], place)
     elif action == "sample":
-        _sample(cases, design, place)
+        _sample(job, design, place)
     else:
         _simulate(job, design, place)
 
@@ -509,22 +466,19 @@ def _optimise(case: Case, place: _Place) -> None:
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
-    found = simulate_scenarios([_unnamed(case) for batch in job for case in batch], design)
-    for batch in job:
+    found = simulate_scenarios([_unnamed(case) for case in job], design)
+    for case in job:
         place.check()
-        for case in batch:
-            begun = time.perf_counter()
-            result = next(found)
-            wall = time.perf_counter() - begun
-            part = place.work / case.key
-            if isinstance(result, ConvergenceError):
-                place.fail(case, str(result))
-            else:
-                make_folder(part)
-                write_result(part, result, wall, paraview=False)
-        for case in batch:
-            with suppress(FileNotFoundError):  # it failed
-                os.rename(place.work / case.key, place[case])
+        begun = time.perf_counter()
+        result = next(found)
+        wall = time.perf_counter() - begun
+        part = place.work / case.key
+        if isinstance(result, ConvergenceError):
+            place.fail(case, str(result))
+        else:
+            make_folder(part)
+            write_result(part, result, wall, paraview=False)
+            os.rename(part, place[case])
 
 
 def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:

@@ -417,7 +417,12 @@ def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
     """Return the design and its label; raise InputError where no member can take an arm's place."""
     if not any(owner is not None for owner in scene.owners):
         raise InputError(f"{scene.source}: sections: expected arms with a design, found none")
-    for arm in scene.arms:
+    for index, arm in enumerate(scene.arms):
+        if scene.is_spatial and arm.flexible and scene.material_of(index).angle:
+            raise InputError(
+                f"{scene.source}: arms.{arm.name}.angle: sections: expected 0 in space, found "
+                f"{scene.material_of(index).angle:.4g} rad; the fibres of a member are along it"
+            )
         if arm.flexible and arm.interfaces:
             raise InputError(
                 f"{scene.source}: arms.{arm.name}.interfaces: sections: expected one outboard "

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from types import UnionType
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
 
 import numpy as np
 import pandas as pd
@@ -534,7 +535,10 @@ def nominal_value(scene: Scene, key: str) -> object:
 
 def _range(field: FieldInfo) -> tuple[float, float]:
     """Return the least and the largest value of a key, also of one that may be left out."""
-    inner = get_args(without_none(field.annotation))[1:]
+    kind = without_none(field.annotation)
+    if get_origin(kind) in (Union, UnionType):  # of arrays, too: the range of a number
+        kind = get_args(kind)[0]
+    inner = get_args(kind)[1:]
     rules = [*field.metadata, *(rule for one in inner for rule in getattr(one, "metadata", ()))]
     lows, highs = (
         [getattr(rule, name) for rule in rules for name in names if hasattr(rule, name)]

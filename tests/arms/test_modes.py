@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy.linalg
-from bodies import changed, random_tree
+from bodies import changed, random_chain, random_tree
 from mpi4py import MPI
 from remainders import Field, arm_of, build, dense_matrices, rates, uneven, wave
 from runs import TWO_ARM
@@ -16,22 +16,12 @@ from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.modes import (
-    CarriedInertia,
-    Chain,
-    FrozenTree,
-    LoadedModes,
-    RigidIntegrals,
-    loaded_modes,
-    rigid_integrals,
-)
+from dolfinopt.arms.modes import FrozenTree, LoadedModes, loaded_modes
 from dolfinopt.fem.interface import floats
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.responses.frequency import squared_period
 from dolfinopt.responses.sensitivity import period_gradient
-
-NOTHING = RigidIntegrals(0.0, 0j, 0.0)
 
 
 def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
@@ -39,127 +29,95 @@ def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
     return field(0, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0]))
 
 
-Cloud = tuple[np.ndarray, np.ndarray]  # masses and places x + i y
-
-
-def chain_of_points(rng: np.random.Generator, arms: int) -> tuple[Chain, list[Cloud]]:
-    """Return a chain of random bodies and each one's point masses."""
-    clouds = [(rng.uniform(0.1, 1.0, 7), rng.normal(size=7) + 1j * rng.normal(size=7))
-              for _ in range(arms)]  # fmt: skip
-    bodies = [RigidIntegrals(m.sum(), complex(m @ z), float(m @ np.abs(z) ** 2)) for m, z in clouds]
-    reach = [complex(*rng.normal(size=2)) for _ in range(arms)]
-    angles = list(rng.uniform(-3.0, 3.0, arms))
-    loads = [RigidIntegrals(rng.uniform(), 0j, rng.uniform()) for _ in range(arms)]
-    return Chain(bodies, reach, angles, loads, "rigid-body"), clouds
-
-
-def direct_inertia(chain: Chain, clouds: list[Cloud], k: int) -> np.ndarray:
-    """Return the inertia (3, 3) of all that arm k carries, by velocities of all points."""
-    masses, places = [np.array([chain.loads[k].mass])], [np.zeros(1, dtype=complex)]
-    origin, turn = 0j, 1.0 + 0j
-    for j in range(k + 1, len(clouds)):
-        turn *= np.exp(1j * chain.angles[j])
-        masses.append(clouds[j][0])
-        places.append(origin + turn * clouds[j][1])
-        origin += turn * chain.outboard_points[j]
-        masses.append(np.array([chain.loads[j].mass]))
-        places.append(np.array([origin]))
-    m, z = np.concatenate(masses), np.concatenate(places)
-    velocity = np.zeros((len(m), 2, 3))
-    velocity[:, 0, 0] = velocity[:, 1, 1] = 1.0
-    velocity[:, 0, 2], velocity[:, 1, 2] = -z.imag, z.real
-    inertia = np.einsum("n,nik,nil->kl", m, velocity, velocity)
-    inertia[2, 2] += sum(load.inertia for load in chain.loads[k:])
-    return inertia
-
-
-@pytest.mark.parametrize("arms", [1, 2, 3, 4])
-@pytest.mark.parametrize("kind", ["rigid-body", "point-mass", "none"])
-def test_carried(arms: int, kind: str) -> None:
-    """Against point masses placed at the chain's random angles, to rounding."""
-    rng = np.random.default_rng(arms)
-    chain, clouds = chain_of_points(rng, arms)
-    carried = Chain(chain.bodies, chain.outboard_points, chain.angles, chain.loads, kind).carried()
-    assert len(carried) == arms
-    for k, load in enumerate(carried):
-        expected = direct_inertia(chain, clouds, k)
-        if kind == "point-mass":
-            expected = np.diag([expected[0, 0], expected[0, 0], 0.0])
-        elif kind == "none":
-            expected = np.zeros((3, 3))
-        np.testing.assert_allclose(load.matrix(), expected, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.serial
-def test_carried_inertia_of_a_frozen_tree():
+@pytest.mark.parametrize("d", [2, 3])
+def test_carried_inertia_of_a_frozen_machine(d: int) -> None:
     """What body 1 carries is what its rows feel of the others, which are held."""
     rng = np.random.default_rng(7)
-    mechanism = random_tree(rng, interfaces=2).mechanism()
-    pose = RigidMotion(*rng.normal(size=(3, 1, 4)))
-    rest = np.zeros((1, 8))
-    mass = linearise(mechanism, pose, rest, rest, rest).dense()[0, :3, 16:19]
+    machine = random_tree(rng, interfaces=2) if d == 3 else random_chain(rng, 3)
+    mechanism = machine.mechanism()
+    pose = RigidMotion(*rng.normal(size=(3, 1, mechanism.num_rigid)))
+    size, own = mechanism.num_coordinates, mechanism.slices[1]
+    rest = np.zeros((1, size))
+    rows = linearise(mechanism, pose, rest, rest, rest).dense()[0, own, 2 * size :]
     rigid = mechanism.rigid
     frozen = FrozenTree(rigid, pose, "rigid-body")
-    carried, B = frozen.carried()[1].matrix(), mechanism.bodies[1].outboard
+    carried, B = frozen.carried()[1], mechanism.bodies[1].outboard
     expected = mechanism.bodies[1].M + B.T @ carried @ B
-    assert np.abs(mass - expected).max() < 1e-12 * np.abs(mass).max()
-    # The derivative by body 4, two joints further out, whose inertia is not stretched linearly.
-    weights = rng.normal(size=(12, 12))
-    zero = [np.zeros((len(b.outboard), len(b.outboard))) for b in mechanism.bodies]
-    by = frozen.cotangents([zero[0], weights, *zero[2:]])[4]
-    for name in ("mass", "w", "W"):
-        change = 0.1 * np.asarray(getattr(rigid.bodies[4], name)) + 0.01
-        if name == "W":
-            change = 0.5 * (change + change[np.arange(9).reshape(3, 3).T.ravel()])
-        other = changed(rigid, 4, name, change)
-        after = FrozenTree(other, pose, "rigid-body").carried()[1].matrix()
-        found = np.sum(getattr(by, name) * change)
-        assert found == pytest.approx(np.sum(weights * (after - carried)), rel=1e-10)
+    assert np.abs(rows[:, own] - expected).max() < 1e-12 * np.abs(expected).max()
+    # The derivative by the last body, whose inertia is not stretched linearly.
+    last, (b,) = len(rigid.bodies) - 1, carried.shape[:1]
+    weights = rng.normal(size=(b, b))
+    zero = [np.zeros((len(one.outboard), len(one.outboard))) for one in mechanism.bodies]
+    for kind in ("rigid-body", "point-mass", "none"):
+        frozen = FrozenTree(rigid, pose, kind)
+        before = frozen.carried()[1]
+        light = {"point-mass": carried[0, 0] * np.diag(np.arange(b) % mechanism.dim.b < d)}
+        if kind != "rigid-body" and len(mechanism.sites[1]) == 1:
+            np.testing.assert_allclose(before, light.get(kind, 0.0 * carried), rtol=1e-12)
+        by = frozen.cotangents([zero[0], weights, *zero[2:]])[last]
+        for name in ("mass", "w", "W"):
+            change = 0.1 * np.asarray(getattr(rigid.bodies[last], name)) + 0.01
+            if name == "W":
+                change = 0.5 * (change + mechanism.dim.transposed(change))
+            other = changed(rigid, last, name, change)
+            after = FrozenTree(other, pose, kind).carried()[1]
+            found = np.sum(getattr(by, name) * change)
+            assert found == pytest.approx(np.sum(weights * (after - before)), rel=1e-9, abs=1e-12)
 
 
-def test_rigid_integrals_of_a_bar() -> None:
+def test_rigid_body_of_a_bar() -> None:
     """Solid, and with the outer half empty; Gmsh places nodes to 1e-12 of the length."""
-    arm = arm_of((20, 2))
+    arm = arm_of((20, 2), "interpolation.floor=1e-12")
     for share in (1.0, 0.5):
-        solid = arm.mesh.centroid[:, 0] < share
-        elastic = arm.substructure.at(np.ones(len(solid)), 2700.0 * solid)
-        found, m = rigid_integrals(elastic), 2700.0 * 0.06 * 0.01 * share
-        assert found.mass == pytest.approx(m, rel=1e-11)
-        assert found.moment == pytest.approx(0.5 * m * share, rel=1e-11)
-        assert found.inertia == pytest.approx(m * (share**2 / 3.0 + 0.06**2 / 12.0), rel=1e-11)
+        body = arm.state(np.where(arm.mesh.centroid[:, 0] < share, 1.0, 0.0)).rigid_body
+        m = 2700.0 * 0.06 * 0.01 * share
+        assert body.mass == pytest.approx(m, rel=1e-10)
+        np.testing.assert_allclose(body.w[:, 0], [0.5 * m * share, 0.0], atol=1e-10)
+        expected = m * (share**2 / 3.0 + 0.06**2 / 12.0)
+        assert body.W[0, 0, 0] == pytest.approx(expected, rel=1e-10)
+
+
+def carried_by(mass: float, x: float, y: float, inertia: float) -> np.ndarray:
+    """Return the inertia (3, 3) of a body with its centre at (x, y), about the origin."""
+    cx, cy = mass * x, mass * y
+    inertia += mass * (x * x + y * y)
+    return np.array([[mass, 0.0, -cy], [0.0, mass, cx], [-cy, cx, inertia]])
+
+
+NOTHING, BODY = np.zeros((3, 3)), carried_by(3.0, 0.4, -0.8 / 3.0, 0.8)
 
 
 @pytest.mark.parametrize(
     "carried",
-    [NOTHING, RigidIntegrals(6.0, 0j, 0.0), RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)],
+    [NOTHING, carried_by(6.0, 0.0, 0.0, 0.0), BODY],
     ids=["nothing", "point", "body"],
 )
-def test_dense_eigenproblem(carried: RigidIntegrals) -> None:
+def test_dense_eigenproblem(carried: np.ndarray) -> None:
     """Any design on a small mesh; unit modal mass, carried mass included."""
     arm = arm_of((9, 3), "arms.height=0.2")
     arm.set_design(design_of(arm))
     modes = loaded_modes(arm.elastic, carried, 5, None)
     young, density = arm.solid.young_modulus, arm.solid.density
     K, M = dense_matrices(arm.elastic, young * arm.material.stiffness, density * arm.material.mass)
-    M[-3:, -3:] += carried.matrix()
+    M[-3:, -3:] += carried
     expected = scipy.linalg.eigh(K, M, eigvals_only=True)[:5]
     # LAPACK is right to 1e-16 of the largest eigenvalue, some 1e6 times the lowest.
     np.testing.assert_allclose(modes.values, expected, rtol=1e-8)
     assert modes.frequency == pytest.approx(np.sqrt(expected[0]) / (2.0 * np.pi), rel=1e-8)
     flat = modes.field.reshape(-1, 5)
     mass = flat.T @ arm.elastic.mass_times(modes.field).reshape(-1, 5)
-    mass += modes.outboard.T @ carried.matrix() @ modes.outboard
+    mass += modes.outboard.T @ carried @ modes.outboard
     np.testing.assert_allclose(mass, np.eye(5), atol=1e-9)
 
 
 def test_an_arm_cut_in_two() -> None:
     """The same on the ranks that share an arm; of solids that float, the refinement, too."""
-    carried = RigidIntegrals(3.0, 1.2 - 0.8j, 1.5)
     values, floating = [], []
     for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
         arm = arm_of((24, 3), comm=comm)
         arm.set_design(design_of(arm))
-        values.append(loaded_modes(arm.elastic, carried, 3, None).values)
+        values.append(loaded_modes(arm.elastic, BODY, 3, None).values)
         arm = arm_of((60, 6), "interpolation.floor=1e-9", comm=comm)
         stripes = design_of(arm, lambda k, x, y: np.floor(12.0 * x) % 2.0 == 0.0)
         arm.set_design(stripes.astype(float))
@@ -186,21 +144,24 @@ def stubby() -> Arm:
     return arm
 
 
+FIRST_MOMENT = carried_by(1.0, 1.0, 0.0, -1.0) - carried_by(1.0, 0.0, 0.0, 0.0)  # 1 kg m along x
+
+
 @cache
-def coinciding() -> RigidIntegrals:
+def coinciding() -> np.ndarray:
     """Return what the stubby arm carries when its two lowest frequencies are equal."""
     # They repel each other unless two numbers are right, by Newton's method: a change dM gives the
     # pair's matrix -lambda phi' dM phi, which has to close the gap and must not mix them.
     arm, moment, inertia = stubby(), -0.15 * MASS, 2.5 + 0.15**2 * MASS
     for _ in range(20):
-        carried = RigidIntegrals(MASS, complex(moment, 0.0), inertia)
+        carried = carried_by(MASS, 0.0, 0.0, inertia) + moment * FIRST_MOMENT
         modes = loaded_modes(arm.elastic, carried, 2, None)
         (low, high), phi = modes.values, modes.outboard
         if high - low < 1e-11 * high:
             return carried
         changes = []
-        for unit in (RigidIntegrals(0.0, 1.0 + 0j, 0.0), RigidIntegrals(0.0, 0j, 1.0)):
-            pair = -high * phi.T @ unit.matrix() @ phi
+        for unit in (FIRST_MOMENT, carried_by(0.0, 0.0, 0.0, 1.0)):
+            pair = -high * phi.T @ unit @ phi
             changes.append([pair[0, 0] - pair[1, 1], 2.0 * pair[0, 1]])
         step = np.linalg.solve(np.transpose(changes), [high - low, 0.0])
         moment, inertia = moment + step[0], inertia + step[1]
@@ -208,7 +169,7 @@ def coinciding() -> RigidIntegrals:
 
 
 def slopes_at(
-    arm: Arm, carried: RigidIntegrals, exponent: float, follow: bool
+    arm: Arm, carried: np.ndarray, exponent: float, follow: bool
 ) -> tuple[Callable[[np.ndarray], LoadedModes], np.ndarray]:
     """Return the modes of a design, and the gradient of the squared period at the present one."""
     start = loaded_modes(arm.elastic, carried, 3, None).start
@@ -246,8 +207,8 @@ def test_following_a_mode_through_a_crossing() -> None:
     """Rotary inertia lowers bending below the axial mode, which it does not touch: MAC keeps it."""
     arm, seen = stubby(), []
 
-    def carried(inertia: float) -> RigidIntegrals:
-        return RigidIntegrals(MASS, 0j, inertia).shifted(-0.15 + 0j)
+    def carried(inertia: float) -> np.ndarray:
+        return carried_by(MASS, -0.15, 0.0, inertia)
 
     first = loaded_modes(arm.elastic, carried(0.5), 3, None)
     axial = int(np.argmax(np.abs(first.outboard[0]) / np.abs(first.outboard[1])))
@@ -283,13 +244,10 @@ def test_first_frequency_is_that_of_all_elements(name: str) -> None:
     index = next(iter(scene.cell_counts))
     arm = Arm(scene, index, MPI.COMM_WORLD, do.Profile())
     arm.set_design(arm.uniform(0.5))
-    nothing = NOTHING
-    if demo == "spatial_arm":
-        nothing = CarriedInertia((0.0,) * (6 * len(scene.arms[index].interface_points)) ** 2)
+    nothing = np.zeros((arm.current.elastic.rigid.shape[2],) * 2)
     expected = loaded_modes(arm.elastic, nothing, 1, None).frequency
     assert arm.current.body.first_frequency / expected - 1.0 >= excess - 1e-9
-    # Iterated until the eigenvalue changes by 1e-5; what is left is a small part of that.
-    assert arm.current.first_frequency == pytest.approx(expected, rel=1e-6)
+    assert arm.current.first_frequency == pytest.approx(expected, rel=1e-10)
 
 
 def euler_value(mass: float, inertia: float, height: float) -> float:

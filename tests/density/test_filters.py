@@ -5,11 +5,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import STATED
-from solids import link_mesh
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.density import filter as filters
 from dolfinopt.density.filter import HelmholtzFilter
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
@@ -257,15 +255,3 @@ Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
 Transfinite Curve {1, 3} = 41; Transfinite Curve {2, 4} = 5; Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
-
-
-def test_tetrahedra_are_factorised_once(monkeypatch):
-    """And give what conjugate gradients give, to the rounding of either."""
-    mesh = link_mesh("tetrahedron", (20, 4, 2))
-    x, fields = rough(np.round(mesh.centroid, 9)), []
-    for most, kind in ((filters.FACTORISED_FACETS, "preonly"), (0, "cg")):
-        monkeypatch.setattr(filters, "FACTORISED_FACETS", most)
-        smooth = HelmholtzFilter(mesh, 0.1)
-        assert smooth._scheme._solver.getType() == kind
-        fields.append(smooth.backward(smooth.forward(x)))
-    assert np.allclose(*fields, rtol=1e-11, atol=1e-14 * mesh.area.max())

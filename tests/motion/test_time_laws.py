@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from bodies import assert_close, derivative
-from mpi4py import MPI
-from remainders import built_of
 from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
 from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
-from dolfinopt.responses.evaluation import evaluate_batch
 from dolfinopt.scene.csv_table import Table, read_table
 from dolfinopt.scene.laws import Law, Limits, law_for
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
@@ -259,22 +255,6 @@ def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
     )
     check_motion(fast)
     refusal(lambda: check_motion(slow), "pick.csv: line 3, column t = 0.18")
-
-
-def test_batches_take_profiles_and_stops(tmp_path: Path) -> None:
-    """Several payloads at once, steps ending at every jump: what each of them does alone."""
-    file = tmp_path / "pick.csv"
-    file.write_text("t,x,y\n0,-0.4,0.1\n0.5,0.3,0.2\n0.7,0.3,0.2\n1.3,0.5,0.6\n")
-    motion = {"path": "points", "file": str(file), "law": "trapezoidal", "horizon": 1.5}
-    of = posed(**motion)
-    scenes = [scene_from_dict(of.to_tree(), "t", [f"payload.mass={m}"]) for m in (1.0, 3.0)]
-    built = built_of(of, MPI.COMM_SELF)
-    x = built.uniform()
-    together = evaluate_batch(scenes, built.partition, built.arms, x, built.profile)
-    for scene, both in zip(scenes, together, strict=True):
-        assert isinstance(both, tuple)
-        alone = replace(built, scene=scene).evaluate(x)[0]
-        assert_close(both[0].max_deviation, alone.max_deviation, 2e-4)
 
 
 # -- tables: what is refused, and the curves through their rows against SciPy's conditions  -------

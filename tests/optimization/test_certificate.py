@@ -6,7 +6,6 @@ Their data were not at hand: the truss here is another one, whose points of rest
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -19,10 +18,8 @@ from dolfinopt.optimization.certificate import Certificate, judge
 from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.mma import initial_state, mma_step
 from dolfinopt.optimization.problem import Problem
-from dolfinopt.parallel import Partition, sum_over_arms
 
 WORLD = MPI.COMM_WORLD
-ALONE = partial(sum_over_arms, Partition(MPI.COMM_SELF, MPI.COMM_SELF, (0,)))
 
 NO_ROWS = np.zeros(0, dtype=int)
 
@@ -80,7 +77,7 @@ class TwoBars:
         """Return that of k, by the exact gradient or another one."""
         problem = self.problem(k, self.exact(k) if gradient is None else gradient)
         bounds = np.full(2, 0.1), np.full(2, 1.9)
-        return judge(k, *bounds, problem, self.frozen(k), {0: slice(0, 2)}, ALONE)
+        return judge(k, *bounds, problem, self.frozen(k))
 
     def improved(self, k: np.ndarray, count: int) -> list[tuple[np.ndarray, Problem]]:
         """Return the designs of `count` steps with the exact gradient."""
@@ -154,11 +151,11 @@ def test_variables_at_bounds_have_no_part_in_the_angle():
     exact, frozen = np.array([1.0, 0.0, 5.0, 7.0]), np.array([1.0, 1.0, -5.0, -7.0])
     x, low, high = np.array([0.5, 0.5, 0.0, 1.0]), np.zeros(4), np.ones(4)
     problem = Problem(1.0, exact, np.zeros(0), np.zeros((0, 4)), (), NO_ROWS)
-    found = judge(x, low, high, problem, frozen, {0: slice(0, 4)}, ALONE)
+    found = judge(x, low, high, problem, frozen)
     assert found.angle == pytest.approx(45.0) and found.ratio == pytest.approx(np.sqrt(2.0))
-    held = judge(x, x, x, problem, frozen, {0: slice(0, 4)}, ALONE)
+    held = judge(x, x, x, problem, frozen)
     assert np.isnan(held.angle) and held.kkt == 0.0
-    alone = judge(x, low, high, problem, None, {0: slice(0, 4)}, ALONE)
+    alone = judge(x, low, high, problem, None)
     assert np.isnan(alone.angle) and alone.kkt == found.kkt
 
 
@@ -266,12 +263,12 @@ def test_light_payload_pays_for_frozen_loads():
 @pytest.mark.serial
 def test_the_exact_gradient_takes_over_where_frozen_loads_gain_no_more():
     """As soon as the best design gained at most 1 % in ten iterations; the better one stays."""
-    result = do.optimize(quick(LIGHT, "objective.gradient=exact", iterations=60))
+    result = do.optimize(quick(LIGHT, "objective.gradient=exact", iterations=36))
     k = result.exact_from
     best = np.minimum.accumulate([row.objective for row in result.history])
     gains = best[:-10] / best[10:] - 1.0
     assert k == 10 + int(np.argmax(gains <= 0.01)) < result.iterations
-    frozen = do.optimize(quick(LIGHT, iterations=60))
+    frozen = do.optimize(quick(LIGHT, iterations=36))
     assert [row.objective for row in result.history[: k + 1]] == [
         row.objective for row in frozen.history[: k + 1]
     ]

@@ -156,7 +156,7 @@ interior.WIDEST, loop.CHECKPOINT_SECONDS = int(sys.argv[2]), 0.0
 scene = do.load_scene(sys.argv[3], sys.argv[4:])
 
 def report(row):
-    if row.iteration == 2:
+    if row.iteration == 1:
         os.kill(os.getpid(), signal.SIGKILL)
 
 do.optimize(scene, Path(sys.argv[1]), report=report)
@@ -172,9 +172,9 @@ def test_resumes_where_it_was_killed(width, error, tmp_path, monkeypatch):
     """
     monkeypatch.setattr(interior, "WIDEST", width)
     settings = "reduction.coordinates=7"
-    scene = small(settings, iterations=4)
+    scene = small(settings, iterations=3)
     whole = do.optimize(scene)
-    keys = *SMALL, "optimizer.max_iterations=4", settings
+    keys = *SMALL, "optimizer.max_iterations=3", settings
     words = [sys.executable, "-c", KILLED, str(tmp_path), str(width), str(DEMO), *keys]
     killed = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr

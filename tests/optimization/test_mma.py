@@ -1,84 +1,31 @@
-"""The method of moving asymptotes: against mmapy, optimality, invariances, robustness.
+"""The method of moving asymptotes: against mmapy, optimality, invariances, robustness."""
 
-Problems are written for all variables; each rank of COMM_WORLD holds its piece of them.
-"""
-
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from mmapy import mmasub
-from mpi4py import MPI
 
 import dolfinopt.optimization.mma as mma
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 
-COMM = MPI.COMM_WORLD
+pytestmark = pytest.mark.serial  # ranks have no part in it
 RAA0 = 1e-5
 PENALTY = 1000.0
 
 Problem = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]  # df0dx, f, dfdx
 
 
-def mine(values):
-    """Return this rank's piece of the last axis."""
-    return np.array_split(np.asarray(values), COMM.size, axis=-1)[COMM.rank]
-
-
-def whole(piece):
-    """Return all pieces, joined, on every rank."""
-    return np.concatenate(COMM.allgather(piece))
-
-
-def of_variables(state, each):
-    """Return the state with `mine` or the `whole` of what it has of each variable."""
-    fields = ("x_old1", "x_old2", "low", "upp")
-    return replace(state, **{k: each(getattr(state, k)) for k in fields})
-
-
-def step(x, df0dx, f, dfdx, lo, hi, state, move=0.2):
-    """Take one step with all variables given, over the ranks; return all of them again."""
-    x_new, state = mma_step(
-        *(mine(x), mine(df0dx), f, mine(dfdx), mine(lo), mine(hi), of_variables(state, mine)),
-        move=move,
-        comm=COMM,
-    )
-    return whole(x_new), of_variables(state, whole)
-
-
 def iterate(problem, x, lo, hi, steps, move=0.2):
     """Return the designs (steps + 1, n) from x on, and the last state."""
     designs, state = [x], initial_state(x)
     for _ in range(steps):
-        x, state = step(x, *problem(x), lo, hi, state, move)
+        x, state = mma_step(x, *problem(x), lo, hi, state, move=move)
         designs.append(x)
     return np.array(designs), state
-
-
-class Ranks:
-    """Let threads stand for ranks: what `mma_step` asks of a communicator."""
-
-    def __init__(self, rank, slots, barrier):
-        self.rank, self.slots, self.barrier, self.size = rank, slots, barrier, len(slots)
-
-    def allgather(self, value):
-        self.slots[self.rank] = value
-        self.barrier.wait()
-        values = list(self.slots)
-        self.barrier.wait()
-        return values
-
-
-def on_threads(size, run):
-    """Return what run(communicator) returns on each of `size` threads."""
-    slots, barrier = [None] * size, threading.Barrier(size, timeout=60.0)
-    with ThreadPoolExecutor(size) as pool:
-        return list(pool.map(lambda rank: run(Ranks(rank, slots, barrier)), range(size)))
 
 
 def cantilever(x):
@@ -202,10 +149,10 @@ def largest_difference_from_mmapy(problem, x, lo, hi, steps, move=0.2):
     # 200 iterations, without a word, once in about 2000 steps.
     state, compared, of_design, of_asymptotes = initial_state(x), 0, 0.0, 0.0
     for _ in range(steps):
-        inputs = (x, *problem(x), lo, hi, state, move)
+        inputs = (x, *problem(x), lo, hi, state)
         last, before = x - state.x_old1, state.x_old1 - state.x_old2
-        x, state = step(*inputs)
-        other, low, upp, residual = mmapy_step(*inputs)
+        x, state = mma_step(*inputs, move=move)
+        other, low, upp, residual = mmapy_step(*inputs, move)
         apart = np.maximum(np.abs(low - state.low), np.abs(upp - state.upp))
         resting = (last * before != 0.0) & (np.minimum(np.abs(last), np.abs(before)) < 1e-8)
         of_asymptotes = max(of_asymptotes, apart[~resting].max(initial=0.0))
@@ -266,7 +213,7 @@ def test_steps_agree_with_mmapy(posed, bounds, steps, move, close, monkeypatch):
 def test_step_satisfies_the_optimality_conditions(seed):
     """Karush-Kuhn-Tucker in Svanberg's own form, to rounding, for whatever inputs."""
     x, df0dx, f, dfdx, lo, hi, state, move = any_step(seed)
-    y, new = step(x, df0dx, f, dfdx, lo, hi, state, move)
+    y, new = mma_step(x, df0dx, f, dfdx, lo, hi, state, move=move)
     sub = Subproblem(x, df0dx, f, dfdx, lo, hi, new, move)
     weights = np.concatenate(([1.0], new.multipliers))
     rising, falling = (weights @ part for part in sub.slopes(y))
@@ -313,53 +260,6 @@ def test_units_of_functions_do_not_matter(objective, constraints, close):
     np.testing.assert_allclose(other, plain, rtol=0.0, atol=close)
 
 
-def test_ranks_do_not_matter():
-    """The same designs from the ranks of this run and from one."""
-    n = 10_001  # several blocks of variables
-    designs, _ = iterate(two_arms(n), np.full(n, 0.4), np.full(n, 1e-3), np.ones(n), 12)
-    x = np.full(n, 0.4)
-    state = initial_state(x)
-    for expected in designs[1:]:
-        x, state = mma_step(x, *two_arms(n)(x), 1e-3, 1.0, state)
-        np.testing.assert_allclose(x, expected, rtol=0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("deal", "undivided"),
-    [
-        *((deal, True) for deal in ([[0, 1], [2]], [[2, 0], [1]], [[1], [], [2], [0]])),
-        *((deal, False) for deal in ([[0], [1, 2]], [[], [0], [1, 2]])),
-    ],
-)
-def test_pieces_do_not_matter(deal, undivided):
-    """Uneven pieces, none on some ranks; undivided ones give the same bits on any ranks."""
-    n = 500
-    places = np.split(np.arange(n), [123, 321])
-    problem, lo, hi = two_arms(n), np.full(n, 1e-3), np.ones(n)
-
-    def run(comm, deal):
-        own = np.concatenate([places[k] for k in deal[comm.rank]] or [np.empty(0, int)])
-        pieces = {k: places[k].size for k in deal[comm.rank]} if undivided else None
-        x, designs = np.full(n, 0.4), []
-        state = initial_state(x[own])
-        for _ in range(12):
-            df0dx, f, dfdx = problem(x)
-            inputs = x[own], df0dx[own], f, dfdx[:, own], lo[own], hi[own], state
-            y, state = mma_step(*inputs, comm=comm, pieces=pieces)
-            x = np.empty(n)
-            for indices, values in comm.allgather((own, y)):
-                x[indices] = values
-            designs.append(x)
-        return np.array(designs), state.multipliers
-
-    ((alone, _),) = on_threads(1, lambda comm: run(comm, [[0, 1, 2]]))
-    assert np.abs(alone[-1] - 0.4).max() > 0.1
-    results = on_threads(len(deal), lambda comm: run(comm, deal))
-    for designs, multipliers in results:
-        np.testing.assert_allclose(designs, alone, rtol=0.0, atol=0.0 if undivided else 1e-12)
-        np.testing.assert_array_equal(multipliers, results[0][1])
-
-
 def test_inputs_and_results_share_no_memory():
     n = 8
     df0dx, f, dfdx = two_arms(n)(np.full(n, 0.4))
@@ -379,9 +279,9 @@ def test_constraint_given_twice_counts_once(factor):
     df0dx, f, dfdx = problem(x)
     f[0] = 0.05 * np.abs(dfdx[0]).sum()
     args = np.zeros(x.size), np.ones(x.size), initial_state(x)
-    once, _ = step(x, df0dx, f, dfdx, *args)
+    once, _ = mma_step(x, df0dx, f, dfdx, *args)
     f, dfdx = np.append(f, factor * f[0]), np.vstack((dfdx, factor * dfdx[0]))
-    twice, state = step(x, df0dx, f, dfdx, *args)
+    twice, state = mma_step(x, df0dx, f, dfdx, *args)
     assert np.abs(once - x).max() > 0.01
     assert state.multipliers[[0, -1]].sum() > 0.0
     np.testing.assert_allclose(twice, once, atol=1e-9)
@@ -391,7 +291,7 @@ def test_nothing_to_gain_means_no_step():
     n = 7
     x = np.linspace(0.0, 1.0, n)
     still = np.zeros(n), -np.ones(1), np.ones((1, n))
-    y, _ = step(x, *still, np.zeros(n), np.ones(n), initial_state(x))
+    y, _ = mma_step(x, *still, np.zeros(n), np.ones(n), initial_state(x))
     np.testing.assert_array_equal(y, x)
 
 
@@ -421,7 +321,7 @@ def test_variables_at_rest_keep_their_asymptotes():
     noise = np.array([1e-15, -1e-15, 0.1, -0.1])
     state = MMAState(5, x - noise, x - noise - 0.1, x - 0.3, x + 0.3, np.zeros(1))
     inputs = x, np.ones(n), -np.ones(1), np.ones((1, n)), np.zeros(n), np.ones(n), state
-    _, new = step(*inputs)
+    _, new = mma_step(*inputs)
     np.testing.assert_allclose(new.upp - x, 0.3 * np.array([1.0, 1.0, 1.2, 0.7]), rtol=1e-14)
 
 
@@ -443,9 +343,9 @@ def test_warm_start_saves_evaluations(monkeypatch):
         if k == 10:
             counts.update(warm=0, cold=0)
         kind = "cold"
-        cold, _ = step(x, *two_arms(n)(x), *bounds, replace(state, multipliers=np.empty(0)))
+        cold, _ = mma_step(x, *two_arms(n)(x), *bounds, replace(state, multipliers=np.empty(0)))
         kind = "warm"
-        x, state = step(x, *two_arms(n)(x), *bounds, state)
+        x, state = mma_step(x, *two_arms(n)(x), *bounds, state)
         np.testing.assert_allclose(x, cold, atol=1e-12)
     assert counts["warm"] <= 4 * 30
     assert counts["warm"] <= 0.65 * counts["cold"]  # 92 and 151
@@ -457,78 +357,25 @@ def test_unsolved_subproblem_is_an_error(monkeypatch):
     df0dx, f, dfdx = problem(x)
     f[0] = np.abs(dfdx[0]).sum()
     with pytest.raises(ConvergenceError, match=r"constraint 0 .* reduce move"):
-        step(x, df0dx, f, dfdx, np.zeros(x.size), np.ones(x.size), initial_state(x))
-
-
-def bad_step(**changes):
-    """Take a step whose input is changed on one rank only: the error must reach all."""
-    n = 8
-    x = mine(np.full(n, 0.4))
-    df0dx, f, dfdx = two_arms(n)(np.full(n, 0.4))
-    inputs = {"x": x, "df0dx": mine(df0dx), "f": f, "dfdx": mine(dfdx)}
-    inputs |= {"xmin": np.full(x.size, 1e-3), "xmax": np.ones(x.size), "state": initial_state(x)}
-    if COMM.rank == COMM.size - 1:
-        inputs |= {name: change(inputs[name]) for name, change in changes.items()}
-    return mma_step(**inputs, comm=COMM)
-
-
-def spoilt(value):
-    def spoil(array):
-        array = array.copy()
-        array[..., -1] = value
-        return array
-
-    return spoil
-
-
-def foreign(name, spoil):
-    return {"state": lambda s: replace(s, **{name: spoil(getattr(s, name))})}
+        mma_step(x, df0dx, f, dfdx, np.zeros(x.size), np.ones(x.size), initial_state(x))
 
 
 BAD = [
-    *(({name: spoilt(value)}, rf"{name} is not finite, first at index .*{value}")
-      for name in ("x", "df0dx", "f", "dfdx", "xmin", "xmax")
-      for value in (np.nan, np.inf, -np.inf)),
-    *(({name: lambda array: array[..., :-1]}, r"\w+ has shape \(.*\), expected \(")
-      for name in ("df0dx", "f", "dfdx", "xmin", "xmax")),
-    *((foreign(name, spoil), f"state.{name} does not hold")
-      for name in ("x_old1", "x_old2", "low", "upp")
-      for spoil in (lambda v: v[:-1], lambda v: v * np.nan)),
-    ({"xmin": lambda lo: lo + 0.499}, r"x\[0\] = 0.4 is not between 0.5 and 1.0"),
+    *(({name: lambda v, to=value: v + to}, rf"{words} not finite, first at")
+      for name, words in (("x", "x"), ("f", "f"), ("df0dx", "gradients times ranges"))
+      for value in (np.nan, np.inf)),
+    ({"dfdx": lambda v: v * 1e308}, "gradients times ranges not finite"),
+    ({"xmin": lambda v: v + 0.499}, r"x\[0\] = 0.4 is not between 0.5 and 1000"),
+    ({"f": lambda v: v[:1]}, r"\(3, 8\) gradients of 1 constraints, 8 x"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("changes", "words"), BAD)
 def test_bad_input_is_named(changes, words):
+    x = np.full(8, 0.4)
+    df0dx, f, dfdx = two_arms(8)(x)
+    inputs = {"x": x, "df0dx": df0dx, "f": f, "dfdx": dfdx, "xmin": 1e-3}
+    for name, change in changes.items():
+        inputs[name] = change(inputs[name])
     with pytest.raises(ValueError, match=f"MMA: {words}"):
-        bad_step(**changes)
-
-
-def test_piece_on_two_ranks_is_an_error():
-    def run(comm):
-        x = np.full(4, 0.4)
-        with pytest.raises(ValueError, match=r"MMA: piece 7 is on another rank, too \(rank 1\)"):
-            mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), comm=comm, pieces={7: 4})
-
-    on_threads(2, run)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        *(({"move": move}, r"move is .*, expected 0 < move <= 1") for move in (0.0, 1.5, np.nan)),
-        ({"pieces": {0: 1, 1: 2}}, "pieces hold 3 variables, x 4"),
-        ({"widest": 0.1}, r"widest is 0\.1, expected at least 0\.2"),
-    ],
-)
-def test_senseless_settings_are_named(settings, words):
-    x = np.full(4, 0.4)
-    with pytest.raises(ValueError, match=words):
-        mma_step(x, *two_arms(4)(x), 1e-3, 1.0, initial_state(x), **settings)
-
-
-def test_derivative_that_overflows_is_an_error():
-    x = np.full(4, 5.0)
-    df0dx, f, dfdx = two_arms(4)(x)
-    with pytest.raises(ValueError, match="overflows"):
-        mma_step(x, df0dx * 1e308, f, dfdx, 1.0, 1e9, initial_state(x))
+        mma_step(**inputs, xmax=1e9, state=initial_state(x))

@@ -17,7 +17,7 @@ from dolfinopt.dynamics.collocation import Solution, radau_iia
 from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.shape_integrals import rigid_bar
-from dolfinopt.responses.evaluation import constraint_gradients, evaluate_batch
+from dolfinopt.responses.evaluation import constraint_gradients
 from dolfinopt.responses.motion import motion_objective
 
 WORLD = MPI.COMM_WORLD
@@ -26,28 +26,6 @@ WORLD = MPI.COMM_WORLD
 def same(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the same design on every arm."""
     return wave(0, x, y)
-
-
-@pytest.mark.serial  # the trajectories belong to one rank
-def test_stiffening_is_decided_for_every_scene_by_itself() -> None:
-    """What stands beside it in a batch does not matter, nor which of them comes first."""
-    auto, slow = "simulation.stiffening=auto", ["payload.mass=0.2", "motion.duration=2.5"]
-    asked = [[auto], [auto, *slow], ["simulation.stiffening=true"], ["simulation.stiffening=false"]]
-    built = [build(*overrides, cells=(12, 2)) for overrides in asked]
-    x_phys = built[0].fields(lambda k, x, y: np.full_like(x, 0.5))
-    alone = []
-    for one in built:
-        _, trajectory = one.evaluate(x_phys, simulated=True)
-        alone.append((trajectory.mechanism.bodies[0].is_stiffened, trajectory.max_deviation[0]))
-    assert [stiffened for stiffened, _ in alone] == [True, False, True, False]
-    for order in (slice(None), slice(None, None, -1)):
-        batch, first = [one.scene for one in built][order], built[order][0]
-        place = batch, first.partition, first.arms
-        for found, expected in zip(evaluate_batch(*place, x_phys, do.Profile()), alone[order]):
-            _, trajectory = found
-            assert trajectory.mechanism.bodies[0].is_stiffened == expected[0]
-            # Common steps: within the tolerance, a fiftieth of what stiffening changes.
-            assert trajectory.max_deviation[0] == pytest.approx(expected[1], rel=5e-4)
 
 
 SHARED = "arms.arm2.design=arm1"
@@ -175,7 +153,7 @@ def test_gradient_by_the_variables_through_a_projection(kind: str, designs: int)
     x, d, arms = built.fields(wave), built.fields(uneven), built.arms
 
     def realised(h: float, variant: int):
-        moved = {k: arm.physical_designs(x[k] + h * d[k], 4.0, 0.45) for k, arm in arms.items()}
+        moved = {k: arm.physical_designs(x[k] + h * d[k], 4.0) for k, arm in arms.items()}
         return {k: found[variant] for k, found in moved.items()}
 
     values = []
@@ -270,8 +248,6 @@ def test_densities_that_are_none_are_refused(change, words) -> None:
         x[1] = change(x[1])
     with refused("arm 'arm2'", *words):
         built.evaluate(x)
-    with refused(*words):
-        evaluate_batch([built.scene] * 2, built.partition, built.arms, x, do.Profile())
 
 
 @pytest.mark.serial  # ranks have no part in it

@@ -116,24 +116,6 @@ def test_files_of_the_scene_count_by_content(tmp_path):
     assert key(tmp_path / "a.csv") != key(tmp_path / "b.csv")
 
 
-@alone
-def test_batches_have_one_basis():
-    """A basis that depends on frequencies, or a frequency that is asked for, is not scaled."""
-    key = Case(scene()).batch_key
-    light = "material.density=2600"
-    assert Case(scene(light, "payload.mass=4")).batch_key == key
-    others = ["reduction.coordinates=5", "material.poisson_ratio=0.3", "design.initial=0.4"]
-    assert key not in {Case(scene(other)).batch_key for other in others}
-    krylov = ("reduction.method=krylov", "reduction.shifts=[30]")
-    for settings in (krylov, ("objective.kind=static",), ("constraints.first_frequency=1",)):
-        assert Case(scene(*settings)).batch_key != Case(scene(*settings, light)).batch_key
-    damped, gramian = "damping.stiffness_proportional=1e-3", "reduction.method=balanced"
-    assert Case(scene(damped)).batch_key == key
-    assert Case(scene(gramian, damped)).batch_key != Case(scene(gramian)).batch_key
-    chosen = Case(scene("reduction.coordinates=auto"))
-    assert chosen.batch_key == chosen.key
-
-
 @pytest.fixture(scope="module")
 def plan():
     """An optimisation's design and the initial one in three scenes."""
@@ -214,7 +196,7 @@ def test_second_run_computes_nothing(plan, done, monkeypatch):
 
 @alone
 def test_scenarios_share_what_they_can():
-    """One mesh and factorisation, one basis and batch a reduction; results as if alone."""
+    """One mesh and factorisation, one basis a reduction; results as if alone."""
     damped = "damping.stiffness_proportional=1e-3"
     scenes = [
         scene(),
@@ -232,7 +214,6 @@ def test_scenarios_share_what_they_can():
         assert found.scene is one and found.trajectory.scene is one
     assert [c.factorisations for c in counts][:4] == [2, 0, 0, 0]
     assert [c.eigenproblems for c in counts][:4] == [2, 0, 0, 2]
-    assert [c.simulations for c in counts] == [3, 0, 0, 1, 1, 1]
 
 
 @alone
@@ -247,33 +228,8 @@ def test_chosen_coordinates_are_those_of_each_scene():
 
 
 @alone
-def test_sweep_is_one_batch(tmp_path, simulated):
-    """The first bears the account of all; in any order the same cases."""
-    sweep = [Case(scene(f"payload.mass={mass}")) for mass in np.linspace(4.0, 8.0, 5)]
-    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
-    keys = [case.key for case in sweep]
-    first = sweep[keys.index(min(keys))]
-    counts = [outcomes[case].summary()["counts"] for case in sweep]
-    assert [one["simulations"] for one in counts] == [5 * (case is first) for case in sweep]
-    assert [one["factorisations"] for one in counts] == [2 * (case is first) for case in sweep]
-    assert run_cases(sweep[::-1], tmp_path, SELF, shown=False).computed == 0 and len(simulated) == 5
-
-
-@alone
-def test_what_scales_the_arms_is_one_batch(tmp_path, simulated):
-    """Against arms that are assembled and reduced anew."""
-    changes = ("material.density=2900", "material.young_modulus=60e9", "arms.arm1.thickness=0.012")
-    sweep = [Case(scene(change)) for change in changes]
-    outcomes = run_cases(sweep, tmp_path, SELF, shown=False)
-    assert len(simulated) == 3
-    for case in sweep:
-        [single] = simulate_scenarios([case.scene], None)
-        assert_close(outcomes[case], single.evaluation)
-
-
-@alone
 def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, simulated):
-    """What is there stays as it is, and all are right to the tolerance in any company."""
+    """What is there stays as it is, and all are the same in any company."""
     _, outcomes = done
     [case, *_] = together = plan[3:6]
     first = run_cases([case], tmp_path, SELF, shown=False)
@@ -284,29 +240,6 @@ def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, simula
     assert after[case].compliance == first[case].compliance
     for one in together:
         assert_close(after[one], outcomes[one])
-
-
-@alone
-def test_batch_interrupted_while_it_is_written(plan, done, tmp_path, monkeypatch, simulated):
-    """Nothing of it is in place: it is computed anew as a whole, to the same bits."""
-    _, outcomes = done
-    written = []
-    whole = computing.write_result
-
-    def stop(*args, **kwargs):
-        if written:
-            raise Killed
-        written.append(whole(*args, **kwargs))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(computing, "write_result", stop)
-        with pytest.raises(Killed):
-            run_cases(plan[3:6], tmp_path, SELF, shown=False)
-    assert not list(tmp_path.rglob("summary.json"))
-    again = run_cases(plan[3:6], tmp_path, SELF, shown=False)
-    assert again.computed == 3 and len(simulated) == 6
-    for case in plan[3:6]:
-        assert_same(again[case], outcomes[case])
 
 
 @alone

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, Field, model_validator
+from pydantic.fields import FieldInfo
 
-from dolfinopt.scene.materials import CATALOGUE, unknown_material
-from dolfinopt.scene.tables.base import FileName, Length, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.base import (
+    FileName,
+    Length,
+    Loc,
+    Position,
+    Refusal,
+    Table,
+    shown,
+    table_in,
+)
 from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
     FRICTION_SPEED,
@@ -35,6 +45,14 @@ from dolfinopt.scene.tables.joints import (
     check_plane_bearing,
     check_springs,
     in_frame,
+)
+from dolfinopt.scene.tables.material import (
+    LAWS,
+    CatalogueName,
+    LawDeclaration,
+    Material,
+    Quantity,
+    material_keys,
 )
 
 if TYPE_CHECKING:
@@ -71,53 +89,6 @@ def tensor_problem(inertia: float | tuple[float, ...] | None) -> str:
             "others"
         )
     return ""
-
-
-# -- `[material]` --------------------------------------------------------------------------------
-
-YoungModulus = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
-PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
-MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
-YieldStrength = Annotated[float, Field(ge=1e-3, le=1e15)]  # Pa
-
-
-def check_material(name: str) -> str:
-    """Return `name` if the catalogue has it."""
-    if name not in CATALOGUE:
-        raise Refusal(unknown_material(name))
-    return name
-
-
-CatalogueName = Annotated[
-    str,
-    AfterValidator(check_material),
-    WithJsonSchema({"type": "string", "enum": list(CATALOGUE)}),
-]
-
-
-class Material(Table):
-    """The solid material, linear elastic and isotropic, in plane stress.
-
-    `material = "NAME"` in place of the table takes all values from the catalogue; so does
-    `name = "NAME"` in it, for those that are not stated.
-    """
-
-    name: CatalogueName | None = Field(
-        default=None,
-        description='name in the catalogue, e.g. "aluminium 7075-T6", from which values not stated '
-        'are taken; material = "NAME" in place of the table is short for it [-]',
-    )
-    young_modulus: YoungModulus = Field(description="Young's modulus of the solid material [Pa]")
-    poisson_ratio: PoissonRatio = Field(description="Poisson's ratio [-]")
-    density: MassDensity = Field(description="mass density of the solid material [kg/m3]")
-    yield_strength: YieldStrength | None = Field(
-        default=None,
-        description="stress up to which the solid material is elastic; for reports alone [Pa]",
-    )
-
-
-# What a catalogue name stands for.
-MATERIAL_VALUES = tuple(key for key in Material.model_fields if key != "name")
 
 
 # -- `[[arms]]` ----------------------------------------------------------------------------------
@@ -338,20 +309,6 @@ class Arm(Table):
         default=None,
         description='name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
         "that of [material] [-]",
-    )
-    young_modulus: YoungModulus | None = Field(
-        default=None,
-        description="Young's modulus of this arm; default: material.young_modulus [Pa]",
-    )
-    poisson_ratio: PoissonRatio | None = Field(
-        default=None, description="Poisson's ratio of this arm; default: material.poisson_ratio [-]"
-    )
-    density: MassDensity | None = Field(
-        default=None, description="mass density of this arm; default: material.density [kg/m3]"
-    )
-    yield_strength: YieldStrength | None = Field(
-        default=None,
-        description="yield strength of this arm's material; default: material.yield_strength [Pa]",
     )
     regions: tuple[Region, ...] = Field(
         default=(), description="parts of the arm that stay solid or void"
@@ -745,6 +702,8 @@ class Arm(Table):
                 "moves in space, and needs [[joints]]",
                 (*at, "cells" if self.cells is not None else "cell_shape"),
             )
+        if self.flexible:
+            self._check_material(scene, at)
         self._check_inertia(scene, at)
         check_interfaces(scene, at[-1])
         check_motor(scene, at[-1])
@@ -753,6 +712,26 @@ class Arm(Table):
             self._check_pattern(before, at)
         if self.design is not None:
             self._check_shared(before, at)
+
+    def _check_material(self, scene: Scene, at: Loc) -> None:
+        """Refuse an own material, or the scene's, that this arm cannot be made of."""
+        solid = scene.material_of(at[-1])
+        if self.hollow and solid.angle_axis is not None:
+            raise Refusal(
+                "expected none with hollow = true: the angle turns about the wall's normal",
+                (*at, "angle_axis"),
+                (*at, "hollow"),
+            )
+        try:
+            solid.check_law(3 if self.is_solid else 2)
+        except Refusal as refusal:
+            own = self.material is not None or vars(self)["kind"] is not None
+            owners = (
+                at if own or getattr(self, key) is not None else ("material",)
+                for (key,) in refusal.keys
+            )
+            keys = ((*owner, *key) for owner, key in zip(owners, refusal.keys, strict=True))
+            raise Refusal(refusal.reason, *keys) from None
 
     def _check_files(self, before: tuple[Arm, ...], at: Loc) -> None:
         """Refuse a name with which two files of a part would be one, such as a_face.step."""
@@ -846,3 +825,46 @@ class Arm(Table):
                     (*at, key),
                     (*at, "pattern"),
                 )
+
+
+# -- an arm's own material -----------------------------------------------------------------------
+
+
+def _add_material_keys() -> None:
+    """Let an arm state every key of [material] for itself."""
+    for key in material_keys():
+        field = Material.model_fields[key]
+        words, unit = str(field.description).rsplit(" [", 1)
+        kind: Any = field.annotation
+        kind = Annotated[(kind, *field.metadata)] if field.metadata else kind
+        Arm.model_fields[key] = FieldInfo(
+            annotation=kind | None,
+            default=None,
+            description=f"of this arm: {words}; default: material.{key} [{unit}",
+        )
+    fields = Arm.model_fields
+    for key in [key for key, field in fields.items() if table_in(field.annotation)]:
+        fields[key] = fields.pop(key)  # keys are told before the tables below them
+
+
+_add_material_keys()
+Arm.model_rebuild(force=True)
+
+
+def declare_law(one: LawDeclaration, words: Mapping[str, str]) -> None:
+    """Let scenes that are read from now on name a kind of material, and keys of its own.
+
+    Args:
+        one: the kind.
+        words: what its keys mean, with the unit; of those that [material] has they say nothing.
+    """
+    from dolfinopt.scene.schema import Scene
+
+    LAWS[one.kind] = one
+    fields = Material.model_fields
+    fields["kind"].annotation = Literal[tuple(LAWS)]  # type: ignore[assignment]
+    for key in words.keys() - fields.keys():
+        fields[key] = FieldInfo(annotation=Quantity | None, default=None, description=words[key])
+    _add_material_keys()
+    for table in (Material, Arm, Scene):
+        table.model_rebuild(force=True)

@@ -453,7 +453,10 @@ class Optimizer(Table):
     """When the optimiser stops and how far it moves at once."""
 
     max_iterations: int = Field(
-        default=400, ge=0, le=MAX_ITERATIONS, description="largest number of design iterations [-]"
+        default=1000,
+        ge=0,
+        le=MAX_ITERATIONS,
+        description="largest number of design iterations; runs end by themselves before [-]",
     )
     move: float = Field(
         default=0.2, ge=1e-6, le=1, description="largest step of x in one iteration [-]"

@@ -358,6 +358,14 @@ class ConstraintOptions(Table):
             if one.of_arms:
                 where = (*at, one.key) if one.key in self.limits else ("objective", "kind")
                 raise Refusal("expected another response: no arm is flexible", where)
+        for one in (one for one in asked(scene) if one.name == "stress"):
+            for name, kind in scene.without_strength.items():
+                where = (*at, one.key) if one.key in self.limits else ("objective", "kind")
+                raise Refusal(
+                    f"expected another response: {name} is {kind}, and no strength criterion is "
+                    "known for that; limit deviation or buckling",
+                    where,
+                )
 
     def _check_poles(self, scene: Scene, at: Loc) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
@@ -488,3 +496,15 @@ class Scenario(Table):
                     "the reduced basis depends on its Poisson's ratio"
                 )
         return changes
+
+    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+        """Refuse changes of a material that are more than a factor of its stiffness."""
+        for change in self.changes:
+            table, _, key = change.partition("=")[0].strip().partition(".")
+            allowed = [one for one in scene.scaling_keys if one != "thickness"]
+            if table == "material" and key not in (*allowed, "yield_strength"):
+                raise Refusal(
+                    f"expected of the material {' or '.join(allowed)} alone: the reduced basis "
+                    "depends on the others",
+                    (*at, "changes"),
+                )
