@@ -54,8 +54,8 @@ AIM = 1e-4  # of the deviation without corrections
 STEPS = 2  # of Gauss-Newton: the first leaves 4e-3 of it on two_arm, the second 1e-5
 # Of the mean of the normal matrix's diagonal: it leaves 3e-8 m of two_arm's 55 mm; of more joints
 # than needed the smallest corrections, 4e-7 m, whose gradient 1e-8 leaves 1e-4 off.
-REGULARISATION, OF_REDUNDANT = 1e-10, 1e-6
-CURVED = 1e-4  # of the deviation is left: second derivatives count
+REGULARISATION, OF_REDUNDANT = 1e-8, 1e-6
+CURVED = 1e-3  # of the deviation is left: second derivatives count
 CURVATURE_STEPS = 3
 DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
 FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
@@ -460,7 +460,7 @@ class LeastSquares:
         by_coefficients: J (n d, p F).
         gap: (n d,) m.
         normal: J' W J + R.
-        roughness: R (p F, p F): of the corrections' accelerations, in the mean square.
+        roughness: R (p F, p F): of the corrections' accelerations, and of their size.
     """
 
     t: np.ndarray
@@ -490,6 +490,8 @@ def least_squares(
     normal = J.T @ (weights[:, None] * J)
     bends = corrections.splines.at(t)[2]
     squares = bends.T @ (np.gradient(t)[:, None] * bends)
+    if share == OF_REDUNDANT:  # several joints may share a constant offset
+        squares = squares / np.trace(squares) + np.eye(len(squares)) / len(squares)
     roughness = np.kron(squares, np.eye(len(corrections.joints)))
     roughness *= share * np.trace(normal) / np.trace(roughness)
     return LeastSquares(t, weights, J, gap, normal + roughness, roughness)

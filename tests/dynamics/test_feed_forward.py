@@ -160,3 +160,20 @@ def test_singular_positions_are_named() -> None:
     """A slider-crank passes its dead centres: no joint moves the slider along the line there."""
     with pytest.raises(InputError, match="cannot move the tip along its path at t = "):
         small(TIP, scene="slider_crank")
+
+
+@pytest.mark.parametrize(
+    ("scene", "changes"),
+    [
+        ("two_arm", (*SMALL, 'feed_forward.joints=["cart","arm1","arm2"]')),
+        ("spatial_arm", ("arms.cells=[12,2,2]", "design.filter_radius=0")),
+    ],
+)
+def test_gradient_with_joints_in_surplus_and_in_space(scene, changes) -> None:
+    """Along all densities against a difference; what noise leaves of it: 5e-5."""
+    told = TIP, "objective.gradient=exact", "objective.kind=integral_compliance"
+    model = Model(ROOT / "demos" / f"{scene}.toml", *changes, *told, "simulation.tolerance=1e-7")
+    slope = sum(g.sum() for g in model.gradient(model.uniform(0.5)).values())
+    h = 1e-3
+    values = [model.simulate(model.uniform(0.5 + s * h)).objective for s in (1, -1)]
+    assert slope == pytest.approx((values[0] - values[1]) / (2.0 * h), rel=3e-4)

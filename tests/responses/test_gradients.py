@@ -333,9 +333,7 @@ CASES = [
     case("two_arm", "deviation", FEED, PAYLOADS, *FINER, ranks=True),
     case("two_arm", "stress", FEED, PAYLOADS, *FINER),
     case("two_arm", "integral_compliance", FEED, GRAVITY, "feed_forward.lead=0.0", *FINER),
-    case("two_arm", "peak_force", FEED, 'feed_forward.joints=["cart", "arm1", "arm2"]', *FINER),
     case("two_arm", "effort", FEED, TWO, *FINER, slow=True),
-    case("space", "deviation", FEED, 'scenarios=[{changes=["payload.mass=2"]}]'),
     # Every word that a scene knows, through a filter: new ones are tested by their word alone.
     *(case("two_arm", kind, "design.filter_radius=0.05", *FINER)
       for kind in objective_kinds() if "poles_at" not in DECLARED[kind].options),
