@@ -146,6 +146,10 @@ def test_splines_rest_at_their_ends() -> None:
     ("changes", "words"),
     [
         (("feed_forward.lead=0.1",), "expected none without feed_forward.kind"),
+        (("feed_forward.kind=toe",), 'feed_forward.kind = "toe"'),
+        ((TIP, "feed_forward.spacing=0"), "feed_forward.spacing = 0"),
+        ((TIP, "feed_forward.lead=-1"), "feed_forward.lead = -1"),
+        ((TIP, "feed_forward.joints=3"), "feed_forward.joints = 3"),
         ((TIP, 'feed_forward.joints=["elbow"]'), "expected drives, of cart, arm1, arm2"),
         ((TIP, 'feed_forward.joints=["arm1"]'), "expected at least 2 joints"),
         ((TIP, "control.stiffness=[1,1,1]", "control.damping=[1,1,1]"), "unless control.feed"),
