@@ -1,82 +1,592 @@
-"""What a control knows ahead: forces that move the machine with rigid arms as desired.
+"""Joint motions under which the bending arms carry the tip along its path: servo constraints.
 
-They are inverse dynamics of bodies of the same mass and inertia that do not deform. In a closed
-loop the joints that follow from others have no drive: what they would need, the closures give, by
-multipliers of least norm.
+Corrections r_F = sum_k B_k(t) c_k of some joints, splines of degree 5, are such that the tip h of
+the flexible machine stays on the path y of the rigid one:
+
+    min over c   1/2 sum_i w_i |h(t_i, c) - y(t_i)|^2 + c' R c / 2,
+
+R for the smoothest ones,
+
+by Gauss-Newton steps. The columns dh/dc follow from the linearised collocation equations, all
+right sides at once, so that nothing is integrated backwards in time: the internal dynamics of a
+flexible arm are unstable (non-minimum phase), their bounded solution begins before the motion does,
+within `lead`. Source: Seifried, Dynamics of Underactuated Multibody Systems (2014),
+doi:10.1007/978-3-319-01228-5; Bastos, Seifried & Bruels (2013), doi:10.1007/s11044-012-9318-6.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import combinations, pairwise
 
 import numpy as np
 
-from dolfinopt.multibody.gradient import body_gradient
-from dolfinopt.multibody.newton_euler import inverse_dynamics
-from dolfinopt.multibody.ranks import least_norm
+from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.adjoint import Adjoint, add_gradients
+from dolfinopt.dynamics.collocation import (
+    Solution,
+    end_gain,
+    lagrange_integrals,
+    radau_iia,
+    stage_values,
+    stages_of,
+)
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.measured import EXACT
+from dolfinopt.dynamics.newton_matrix import matrix_of
+from dolfinopt.dynamics.system import unchanged
+from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_instants
+from dolfinopt.dynamics.time_grid import first_grid
+from dolfinopt.errors import InputError
+from dolfinopt.multibody.kinematics import end_effector, end_effector_gradient, lengths
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import Scene
 
-if TYPE_CHECKING:
-    from dolfinopt.dynamics.machine_system import MachineSystem
+DEGREE = 5
+FINEST = 16.0  # times closer are knots beside breakpoints, where steps grow by
+GROWTH = 1.5
+FIRST_SPACING = 0.02  # of the motion's duration
+AIM = 1e-4  # of the deviation without corrections
+STEPS = 2  # of Gauss-Newton: the first leaves 4e-3 of it on two_arm, the second 1e-5
+# Of the mean of the normal matrix's diagonal: it leaves 3e-8 m of two_arm's 55 mm; of more joints
+# than needed the smallest corrections, 4e-7 m, whose gradient 1e-8 leaves 1e-4 off.
+REGULARISATION, OF_REDUNDANT = 1e-8, 1e-6
+CURVED = 1e-3  # of the deviation is left: second derivatives count
+CURVATURE_STEPS = 3
+DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
+FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
+SINGULAR = 1e-3  # least singular value of the tip's Jacobian, over the reach
+INSTANTS = 121  # at which it is looked at
 
 
-def feed_forward(machine: MachineSystem, desired: RigidMotion) -> tuple[np.ndarray, np.ndarray]:
-    """Return the forces of the free coordinates and of motors behind springs, (n, R) and (n, M).
+# -- corrections -----------------------------------------------------------------------------
 
-    Motors behind springs move their rotors.
+
+@dataclass(frozen=True, eq=False)
+class Splines:
+    """Splines of degree 5 whose rates and accelerations vanish at both ends.
+
+    Attributes:
+        knots: (m,) ascending, the first 0 and the last the horizon, s.
     """
-    rigid, drives = machine.rigid, machine.drives
-    none = np.zeros((len(desired.q), 0))
-    every = inverse_dynamics(rigid, desired, none, none, none)[1]
-    forces, motors = np.split(every, [rigid.num_rigid], axis=1)
+
+    knots: np.ndarray
+
+    @cached_property
+    def _every(self) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
+        from scipy.interpolate import BSpline  # takes as long to import as NumPy
+
+        ends = self.knots[[0, -1]]
+        knots = np.concatenate([np.repeat(ends[0], DEGREE), self.knots, np.repeat(ends[1], DEGREE)])
+        # The first three coefficients are equal, and so are the last three.
+        count = len(self.knots) + DEGREE - 1
+        tie = np.repeat(np.eye(count - 4), [3, *[1] * (count - 6), 3], axis=0)
+        spline = BSpline(knots, tie, DEGREE)
+        return spline, spline.derivative(1), spline.derivative(2)
+
+    @property
+    def count(self) -> int:
+        """Number p of coefficients of a joint."""
+        return len(self.knots) + DEGREE - 5
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return all splines, their rates and accelerations (3, n, p) at instants t (n,), s."""
+        return np.stack([one(t) for one in self._every])
+
+
+@dataclass(frozen=True, eq=False)
+class Corrections:
+    """What some joints turn beside their desired motion.
+
+    Attributes:
+        joints: (F,) rigid coordinates.
+        splines: p of them.
+        coefficients: (p, F), rad, m.
+    """
+
+    joints: np.ndarray
+    splines: Splines
+    coefficients: np.ndarray
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return corrections, rates and accelerations (3, n, F)."""
+        return self.splines.at(t) @ self.coefficients
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectedMotion:
+    """A motion and corrections of it, at given instants."""
+
+    motion: Callable[[np.ndarray], RigidMotion]
+    corrections: Corrections
+
+    def __call__(self, t: np.ndarray) -> RigidMotion:
+        """Return the corrected motion at instants t (n,), s."""
+        desired, joints = self.motion(t), self.corrections.joints
+        rates = [desired.q.copy(), desired.qd.copy(), desired.qdd.copy()]
+        for x, change in zip(rates, self.corrections.at(t), strict=True):
+            x[:, joints] += change
+        q, qd, qdd = rates
+        return replace(desired, q=q, qd=qd, qdd=qdd)
+
+
+def corrected(machine: MachineSystem, corrections: Corrections) -> MachineSystem:
+    """Return a machine that moves with corrections, its tip's path unchanged."""
+    motion = machine.motion
+    if isinstance(motion, LoadedMotion):
+        moved = replace(motion, motion=CorrectedMotion(motion.motion, corrections))
+        return replace(machine, motion=moved, path=motion)
+    return replace(machine, motion=CorrectedMotion(motion, corrections), path=motion)
+
+
+def with_known_forces(machine: MachineSystem, feed_forward: FeedForward) -> MachineSystem:
+    """Return a controlled machine whose drives know the forces of the prescribed, corrected one."""
+    drives, horizon = machine.drives, machine.breakpoints[-1]
+    t = np.linspace(0.0, horizon, int(np.ceil(horizon / FORCE_INTERVAL)) + 1)
+    rates = (feed_forward.solution.sample(t, k) for k in range(3))
+    forces = feed_forward.machine.at(t).state(*rates).forces()[:, drives.free]
+    if drives.table is not None:
+        forces = forces + drives.table(t)
+    return replace(machine, drives=replace(drives, table=Table(t, forces * drives.driven)))
+
+
+def graded_knots(breakpoints: tuple[float, ...], spacing: float) -> np.ndarray:
+    """Return knots (m,) at most `spacing` apart, s, closer beside the breakpoints.
+
+    There a motion's jerk jumps, and the internal dynamics answer within milliseconds.
+    """
+    knots = [np.array(breakpoints[:1])]
+    for begin, end in pairwise(breakpoints):
+        half = 0.5 * (end - begin)
+        steps = np.minimum(
+            spacing, spacing / FINEST * GROWTH ** np.arange(int(half / spacing) + 20)
+        )
+        near = np.cumsum(steps)
+        near = near[near < half]
+        near = near * (half / near[-1]) if len(near) else np.array([half])
+        knots += [begin + near, end - near[-2::-1], np.array([end])]
+    return np.concatenate(knots)
+
+
+# -- the tip ---------------------------------------------------------------------------------
+
+
+def tip_jacobians(
+    machine: MachineSystem, motion: RigidMotion, q: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tip's derivatives by elastic (n, d, N) and rigid coordinates (n, d, R)."""
+    d = machine.mechanism.dim.d
+    by_q, by_rigid = [], []
+    for axis in np.eye(d):
+        weights = np.tile(axis, (len(q), 1))
+        one = end_effector_gradient(machine.mechanism, motion, q, weights)
+        by_q.append(one[0])
+        by_rigid.append(one[1])
+    return np.stack(by_q, axis=1), np.stack(by_rigid, axis=1)
+
+
+def path_of(machine: MachineSystem, t: np.ndarray) -> np.ndarray:
+    """Return where the tip of rigid arms is on the desired motion (n, d), m."""
+    desired = (machine.path or machine.motion)(t)
+    none = np.zeros((len(t), machine.mechanism.num_coordinates))
+    return end_effector(machine.mechanism, desired, none)
+
+
+def off_path(machine: MachineSystem, solution: Solution, t: np.ndarray) -> np.ndarray:
+    """Return how far the tip is off its path (n, d), m."""
+    rates = [solution.sample(t, k) for k in range(3)]
+    state = machine.at(t).state(*rates)
+    return end_effector(machine.mechanism, state.motion, state.elastic[0]) - path_of(machine, t)
+
+
+def tip_by_joints(machine: MachineSystem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tip's Jacobian of rigid arms (n, d, R), over the reach, and its instants, s.
+
+    Joints that follow in closed loops follow.
+    """
+    t = np.linspace(0.0, machine.breakpoints[-1], INSTANTS)
+    motion, none = machine.motion(t), np.zeros((len(t), machine.mechanism.num_coordinates))
+    J = tip_jacobians(machine, motion, none)[1]
     if machine.loops is not None:
-        here = machine.loops.at(rigid, desired.q, none)
-        forces = forces - here.generalised_force(here.closing(forces, drives.dependent))
-    return forces[:, drives.free] * drives.driven, motors[:, : len(drives.springs.joints)]
+        dependent = machine.drives.dependent
+        G = machine.loops.at(machine.rigid, motion.q, none[:, :0]).jacobian
+        J = J - J[:, :, dependent] @ np.linalg.pinv(G[:, :, dependent]) @ G[:, :, : J.shape[2]]
+    return J / machine.mechanism.levers, t
 
 
-def known_forces(
-    machine: MachineSystem, desired: RigidMotion
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the drives' feed-forward (n, R), and how far ahead of their joints motors are asked.
+# -- linearised motion -----------------------------------------------------------------------
 
-    Drives before springs give what joint and rotor need, and the friction of the motor. By
-    `Drives.winding` the motor is asked to be ahead (n, R) by what its spring gives, rad.
+
+@dataclass(frozen=True, eq=False)
+class TipResponse:
+    """What the tip does at instants t when corrections change.
+
+    Attributes:
+        by_coefficients: (n, d, p F) columns.
+        forced: (n, d) what the residual that is left still moves it by.
     """
-    drives, springs = machine.drives, machine.drives.springs
-    if not drives.rigid_feed_forward:
-        return np.zeros((len(desired.q), len(drives.free))), None
-    ahead, motors = feed_forward(machine, desired)
-    winding = None
-    if drives.winding:
-        winding = np.zeros_like(ahead)
-        winding[:, springs.joints] = ahead[:, springs.joints] / springs.stiffness
-    speeds = desired.qd[:, machine.motor_joints]
-    ahead[:, springs.joints] += motors + springs.friction.force(speeds)
-    return ahead, winding
+
+    by_coefficients: np.ndarray
+    forced: np.ndarray
 
 
-def feed_forward_gradient(
-    machine: MachineSystem, desired: RigidMotion, weights: np.ndarray
-) -> list[ShapeIntegrals]:
-    """Return the derivative of sum_n weights_n . u_n by every body through `known_forces`.
+def tip_response(
+    machine: MachineSystem, solution: Solution, corrections: Corrections, t: np.ndarray
+) -> TipResponse:
+    """Return the tip's answer by the linearised collocation equations, all columns at once."""
+    joints, splines = corrections.joints, corrections.splines
+    method, S = radau_iia(len(solution.nodes)), machine.num_coordinates
+    stages = stages_of(unchanged(machine), method, solution.time_grid)
+    q, qd = stage_values(stages, solution.q, solution.qd, solution.a)
+    instants = machine.at_stages(solution.time_grid, method.c)
+    state = instants.state(*(x.reshape(-1, S) for x in (q, qd, solution.a)))
+    n, s = solution.a.shape[:2]
+    basis = splines.at(stage_instants(solution.time_grid, method.c))
+    loads = np.einsum("nrfk,knp->nrpf", state.by_command(joints), basis)
+    loads = np.concatenate([loads.reshape(n * s, S, -1), state.residual()[:, :, None]], axis=2)
+    matrix = matrix_of(stages, instants.linearise(*state.rates), np.arange(S))
+    forced = -(matrix.inverse @ loads.reshape(n, s * S, -1))
+    gain = end_gain(stages, forced.reshape(n, s, S, -1))
+    y = np.zeros((n, 2 * S, forced.shape[2]))
+    y[0, :S, :-1] = start_response(machine, solution.q[0], corrections)
+    for k in range(n - 1):
+        y[k + 1] = matrix.transfer[k] @ y[k] + gain[k]
+    a = forced + matrix.answer.reshape(n, s * S, -1) @ y
+    rates = [solution.sample(t, k) for k in range(3)]
+    here = machine.at(t).state(*rates)
+    by_q, by_rigid = tip_jacobians(machine, here.motion, here.elastic[0])
+    by_y = np.zeros((*by_q.shape[:2], S))
+    by_y[:, :, : machine.ends[0]] = by_rigid[:, :, machine.drives.free]
+    by_y[:, :, machine.elastic_columns] = by_q
+    moved = _sampled(solution, t, by_y, y, a)
+    own = np.einsum("ndf,np->ndpf", by_rigid[:, :, joints], splines.at(t)[0])
+    return TipResponse(moved[:, :, :-1] + own.reshape(*own.shape[:2], -1), moved[:, :, -1])
+
+
+def start_response(machine: MachineSystem, y: np.ndarray, corrections: Corrections) -> np.ndarray:
+    """Return the change of the equilibrium at t = 0 by the coefficients (S, p F)."""
+    first = corrections.splines.at(np.zeros(1))[0, 0]
+    by_joint = machine.start_by_command(y, corrections.joints)
+    return np.einsum("sf,p->spf", by_joint, first).reshape(len(by_joint), -1)
+
+
+def _sampled(
+    solution: Solution, t: np.ndarray, by_y: np.ndarray, y: np.ndarray, a: np.ndarray
+) -> np.ndarray:
+    """Return by_y . change (m, d, columns) at instants t of coordinates that change.
 
     Args:
-        machine: with feed-forward.
-        desired: at n instants.
-        weights: (n, R) of the drives' forces u.
+        solution: S coordinates.
+        t: (m,) s.
+        by_y: (m, d, S).
+        y: (n, 2 S, columns) at the steps' beginnings.
+        a: (n, s S, columns) accelerations.
     """
-    rigid, drives, springs = machine.rigid, machine.drives, machine.drives.springs
-    none = np.zeros((len(weights), 0))
-    of_forces = np.zeros_like(desired.q)
-    of_forces[:, drives.free] = weights * drives.driven
-    if drives.winding:
-        share = drives.stiffness[springs.joints] / springs.stiffness
-        of_forces[:, machine.motor_joints] *= 1.0 + share
-    if machine.loops is not None:
-        J = machine.loops.at(rigid, desired.q, none).jacobian
-        moved = np.einsum("nkr,nr->nk", J, of_forces)
-        of_forces[:, drives.dependent] -= least_norm(J[:, :, drives.dependent], moved)
-    of_forces = np.hstack([of_forces, weights[:, springs.joints]])
-    return body_gradient(rigid, desired, none, none, none, none, of_forces)
+    step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(a) - 1)
+    h = np.diff(solution.time_grid)[step]
+    tau = (t - solution.time_grid[step]) / h
+    weights = lagrange_integrals(solution.nodes, tau)[2] * (h * h)[:, None]
+    by_a = (by_y[:, :, None] * weights[:, None, :, None]).reshape(*by_y.shape[:2], -1)
+    by_first = np.concatenate([by_y, by_y * (h * tau)[:, None, None]], axis=2)
+    out = np.empty((len(t), by_y.shape[1], y.shape[2]))
+    for k in np.unique(step):
+        here = step == k
+        out[here] = by_first[here] @ y[k] + by_a[here] @ a[k]
+    return out
+
+
+def internal_rates(found: FeedForward) -> np.ndarray | None:
+    """Return the eigenvalues (2 N,) of what the arms may still do while the tip is held, 1/s.
+
+    At rest at t = 0, of a machine on a prescribed motion that closes no loop. With r_F = P q that
+    keep the tip, P = -H_F^-1 H_q, (K + K_F P) q + (D + D_F P) q' + (M + M_F P) q'' = 0: those with
+    positive real part are unstable, and begin before the motion.
+    """
+    machine, corrections = found.machine, found.corrections
+    if not machine.is_prescribed:
+        return None
+    y = machine.initial_state()[0]
+    none = np.zeros_like(y)
+    state = machine.at(np.zeros(1)).state(y, none, none)
+    by_q, by_rigid = tip_jacobians(machine, state.motion, y)
+    P = -np.linalg.pinv(by_rigid[0][:, corrections.joints]) @ by_q[0]
+    own = np.split(state.instants.linearise(*state.rates).dense()[0], 3, axis=1)
+    by_joints = state.by_command(corrections.joints)[0]
+    K, D, M = (x + by_joints[:, :, k] @ P for k, x in enumerate(own))
+    inverse, size = np.linalg.inv(M), len(M)
+    zero, one = np.zeros((size, size)), np.eye(size)
+    return np.asarray(np.linalg.eigvals(np.block([[zero, one], [-inverse @ K, -inverse @ D]])))
+
+
+# -- least squares ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class FeedForward:
+    """Corrections of a machine's joints, and its motion with them.
+
+    Attributes:
+        plain: without them.
+        machine: that moves with them.
+        solution: its motion.
+        corrections: of its joints.
+        share: regularisation of the least squares, see `REGULARISATION`.
+        has_curvature: whether the coefficients follow the bodies by second derivatives, too.
+        regularity: least singular value of the tip's Jacobian by these joints, over the reach.
+        before, left: largest distance of the tip from its path without and with them, m.
+    """
+
+    plain: MachineSystem
+    machine: MachineSystem
+    solution: Solution
+    corrections: Corrections
+    share: float
+    has_curvature: bool
+    regularity: float
+    before: float
+    left: float
+
+    @cached_property
+    def _squares(self) -> LeastSquares:
+        return least_squares(self.machine, self.solution, self.corrections, self.share)
+
+    @cached_property
+    def _adjoint(self) -> Adjoint:
+        return Adjoint(self.machine, self.solution)
+
+    def gradient(self, by_coefficients: np.ndarray) -> list[ShapeIntegrals]:
+        """Return the derivative by every body of J through the coefficients, dJ/dc (p, F).
+
+        The coefficients follow the bodies, as G = J_c' W e + R c stays zero. With the multipliers
+        mu of (J_c' W J_c + R + S) mu = dJ/dc, S = sum_i (W e)_i d2h_i/dc2,
+
+            dJ = -mu . dG = -(W J_c mu) . dh - d/d eps [ (W e) . dh(c + eps mu) ],
+
+        an adjoint of this motion and, where the tip is not exactly on its path or joints are more
+        than needed, those of two motions beside it.
+        """
+        squares = self._squares
+        change = np.linalg.solve(squares.normal, by_coefficients.ravel())
+        beside: list[ShapeIntegrals] = []
+        if self.has_curvature:
+            for _ in range(CURVATURE_STEPS):
+                curved, beside = self._curvature(change)
+                change = np.linalg.solve(squares.normal, by_coefficients.ravel() + curved)
+        weights = -squares.weights * (squares.by_coefficients @ change)
+        found = self._follow(self.machine, self.solution, weights)[0]
+        return add_gradients(found, beside) if beside else found
+
+    def _curvature(self, change: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
+        """Return -S mu (p F,) and -d/d eps of the bodies' derivative, by central differences."""
+        squares, corrections = self._squares, self.corrections
+        mu = change.reshape(corrections.coefficients.shape)
+        eps = DIFFERENCE / np.abs(corrections.splines.at(squares.t)[0] @ mu).max()
+        weights = squares.weights * squares.gap / (2.0 * eps)
+        sides = []
+        for sign in (1.0, -1.0):
+            moved_by = replace(corrections, coefficients=corrections.coefficients + sign * eps * mu)
+            moved = corrected(self.plain, moved_by)
+            grid, stages = self.solution.time_grid, len(self.solution.nodes)
+            solution = radau.on_grid(moved, grid, EXACT, stages, self.solution)
+            sides.append(self._follow(moved, solution, -sign * weights))
+        (plus, by_plus), (minus, by_minus) = sides
+        return (by_plus + by_minus).ravel(), add_gradients(plus, minus)
+
+    def _follow(
+        self, machine: MachineSystem, solution: Solution, weights: np.ndarray
+    ) -> tuple[list[ShapeIntegrals], np.ndarray]:
+        """Return the derivative of sum weights . tip (n d,) by bodies and coefficients (p, F)."""
+        t, corrections = self._squares.t, self.corrections
+        adjoint = self._adjoint if machine is self.machine else Adjoint(machine, solution)
+        by_q, by_rigid, own = tip_gradient(machine, solution, t, weights.reshape(len(t), -1))
+        multipliers = adjoint.multipliers(t, by_q)
+        bodies = adjoint.by_bodies(*multipliers)
+        by_motion = np.stack([by_rigid, *np.zeros((2, *by_rigid.shape))])
+        by = by_coefficients(corrections, adjoint, multipliers, t, by_motion)
+        return [add_integrals(a, b) for a, b in zip(bodies, own, strict=True)], by
+
+
+def by_coefficients(
+    corrections: Corrections,
+    adjoint: Adjoint,
+    multipliers: tuple[np.ndarray, np.ndarray],
+    t: np.ndarray,
+    by_motion: np.ndarray,
+) -> np.ndarray:
+    """Return dJ/dc (p, F) through a motion that these corrections move.
+
+    Args:
+        corrections: of the motion.
+        adjoint: of the motion.
+        multipliers: of J, see `Adjoint.multipliers`.
+        t: (m,) instants, s.
+        by_motion: (3, m, R) dJ there by rigid coordinates, their rates and accelerations, held.
+    """
+    joints, splines, (rows, by_start) = corrections.joints, corrections.splines, multipliers
+    solution = adjoint.solution
+    at = stage_instants(solution.time_grid, solution.nodes)
+    by_stage = np.einsum("ns,nsfk->knf", rows, adjoint.state.by_command(joints))
+    own = by_motion[:, :, joints]
+    total = np.einsum("knp,knf->pf", splines.at(at), by_stage)
+    total += np.einsum("knp,knf->pf", splines.at(t), own)
+    first = adjoint.system.start_by_command(solution.q[0], joints)
+    return total + np.outer(splines.at(np.zeros(1))[0, 0], by_start @ first)
+
+
+def tip_gradient(
+    machine: MachineSystem, solution: Solution, t: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[dict[str, np.ndarray]]]:
+    """Return the gradient of sum weights . tip (n, d) by unknowns (n, S), joints (n, R), bodies."""
+    state = machine.at(t).state(*(solution.sample(t, k) for k in range(3)))
+    q = state.elastic[0]
+    by_q, by_rigid, bodies = end_effector_gradient(machine.mechanism, state.motion, q, weights)
+    by = np.zeros((len(t), machine.num_coordinates))
+    by[:, machine.elastic_columns] = by_q
+    by[:, : machine.ends[0]] = by_rigid[:, machine.drives.free]
+    return by, by_rigid, bodies
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """The linearised problem of the corrections: min |W^1/2 (J c + gap)|^2 + c' R c.
+
+    Attributes:
+        t: (n,) instants at which the tip counts, s.
+        weights: (n d,) W.
+        by_coefficients: J (n d, p F).
+        gap: (n d,) m.
+        normal: J' W J + R.
+        roughness: R (p F, p F): of the corrections' accelerations, and of their size.
+    """
+
+    t: np.ndarray
+    weights: np.ndarray
+    by_coefficients: np.ndarray
+    gap: np.ndarray
+    normal: np.ndarray
+    roughness: np.ndarray
+
+    def step(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return coefficients (p, F) that are best by the linearised problem."""
+        c = coefficients.ravel()
+        right = self.by_coefficients.T @ (self.weights * self.gap) + self.roughness @ c
+        return (c - np.linalg.solve(self.normal, right)).reshape(coefficients.shape)
+
+
+def least_squares(
+    machine: MachineSystem, solution: Solution, corrections: Corrections, share: float
+) -> LeastSquares:
+    """Return the linearised problem about a motion with corrections; `share` of REGULARISATION."""
+    knots = corrections.splines.knots
+    t = np.sort(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])]))
+    answer = tip_response(machine, solution, corrections, t)
+    gap = (off_path(machine, solution, t) + answer.forced).ravel()
+    J = answer.by_coefficients.reshape(len(gap), -1)
+    weights = np.repeat(np.gradient(t), len(gap) // len(t))
+    normal = J.T @ (weights[:, None] * J)
+    bends = corrections.splines.at(t)[2]
+    squares = bends.T @ (np.gradient(t)[:, None] * bends)
+    if share == OF_REDUNDANT:  # several joints may share a constant offset
+        squares = squares / np.trace(squares) + np.eye(len(squares)) / len(squares)
+    roughness = np.kron(squares, np.eye(len(corrections.joints)))
+    roughness *= share * np.trace(normal) / np.trace(roughness)
+    return LeastSquares(t, weights, J, gap, normal + roughness, roughness)
+
+
+def at_rest(machine: MachineSystem, tolerance: float, stages: int) -> Solution:
+    """Return the undeformed machine on its first steps: where Gauss-Newton begins."""
+    grid = first_grid(machine, tolerance, stages)
+    q = np.repeat(machine.initial_state()[0], len(grid) - 1, axis=0)
+    a = np.zeros((len(q), stages, q.shape[1]))
+    return Solution(grid, radau_iia(stages).c, q, np.zeros_like(q), a, np.inf, 0)
+
+
+def feed_forward_of(
+    machine: MachineSystem, scene: Scene, profile: Profile, start: Solution | None = None
+) -> FeedForward:
+    """Return the corrections of a scene's machine.
+
+    The knots are as close as it takes to leave `AIM` of the deviation, or as the scene has them.
+
+    Raises:
+        ConvergenceError: a motion with corrections cannot be simulated.
+        InputError: at some instant no joints move the tip along its path.
+    """
+    joints, regularity, redundant = joints_of(machine, scene)
+    options, asked = scene.simulation, scene.feed_forward.spacing
+    spacing = asked or FIRST_SPACING * scene.motion.duration
+    share = OF_REDUNDANT if redundant else REGULARISATION
+    run = partial(
+        radau.integrate, tolerance=options.tolerance, stages=options.stages, profile=profile
+    )
+    first = at_rest(machine, options.tolerance, options.stages)
+    before, last, guess = tip_error_at_rest(machine, first), np.inf, start
+    while True:
+        splines = Splines(graded_knots(machine.breakpoints, spacing))
+        none = np.zeros((splines.count, len(joints)))
+        corrections, moved, solution = Corrections(joints, splines, none), machine, first
+        for number in range(1 + STEPS):
+            if number < STEPS:
+                squares = least_squares(moved, solution, corrections, share)
+            else:  # what is left is answered by the same derivatives
+                squares = replace(squares, gap=off_path(moved, solution, squares.t).ravel())
+            corrections = replace(corrections, coefficients=squares.step(corrections.coefficients))
+            moved = corrected(machine, corrections)
+            solution = guess = run(moved, guess=guess)
+        left = float(lengths(off_path(moved, solution, squares.t)).max())
+        if asked or left <= AIM * before or left > 0.5 * last:
+            break
+        spacing, last = 0.5 * spacing, left
+    curved = redundant or left > CURVED * before
+    return FeedForward(
+        machine, moved, solution, corrections, share, curved, regularity, before, left
+    )
+
+
+def tip_error_at_rest(machine: MachineSystem, solution: Solution) -> float:
+    """Return the largest distance of the tip from its path without corrections, m, linearised."""
+    t = solution.time_grid
+    nothing = Corrections(np.zeros(0, dtype=int), Splines(t), np.zeros((len(t), 0)))
+    answer = tip_response(machine, solution, nothing, t)
+    return float(lengths(off_path(machine, solution, t) + answer.forced).max())
+
+
+def joints_of(machine: MachineSystem, scene: Scene) -> tuple[np.ndarray, float, bool]:
+    """Return the rigid coordinates that are corrected, how well they move the tip, and a surplus.
+
+    Raises:
+        InputError: they do not move it along every component of its path.
+    """
+    names, asked = list(scene.rigid_units), scene.feed_forward.joints
+    every = np.sort([names.index(name) for name in scene.driven])
+    J, t = tip_by_joints(machine)
+    needed = min(int(np.linalg.matrix_rank(J[:, :, every]).max()), len(every))
+    if asked is None:
+        joints = max(combinations(every, needed), key=lambda one: least(J, one, needed).min())
+    else:
+        joints = tuple(sorted(names.index(name) for name in asked))
+    if len(joints) < needed:
+        raise InputError(
+            f"{scene.source}: feed_forward.joints: expected at least {needed} joints, as many as "
+            "the tip has directions"
+        )
+    values = least(J, joints, needed)
+    worst = int(values.argmin())
+    if values[worst] < SINGULAR:
+        moved = ", ".join(names[k] for k in joints)
+        raise InputError(
+            f"{scene.source}: feed_forward.joints: {moved} cannot move the tip along its path at "
+            f"t = {t[worst] - scene.lead:.4g} s; choose other joints, or a path that keeps away "
+            "from that position"
+        )
+    return np.array(joints), float(values[worst]), len(joints) > needed
+
+
+def least(J: np.ndarray, joints: tuple[int, ...], needed: int) -> np.ndarray:
+    """Return the least singular value (n,) of so many of the tip's Jacobian by some joints."""
+    sizes = np.linalg.svd(J[:, :, list(joints)], compute_uv=False)
+    return np.asarray(sizes[:, needed - 1])

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.dynamics.feed_forward import feed_forward_gradient
+from dolfinopt.dynamics.known_forces import feed_forward_gradient
 from dolfinopt.dynamics.measured import CLOSURE_COMPLIANCE_SHARE
 from dolfinopt.multibody.closures import ClosedLoops
 from dolfinopt.multibody.gradient import body_gradient

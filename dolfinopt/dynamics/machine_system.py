@@ -27,7 +27,7 @@ import numpy as np
 
 from dolfinopt.dynamics.drives import NO_COORDINATES, NOTHING, Drives
 from dolfinopt.dynamics.equilibrium import equilibrium
-from dolfinopt.dynamics.feed_forward import known_forces
+from dolfinopt.dynamics.known_forces import known_forces
 from dolfinopt.dynamics.machine_instants import MachineInstants
 from dolfinopt.dynamics.measured import DEFLECTION_LIMIT, EXACT
 from dolfinopt.dynamics.modes import modes_of

@@ -9,16 +9,16 @@ import numpy as np
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.march import BEYOND, REMEDY
-from dolfinopt.dynamics.measured import DEFLECTION_LIMIT
-from dolfinopt.dynamics.response_instants import response_instants
-from dolfinopt.dynamics.tip_feed_forward import (
+from dolfinopt.dynamics.feed_forward import (
     FeedForward,
     corrected,
     feed_forward_of,
     with_known_forces,
 )
+from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.march import BEYOND, REMEDY
+from dolfinopt.dynamics.measured import DEFLECTION_LIMIT
+from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.errors import ConvergenceError

@@ -12,10 +12,10 @@ import numpy as np
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.drive_forces import DriveForces
+from dolfinopt.dynamics.feed_forward import FeedForward, by_coefficients
 from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import FILE_ROUNDING
-from dolfinopt.dynamics.tip_feed_forward import FeedForward, by_coefficients
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import (

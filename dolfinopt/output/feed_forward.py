@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.disk import write_text
-from dolfinopt.dynamics.tip_feed_forward import FeedForward, internal_rates
+from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene
 

@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.dynamics.adjoint import add_gradients
+from dolfinopt.dynamics.feed_forward import FeedForward
 from dolfinopt.dynamics.load_gradient import load_counts, load_gradient
-from dolfinopt.dynamics.tip_feed_forward import FeedForward
 from dolfinopt.dynamics.trajectory import Followed, Trajectory
 from dolfinopt.fem.stress import LoadFields
 from dolfinopt.fem.tensors import element_centre

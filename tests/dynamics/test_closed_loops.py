@@ -21,7 +21,7 @@ from machines import (
 
 from dolfinopt.bench.field_machines import CRANK, END, ROD, crank, desired, rod, solved, unknowns
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.feed_forward import feed_forward
+from dolfinopt.dynamics.known_forces import feed_forward
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 

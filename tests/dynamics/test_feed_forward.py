@@ -8,7 +8,7 @@ from runs import ROOT
 from scipy.integrate import solve_ivp
 
 from dolfinopt import Model
-from dolfinopt.dynamics.tip_feed_forward import (
+from dolfinopt.dynamics.feed_forward import (
     Splines,
     graded_knots,
     internal_rates,
@@ -96,7 +96,7 @@ def test_more_coordinates_keep_the_tip(moved, plain) -> None:
     model = Model(ROOT / "demos" / "two_arm.toml", *SMALL, "reduction.coordinates=8")
     finer = model.simulate(model.uniform(0.5)).trajectory.problem
     from dolfinopt.dynamics import radau
-    from dolfinopt.dynamics.tip_feed_forward import corrected
+    from dolfinopt.dynamics.feed_forward import corrected
     from dolfinopt.profiling import Profile
 
     own = moved.problem

@@ -36,7 +36,7 @@ from scipy.integrate import solve_ivp
 import dolfinopt as do
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import desired_motion, largest_stiffness_change
-from dolfinopt.dynamics.feed_forward import feed_forward
+from dolfinopt.dynamics.known_forces import feed_forward
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.exchange.in_space import in_space
 from dolfinopt.multibody.kinematics import Posed

@@ -474,9 +474,10 @@ def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
     tried |= {"scenarios.changes", "scenarios.weight"}  # see test_bad_scenario
-    # In files of their own: test_regions, test_feed_forward, test_joints, test_machine_scenes, test_inp.
-    elsewhere = ("arms.regions", "control", "feed_forward", "closure", "joints", "forces", "arms.interfaces",
-                 "arms.inboard_bore", "arms.outboard_bore", "arms.mesh_scale",
+    # In files of their own: test_regions, test_joints, test_machine_scenes, test_inp,
+    # test_feed_forward.
+    elsewhere = ("arms.regions", "control", "closure", "joints", "forces", "arms.interfaces",
+                 "feed_forward", "arms.inboard_bore", "arms.outboard_bore", "arms.mesh_scale",
                  "constraints.stiffness.")  # fmt: skip
     assert {info.key for info in describe_keys() if not info.key.startswith(elsewhere)} <= tried
 
