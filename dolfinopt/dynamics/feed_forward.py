@@ -5,13 +5,12 @@ the flexible machine stays on the path y of the rigid one:
 
     min over c   1/2 sum_i w_i |h(t_i, c) - y(t_i)|^2 + c' R c / 2,
 
-R for the smoothest ones,
-
-by Gauss-Newton steps. The columns dh/dc follow from the linearised collocation equations, all
-right sides at once, so that nothing is integrated backwards in time: the internal dynamics of a
-flexible arm are unstable (non-minimum phase), their bounded solution begins before the motion does,
-within `lead`. Source: Seifried, Dynamics of Underactuated Multibody Systems (2014),
-doi:10.1007/978-3-319-01228-5; Bastos, Seifried & Bruels (2013), doi:10.1007/s11044-012-9318-6.
+R of their accelerations, by Gauss-Newton steps. The columns dh/dc follow from the linearised
+collocation equations, all right sides at once, so that nothing is integrated backwards in time: the
+internal dynamics of a flexible arm are unstable (non-minimum phase), their bounded solution begins
+before the motion does, within `lead`. Source: Seifried, Dynamics of Underactuated Multibody Systems
+(2014), doi:10.1007/978-3-319-01228-5; Bastos, Seifried & Bruels (2013),
+doi:10.1007/s11044-012-9318-6.
 """
 
 from __future__ import annotations
@@ -52,8 +51,8 @@ GROWTH = 1.5
 FIRST_SPACING = 0.02  # of the motion's duration
 AIM = 1e-4  # of the deviation without corrections
 STEPS = 2  # of Gauss-Newton: the first leaves 4e-3 of it on two_arm, the second 1e-5
-# Of the mean of the normal matrix's diagonal: it leaves 3e-8 m of two_arm's 55 mm; of more joints
-# than needed the smallest corrections, 4e-7 m, whose gradient 1e-8 leaves 1e-4 off.
+# Of the normal matrix's trace: it leaves 4e-8 m of two_arm's 55 mm; with joints in surplus 4e-7 m,
+# where the gradient of 1e-8 is 1e-4 off.
 REGULARISATION, OF_REDUNDANT = 1e-8, 1e-6
 CURVED = 1e-3  # of the deviation is left: second derivatives count
 CURVATURE_STEPS = 3
@@ -334,7 +333,7 @@ class FeedForward:
         machine: that moves with them.
         solution: its motion.
         corrections: of its joints.
-        share: regularisation of the least squares, see `REGULARISATION`.
+        redundant: whether more joints are corrected than the tip has directions.
         has_curvature: whether the coefficients follow the bodies by second derivatives, too.
         regularity: least singular value of the tip's Jacobian by these joints, over the reach.
         before, left: largest distance of the tip from its path without and with them, m.
@@ -344,7 +343,7 @@ class FeedForward:
     machine: MachineSystem
     solution: Solution
     corrections: Corrections
-    share: float
+    redundant: bool
     has_curvature: bool
     regularity: float
     before: float
@@ -352,7 +351,7 @@ class FeedForward:
 
     @cached_property
     def _squares(self) -> LeastSquares:
-        return least_squares(self.machine, self.solution, self.corrections, self.share)
+        return least_squares(self.machine, self.solution, self.corrections, self.redundant)
 
     @cached_property
     def _adjoint(self) -> Adjoint:
@@ -478,9 +477,9 @@ class LeastSquares:
 
 
 def least_squares(
-    machine: MachineSystem, solution: Solution, corrections: Corrections, share: float
+    machine: MachineSystem, solution: Solution, corrections: Corrections, redundant: bool
 ) -> LeastSquares:
-    """Return the linearised problem about a motion with corrections; `share` of REGULARISATION."""
+    """Return the linearised problem about a motion with corrections, see `FeedForward`."""
     knots = corrections.splines.knots
     t = np.sort(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])]))
     answer = tip_response(machine, solution, corrections, t)
@@ -488,13 +487,23 @@ def least_squares(
     J = answer.by_coefficients.reshape(len(gap), -1)
     weights = np.repeat(np.gradient(t), len(gap) // len(t))
     normal = J.T @ (weights[:, None] * J)
+    share = OF_REDUNDANT if redundant else REGULARISATION
+    roughness = share * np.trace(normal) * _roughness(corrections, t, redundant)
+    return LeastSquares(t, weights, J, gap, normal + roughness, roughness)
+
+
+def _roughness(corrections: Corrections, t: np.ndarray, redundant: bool) -> np.ndarray:
+    """Return the matrix (p F, p F) of the integral of squared accelerations, of trace 1.
+
+    Joints in surplus may share a constant offset, which has none: there their size counts as much.
+    """
     bends = corrections.splines.at(t)[2]
     squares = bends.T @ (np.gradient(t)[:, None] * bends)
-    if share == OF_REDUNDANT:  # several joints may share a constant offset
-        squares = squares / np.trace(squares) + np.eye(len(squares)) / len(squares)
+    squares /= np.trace(squares)
+    if redundant:
+        squares += np.eye(len(squares)) / len(squares)
     roughness = np.kron(squares, np.eye(len(corrections.joints)))
-    roughness *= share * np.trace(normal) / np.trace(roughness)
-    return LeastSquares(t, weights, J, gap, normal + roughness, roughness)
+    return np.asarray(roughness / np.trace(roughness))
 
 
 def at_rest(machine: MachineSystem, tolerance: float, stages: int) -> Solution:
@@ -519,7 +528,6 @@ def feed_forward_of(
     joints, regularity, redundant = joints_of(machine, scene)
     options, asked = scene.simulation, scene.feed_forward.spacing
     spacing = asked or FIRST_SPACING * scene.motion.duration
-    share = OF_REDUNDANT if redundant else REGULARISATION
     run = partial(
         radau.integrate, tolerance=options.tolerance, stages=options.stages, profile=profile
     )
@@ -531,7 +539,7 @@ def feed_forward_of(
         corrections, moved, solution = Corrections(joints, splines, none), machine, first
         for number in range(1 + STEPS):
             if number < STEPS:
-                squares = least_squares(moved, solution, corrections, share)
+                squares = least_squares(moved, solution, corrections, redundant)
             else:  # what is left is answered by the same derivatives
                 squares = replace(squares, gap=off_path(moved, solution, squares.t).ravel())
             corrections = replace(corrections, coefficients=squares.step(corrections.coefficients))
@@ -543,7 +551,7 @@ def feed_forward_of(
         spacing, last = 0.5 * spacing, left
     curved = redundant or left > CURVED * before
     return FeedForward(
-        machine, moved, solution, corrections, share, curved, regularity, before, left
+        machine, moved, solution, corrections, redundant, curved, regularity, before, left
     )
 
 
