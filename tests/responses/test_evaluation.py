@@ -380,11 +380,13 @@ def test_instants_follow_the_bend_of_the_motion() -> None:
         -(speed**2) * wave_of(np.sin, times), 0.0, 0,
     )  # fmt: skip
     K = np.array([[3.0]])
-    t = response_instants(solution, K, slice(None), horizon, 30)
+    t = response_instants(solution, K, slice(None), 0.0, horizon, 30)
     assert (t[0], t[-1]) == (0.0, horizon)
     assert (speed * t[1]) ** 2 / 8.0 == pytest.approx(1e-4, rel=0.2)
-    slow = response_instants(replace(solution, a=1e-4 * solution.a), K, slice(None), horizon, 30)
+    slow = response_instants(
+        replace(solution, a=1e-4 * solution.a), K, slice(None), 0.0, horizon, 30
+    )
     np.testing.assert_array_equal(slow, np.linspace(0.0, horizon, 501))
-    assert len(response_instants(solution, K, slice(None), horizon, 100_000)) == 100_001
+    assert len(response_instants(solution, K, slice(None), 0.0, horizon, 100_000)) == 100_001
     long = replace(solution, time_grid=1e5 * grid)
-    assert len(response_instants(long, K, slice(None), 1e5 * horizon, 30)) == 100_001
+    assert len(response_instants(long, K, slice(None), 0.0, 1e5 * horizon, 30)) == 100_001

@@ -70,7 +70,7 @@ def no_trajectory(patch: pytest.MonkeyPatch) -> None:
             for body in adjoint.system.mechanism.bodies
         ]
 
-    patch.setattr(Adjoint, "gradient", none)
+    patch.setattr(Adjoint, "by_bodies", none)
 
 
 def no_start(patch: pytest.MonkeyPatch) -> None:

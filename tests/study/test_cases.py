@@ -64,6 +64,7 @@ CHANGES = {
     "constraints": "constraints.first_frequency=1.0",
     "design": "design.initial=0.4",
     "optimizer": "optimizer.max_iterations=4",
+    "feed_forward": "feed_forward.kind=tip",
     "control": "control={stiffness=[1e3, 1e3, 1e3], damping=[1.0, 1.0, 1.0]}",
     "scenarios": "scenarios=[{changes=['payload.mass=4']}]",
 }
