@@ -13,6 +13,7 @@ from dolfinopt.optimization.measured import (
     LARGEST_ASYMPTOTE_DISTANCE,
     LEAP_FACTOR,
     LEAST_REACH,
+    LEAST_REACH_RISING,
     MERIT_RISE,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
@@ -170,7 +171,8 @@ class Iterate:
                 factor = shorter * (SHORTER_REACH if rose else growth)
                 # A sharp projection leaps however short the step: without a least one it settles.
                 sharp = self.scene.design.projection and self.projection.complete
-                self.reach = min(1.0, max(0.0 if sharp else LEAST_REACH, factor * self.reach))
+                least = LEAST_REACH_RISING if rises else 0.0 if sharp else LEAST_REACH
+                self.reach = min(1.0, max(least, factor * self.reach))
                 return
             self.projection.beta = before
             rises = False  # the shorter step is one of the same projection
