@@ -101,7 +101,7 @@ def test_gradients_by_the_design_of_both_arms(changes):
     h = 1e-5
     pairs = [evaluator.evaluate(x + sign * h * direction)[0].evaluation for sign in (1, -1)]
     ahead, behind = (np.array([one.objective, *one.constraints]) for one in pairs)
-    slopes = WORLD.allreduce(np.vstack([here.objective, here.constraints]) @ direction)
+    slopes = np.vstack([here.objective, here.constraints]) @ direction
     counted = slice(None) if "objective.kind=static" in changes else slice(1)
     differences = (ahead - behind) / (2.0 * h)
     np.testing.assert_allclose(slopes[counted], differences[counted], rtol=1e-5)

@@ -72,7 +72,7 @@ def test_regions_stay_in_every_design(projection, symmetric):
             by_x = arms[k].backward(np.ones(mesh.num_cells), one)
             assert (by_x[mesh.fixed] == 0.0).all() and (by_x[~mesh.fixed] > 0.0).any()
     fixed = variables.xmin == variables.xmax
-    assert fixed.sum() == sum(arm.mesh.fixed.sum() for arm in arms.values())
+    assert fixed.sum() == WORLD.allreduce(sum(arm.mesh.fixed.sum() for arm in arms.values()))
 
 
 def test_regions_are_drawn():
