@@ -51,7 +51,7 @@ GROWTH = 1.5
 FIRST_SPACING = 0.02  # of the motion's duration
 AIM = 1e-4  # of the deviation without corrections
 STEPS = 2  # of Gauss-Newton: the first leaves 4e-3 of it on two_arm, the second 1e-5
-# Of the normal matrix's trace: it leaves 4e-8 m of two_arm's 55 mm; with joints in surplus 4e-7 m,
+# Of the normal matrix's trace: it leaves 1e-6 m of two_arm's 55 mm; with joints in surplus 4e-7 m,
 # where the gradient of 1e-8 is 1e-4 off.
 REGULARISATION, OF_REDUNDANT = 1e-8, 1e-6
 CURVED = 1e-3  # of the deviation is left: second derivatives count
