@@ -33,34 +33,33 @@ from dolfinopt.dynamics.collocation import (
     stages_of,
 )
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.measured import EXACT
+from dolfinopt.dynamics.measured import (
+    CURVATURE_STEPS,
+    CURVED_SHARE,
+    EXACT,
+    FINEST_KNOTS,
+    FIRST_SPACING,
+    FORCE_INTERVAL,
+    GAUSS_NEWTON_STEPS,
+    JOINT_DIFFERENCE,
+    KNOT_GROWTH,
+    LEFT_AIM,
+    OF_REDUNDANT,
+    REGULARISATION,
+    SINGULAR_TIP,
+    SPLINE_DEGREE,
+    TIP_INSTANTS,
+)
 from dolfinopt.dynamics.newton_matrix import matrix_of
 from dolfinopt.dynamics.system import unchanged
 from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_instants
 from dolfinopt.dynamics.time_grid import first_grid
-from dolfinopt.errors import InputError
+from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.multibody.kinematics import end_effector, end_effector_gradient, lengths
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-
-DEGREE = 5
-FINEST = 16.0  # times closer are knots beside breakpoints, where steps grow by
-GROWTH = 1.5
-FIRST_SPACING = 0.02  # of the motion's duration
-AIM = 1e-4  # of the deviation without corrections
-STEPS = 2  # of Gauss-Newton: the first leaves 4e-3 of it on two_arm, the second 1e-5
-# Of the normal matrix's trace: it leaves 1e-6 m of two_arm's 55 mm; with joints in surplus 4e-7 m,
-# where the gradient of 1e-8 is 1e-4 off.
-REGULARISATION, OF_REDUNDANT = 1e-8, 1e-6
-CURVED = 1e-3  # of the deviation is left: second derivatives count
-CURVATURE_STEPS = 3
-DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
-FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
-SINGULAR = 1e-3  # least singular value of the tip's Jacobian, over the reach
-INSTANTS = 121  # at which it is looked at
-
 
 # -- corrections -----------------------------------------------------------------------------
 
@@ -80,17 +79,19 @@ class Splines:
         from scipy.interpolate import BSpline  # takes as long to import as NumPy
 
         ends = self.knots[[0, -1]]
-        knots = np.concatenate([np.repeat(ends[0], DEGREE), self.knots, np.repeat(ends[1], DEGREE)])
+        knots = np.concatenate(
+            [np.repeat(ends[0], SPLINE_DEGREE), self.knots, np.repeat(ends[1], SPLINE_DEGREE)]
+        )
         # The first three coefficients are equal, and so are the last three.
-        count = len(self.knots) + DEGREE - 1
+        count = len(self.knots) + SPLINE_DEGREE - 1
         tie = np.repeat(np.eye(count - 4), [3, *[1] * (count - 6), 3], axis=0)
-        spline = BSpline(knots, tie, DEGREE)
+        spline = BSpline(knots, tie, SPLINE_DEGREE)
         return spline, spline.derivative(1), spline.derivative(2)
 
     @property
     def count(self) -> int:
         """Number p of coefficients of a joint."""
-        return len(self.knots) + DEGREE - 5
+        return len(self.knots) + SPLINE_DEGREE - 5
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return all splines, their rates and accelerations (3, n, p) at instants t (n,), s."""
@@ -162,7 +163,7 @@ def graded_knots(breakpoints: tuple[float, ...], spacing: float) -> np.ndarray:
     for begin, end in pairwise(breakpoints):
         half = 0.5 * (end - begin)
         steps = np.minimum(
-            spacing, spacing / FINEST * GROWTH ** np.arange(int(half / spacing) + 20)
+            spacing, spacing / FINEST_KNOTS * KNOT_GROWTH ** np.arange(int(half / spacing) + 20)
         )
         near = np.cumsum(steps)
         near = near[near < half]
@@ -207,7 +208,7 @@ def tip_by_joints(machine: MachineSystem) -> tuple[np.ndarray, np.ndarray]:
 
     Joints that follow in closed loops follow.
     """
-    t = np.linspace(0.0, machine.breakpoints[-1], INSTANTS)
+    t = np.linspace(0.0, machine.breakpoints[-1], TIP_INSTANTS)
     motion, none = machine.motion(t), np.zeros((len(t), machine.mechanism.num_coordinates))
     J = tip_jacobians(machine, motion, none)[1]
     if machine.loops is not None:
@@ -372,9 +373,15 @@ class FeedForward:
         change = np.linalg.solve(squares.normal, by_coefficients.ravel())
         beside: list[ShapeIntegrals] = []
         if self.has_curvature:
+            first = np.linalg.norm(change)
             for _ in range(CURVATURE_STEPS):
                 curved, beside = self._curvature(change)
                 change = np.linalg.solve(squares.normal, by_coefficients.ravel() + curved)
+            if np.linalg.norm(change) > 2.0 * first:
+                raise ConvergenceError(
+                    "feed-forward: the tip stays too far off its path for a gradient of the "
+                    "corrections; raise feed_forward.lead, or correct other joints"
+                )
         weights = -squares.weights * (squares.by_coefficients @ change)
         found = self._follow(self.machine, self.solution, weights)[0]
         return add_gradients(found, beside) if beside else found
@@ -383,7 +390,7 @@ class FeedForward:
         """Return -S mu (p F,) and -d/d eps of the bodies' derivative, by central differences."""
         squares, corrections = self._squares, self.corrections
         mu = change.reshape(corrections.coefficients.shape)
-        eps = DIFFERENCE / np.abs(corrections.splines.at(squares.t)[0] @ mu).max()
+        eps = JOINT_DIFFERENCE / np.abs(corrections.splines.at(squares.t)[0] @ mu).max()
         weights = squares.weights * squares.gap / (2.0 * eps)
         sides = []
         for sign in (1.0, -1.0):
@@ -519,7 +526,8 @@ def feed_forward_of(
 ) -> FeedForward:
     """Return the corrections of a scene's machine.
 
-    The knots are as close as it takes to leave `AIM` of the deviation, or as the scene has them.
+    The knots are as close as it takes to leave `LEFT_AIM` of the deviation, or as the scene has
+    them.
 
     Raises:
         ConvergenceError: a motion with corrections cannot be simulated.
@@ -537,8 +545,8 @@ def feed_forward_of(
         splines = Splines(graded_knots(machine.breakpoints, spacing))
         none = np.zeros((splines.count, len(joints)))
         corrections, moved, solution = Corrections(joints, splines, none), machine, first
-        for number in range(1 + STEPS):
-            if number < STEPS:
+        for number in range(1 + GAUSS_NEWTON_STEPS):
+            if number < GAUSS_NEWTON_STEPS:
                 squares = least_squares(moved, solution, corrections, redundant)
             else:  # what is left is answered by the same derivatives
                 squares = replace(squares, gap=off_path(moved, solution, squares.t).ravel())
@@ -546,10 +554,10 @@ def feed_forward_of(
             moved = corrected(machine, corrections)
             solution = guess = run(moved, guess=guess)
         left = float(lengths(off_path(moved, solution, squares.t)).max())
-        if asked or left <= AIM * before or left > 0.5 * last:
+        if asked or left <= LEFT_AIM * before or left > 0.5 * last:
             break
         spacing, last = 0.5 * spacing, left
-    curved = redundant or left > CURVED * before
+    curved = redundant or left > CURVED_SHARE * before
     return FeedForward(
         machine, moved, solution, corrections, redundant, curved, regularity, before, left
     )
@@ -584,7 +592,7 @@ def joints_of(machine: MachineSystem, scene: Scene) -> tuple[np.ndarray, float, 
         )
     values = least(J, joints, needed)
     worst = int(values.argmin())
-    if values[worst] < SINGULAR:
+    if values[worst] < SINGULAR_TIP:
         moved = ", ".join(names[k] for k in joints)
         raise InputError(
             f"{scene.source}: feed_forward.joints: {moved} cannot move the tip along its path at "

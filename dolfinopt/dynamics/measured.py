@@ -83,3 +83,22 @@ POLE_STEP = 3e-3
 # -- drives ----------------------------------------------------------------------------------
 
 LINEAR_DRIVE_SHARE = 0.95  # of its limit, up to which a drive gives what is wanted of it
+
+# -- feed_forward ----------------------------------------------------------------------------
+
+SPLINE_DEGREE = 5  # four times continuously differentiable, as tables of joints
+FINEST_KNOTS = 16.0  # times closer are knots beside breakpoints, where steps grow by
+KNOT_GROWTH = 1.5  # a step over the one before, away from breakpoints
+FIRST_SPACING = 0.02  # of the motion's duration
+LEFT_AIM = 1e-4  # of the deviation without corrections
+GAUSS_NEWTON_STEPS = 2  # the first leaves 4e-3 of it on two_arm, the second 1e-5
+# Of the normal matrix's trace: it leaves 1e-6 m of two_arm's 55 mm; with joints in surplus 4e-7 m,
+# where the gradient of 1e-8 is 1e-4 off.
+REGULARISATION = 1e-8
+OF_REDUNDANT = 1e-6
+CURVED_SHARE = 1e-3  # of the deviation is left: second derivatives count
+CURVATURE_STEPS = 3
+JOINT_DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
+FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
+SINGULAR_TIP = 1e-3  # least singular value of the tip's Jacobian, over the reach
+TIP_INSTANTS = 121  # at which it is looked at

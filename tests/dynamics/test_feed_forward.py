@@ -8,14 +8,18 @@ from runs import ROOT
 from scipy.integrate import solve_ivp
 
 from dolfinopt import Model
+from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.feed_forward import (
     Splines,
+    corrected,
     graded_knots,
     internal_rates,
     off_path,
 )
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import end_effector
+from dolfinopt.output.feed_forward import FILE, write_feed_forward
+from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
 
@@ -95,10 +99,6 @@ def test_more_coordinates_keep_the_tip(moved, plain) -> None:
     """The corrections of four coordinates an arm, on the machine with eight."""
     model = Model(ROOT / "demos" / "two_arm.toml", *SMALL, "reduction.coordinates=8")
     finer = model.simulate(model.uniform(0.5)).trajectory.problem
-    from dolfinopt.dynamics import radau
-    from dolfinopt.dynamics.feed_forward import corrected
-    from dolfinopt.profiling import Profile
-
     own = moved.problem
     machine = corrected(
         type(own)(finer.mechanism, own.path, own.breakpoints), moved.feed_forward.corrections
@@ -110,8 +110,6 @@ def test_more_coordinates_keep_the_tip(moved, plain) -> None:
 
 def test_table_repeats_the_run(moved, plain, tmp_path) -> None:
     """feed_forward.csv as motion.file: the same path of the tip."""
-    from dolfinopt.output.feed_forward import FILE, write_feed_forward
-
     write_feed_forward(tmp_path, moved)
     horizon = moved.sampled.t[-1]
     told = f"motion.file='{tmp_path / FILE}'", f"motion.duration={horizon}"
@@ -174,7 +172,7 @@ def test_singular_positions_are_named() -> None:
     ],
 )
 def test_gradient_with_joints_in_surplus_and_in_space(scene, changes) -> None:
-    """Along all densities against a difference; what noise leaves of it: 5e-5."""
+    """Along all densities against a difference, which noise leaves 5e-5 off."""
     told = TIP, "objective.gradient=exact", "objective.kind=integral_compliance"
     model = Model(ROOT / "demos" / f"{scene}.toml", *changes, *told, "simulation.tolerance=1e-7")
     slope = sum(g.sum() for g in model.gradient(model.uniform(0.5)).values())
