@@ -12,6 +12,7 @@ from runs import refused
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.abaqus import facets_of, read_abaqus
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.scene.load import Arm
@@ -169,8 +170,18 @@ def test_sets_are_interfaces_and_regions(surfaces, tmp_path) -> None:
     ("text", "words"),
     [
         ("solid bar\n", ["bar.inp", "begins with *"]),
-        ("*NODE\n1, 0, 0, 0\n*INCLUDE, INPUT=/etc/passwd\n", ["*INCLUDE", "one file"]),
-        ("*NODE\n1, 0, 0\n*ELEMENT, TYPE=C3D8\n1, 2\n", ["cannot be read"]),
+        ("*NODE\n1, 0, 0, 0\n*INCLUDE, INPUT=/etc/passwd\n", ["line 3, *INCLUDE", "one file"]),
+        ("*NODE\n1, 0, 0\n*ELEMENT, TYPE=C3D8\n1, 1\n",
+         ["line 4, *ELEMENT, TYPE=C3D8", "8 nodes"]),
+        ("*NODE\n1, 0, a\n", ["line 2, *NODE", "'a' is not a number"]),
+        ("*NODE\n1, 0\n*ELEMENT, TYPE=C3D6\n", ["line 3, *ELEMENT, TYPE=C3D6", "hexahedra"]),
+        ("*NODE\n1, 0\n1, 1\n", ["line 3, *NODE", "node 1 for the second time"]),
+        ("*NODE\n1, 0\n*ELEMENT, TYPE=C3D4\n1, 1, 1, 1, 2\n", ["line 4", "no node 2"]),
+        ("*NODE\n1, 0\n*NSET, NSET=a, GENERATE\n1, 5, 1, 1\n", ["line 4, *NSET", "step"]),
+        ("*NODE\n1, 0\n*NSET,\nNSET=a\n1, b\n", ["line 5, *NSET,NSET=a", "'b'"]),
+        ("*NODE, INPUT=nodes.txt\n", ["line 1, *NODE, INPUT=nodes.txt", "one file"]),
+        ("*NODE, SYSTEM=C\n1, 0\n", ["line 1", "another system"]),
+        ("*NODE\n1, 0\n*NGEN\n1, 5\n", ["line 3, *NGEN", "written out"]),
         ("*NODE\n1,0,0,0\n2,1,0,0\n3,0,1,0\n*ELEMENT, TYPE=CPS3\n1,1,2,3\n", ["C3D4", "C3D8"]),
     ],
 )
@@ -178,6 +189,37 @@ def test_files_that_are_no_link(text, words, tmp_path) -> None:
     (tmp_path / "bar.inp").write_text(text)
     with refused(*words):
         link(tmp_path, "bar.inp")
+
+
+def test_forms_that_programs_write(folder) -> None:
+    """Several blocks of nodes, GENERATE, sets of sets, lines and masses beside the cells."""
+    lines = (folder / "link.inp").read_text().splitlines()
+    first = next(k for k, line in enumerate(lines) if line.upper().startswith("*NODE")) + 1
+    last = next(k for k in range(first, len(lines)) if lines[k].startswith("*"))
+    nodes, rest = lines[first:last], lines[last:]
+    half = len(nodes) // 2
+    rest = [line.replace("NSET=inboard", "NSET=left") for line in rest]
+    more = ["*NSET, NSET=INBOARD", "left,", "*NSET, NSET=fixed, GENERATE", "1, 5, 2", "7, 9",
+            "*ELEMENT, TYPE=B31, ELSET=BEAM", "900001, 1, 2", "*ELEMENT, TYPE=MASS", "900002, 1",
+            "*MASS, ELSET=BEAM", "0.1"]  # fmt: skip
+    text = [*lines[:first], *nodes[:half], "*Node, nset=second", *nodes[half:], *rest, *more]
+    (folder / "forms.inp").write_text("\r\n".join(text))
+    assert same(link(folder, "forms.inp"), link(folder, "link.msh"))
+    mesh = read_abaqus("\n".join(text))
+    assert mesh.node_sets["fixed"] == [1, 3, 5, 7, 8, 9]
+    assert len(mesh.node_sets["second"]) == len(nodes) - half
+
+
+def test_nodes_of_an_element_set_and_faces_of_a_surface() -> None:
+    """`*NSET, ELSET=` takes corners; a surface names sets, elements or nodes."""
+    text = (
+        "*NODE\n1,0,0,0\n2,1,0,0\n3,0,1,0\n4,0,0,1\n*ELEMENT, TYPE=C3D4, ELSET=E\n"
+        "7, 1, 2,\n3, 4\n*NSET, NSET=n, ELSET=e\n*SURFACE, NAME=s\n7, S2\nE, S4\n"
+        "*SURFACE, TYPE=NODE, NAME=p\nn, 1.0\n"
+    )
+    mesh = read_abaqus(text)
+    assert mesh.node_sets == {"n": [1, 2, 3, 4], "p": [1, 2, 3, 4]}
+    assert facets_of(mesh, "s") == [[1, 4, 2], [3, 4, 1]]
 
 
 def test_what_is_missing_is_told(folder) -> None:
