@@ -380,7 +380,10 @@ def _write_scene(folder: Path, scene: RobotScene, t: np.ndarray, rows: np.ndarra
     for body in scene.bodies:
         if body.size is not None:
             sides = " x ".join(f"{one:.3g}" for one in (body.length, *body.size))
-            what = "a box to edit" if body.mesh is None else f"its shape, {body.mesh.cells} cells"
+            box = (
+                "a box to edit" if body.measured else "a box whose height and thickness are a guess"
+            )
+            what = box if body.mesh is None else f"its shape, {body.mesh.cells} cells"
             click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
             if body.mesh is not None and body.mesh.done:
                 click.echo(f"{scene.arms[body.link]}: {'; '.join(body.mesh.done)}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 
 import basix
 import numpy as np
@@ -18,8 +19,10 @@ from dolfinopt.mesh.measured import (
     FRAME_TOLERANCE,
     FULL_TURN_ANGLE,
     TOUCHING_AREA_SHARE,
+    UNIT_FACTOR,
 )
 from dolfinopt.scene.load import Arm
+from dolfinopt.scene.tables.arms import STEP_FILES
 
 OVERLAP = "overlap others (inverted cells, or {} on top of each other)"
 TENSOR_PLANE = {3: [0, 1, 2], 4: [0, 1, 3, 2]}  # from corners around a cell to DOLFINx's order
@@ -158,6 +161,22 @@ def check_extents(used: np.ndarray, arm: Arm) -> None:
                 f"its {key} is {wide:.6g} m, expected {key} = {size:.6g} m within {tolerance:.3g} "
                 f"m; {remedy(wide, size, key)}"
             )
+
+
+def check_unit(points: np.ndarray, arm: Arm) -> None:
+    """Raise InputError where the points (n, 3) spread as if their unit were another one."""
+    expected = sorted((arm.length, arm.height, arm.thickness * arm.is_solid), reverse=True)[:2]
+    spread = np.sort(np.ptp(points, axis=0))[:-3:-1]
+    for unit, name in ((1e-3, "millimetres"), (1e3, "kilometres")):
+        ratio = unit * spread / expected
+        if not ((ratio > 1.0 / UNIT_FACTOR) & (ratio < UNIT_FACTOR)).all():
+            continue
+        wide = " x ".join(f"{size:.4g}" for size in spread)
+        arms = " x ".join(f"{size:.4g}" for size in expected)
+        told = f"its extents are {wide} m, those of the arm {arms} m: "
+        if Path(str(arm.mesh)).suffix.lower() in STEP_FILES:
+            raise InputError(f"{told}export the STEP file again in the unit that it is drawn in")
+        raise InputError(f"{told}is its unit {name}? arms.mesh_scale = {unit * arm.mesh_scale:g}")
 
 
 def remedy(found: float, expected: float, keys: str) -> str:

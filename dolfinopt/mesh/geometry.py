@@ -19,6 +19,7 @@ from dolfinopt.mesh.checks import (
     FlatMesh,
     check_cells,
     check_extents,
+    check_unit,
     check_facets,
     check_mesh,
     check_place,
@@ -99,8 +100,8 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     with telling_where(where):
         with silent_terminal():
             groups = _read(gmsh, arm, unknown)
-            if arm.is_solid:
-                groups = placed(gmsh, groups, arm)
+            check_unit(arm.mesh_scale * gmsh.model.mesh.getNodes()[1].reshape(-1, 3), arm)
+            groups = placed(gmsh, groups, arm)
         _set_groups(gmsh, groups, arm)
         facets = (_check_solid if arm.is_solid else _check_plane)(gmsh, groups, arm)
     if arm.is_solid:

@@ -52,7 +52,7 @@ def read_inp(gmsh: Any, arm: Arm, _: list[str]) -> Entities:
         for group in interface_names(arm)
         if group not in bores_of(arm)
     }
-    return into_model(gmsh, SolidCells(points, cells, facets))
+    return into_model(gmsh, SolidCells(points, cells, facets), 3)
 
 
 def _text(path: Path) -> str:

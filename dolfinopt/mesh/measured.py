@@ -56,6 +56,8 @@ FILE_CELL_BYTES = {
 
 # -- geometry --------------------------------------------------------------------------------
 
+# Extents that are those of the arm in another unit, within this factor: flanges stick out.
+UNIT_FACTOR = 2.0
 INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
 # Cosine to z of a side face's normal, and what is missing to 1 of an end face's: rounding of

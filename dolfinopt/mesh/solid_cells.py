@@ -144,15 +144,16 @@ def boundary(cells: np.ndarray) -> np.ndarray:
     return np.asarray(facets[count[which.ravel()] == 1])
 
 
-def into_model(gmsh: Any, mesh: SolidCells) -> Entities:
-    """Make cells, facets and their points a model of Gmsh, in place of what it has."""
+def into_model(gmsh: Any, mesh: SolidCells, dim: int) -> Entities:
+    """Make cells of a dimension, facets and points a model of Gmsh, in place of what it has."""
     gmsh.clear()
-    model, dim = gmsh.model, mesh.points.shape[1]
+    model = gmsh.model
     model.add("solid")
     used = np.unique(np.concatenate([rows.ravel() for rows in mesh.cells.values()]))
     number = np.zeros(len(mesh.points), dtype=int)
     number[used] = np.arange(1, len(used) + 1)
-    places = np.pad(mesh.points[used], ((0, 0), (0, 3 - dim)))
+    places = mesh.points[used]
+    places = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
     found: Entities = {group: [] for group in NAMES}
     for d, groups in ((dim, mesh.cells), (dim - 1, mesh.facets)):
         for group, rows in groups.items():
@@ -177,13 +178,14 @@ def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
     bores = bores_of(arm)
     if not bores and arm.mesh_scale == 1.0:
         return groups
+    dim = 3 if arm.is_solid else 2
     points = arm.mesh_scale * points_by_tag(gmsh)
-    cells = {group: elements_of(gmsh, 3, groups[group]) for group in REGIONS if groups[group]}
+    cells = {group: elements_of(gmsh, dim, groups[group]) for group in REGIONS if groups[group]}
     widths = {rows.shape[1] for rows in cells.values()}
-    if len(widths) != 1 or not widths <= set(SIDES):
+    if len(widths) != 1 or not widths <= {corners for d, corners in STRAIGHT if d == dim}:
         return groups  # told by its kinds of cells
     facets = {
-        group: elements_of(gmsh, 2, groups[group])
+        group: elements_of(gmsh, dim - 1, groups[group])
         for group in interface_names(arm)
         if group not in bores
     }
@@ -192,7 +194,7 @@ def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
         facets[group] = _of_bore(points, outer, bore, interface_names(arm)[group])
     if (frame := frame_of(arm)) is not None:
         points = (points - np.array(frame[0])) @ np.array(frame[1]).T
-    return into_model(gmsh, SolidCells(points, cells, facets))
+    return into_model(gmsh, SolidCells(points, cells, facets), dim)
 
 
 def _of_bore(points: np.ndarray, outer: np.ndarray, bore: Bore, name: str) -> np.ndarray:
@@ -464,7 +466,9 @@ def add_cells(gmsh: Any, mesh: InterfaceMesh) -> None:
     if isinstance(mesh, Tetrahedra):
         for k, (name, own) in enumerate(mesh.further.items(), FURTHER):
             names[k], facets[k] = name, own
-    groups = into_model(gmsh, SolidCells(mesh.points, {DESIGN: mesh.cells}, facets))
+    groups = into_model(
+        gmsh, SolidCells(mesh.points, {DESIGN: mesh.cells}, facets), mesh.points.shape[1]
+    )
     model, dim = gmsh.model, mesh.points.shape[1]
     for group in (DESIGN, *facets):
         d = dim - (group != DESIGN)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import remedy
+from dolfinopt.mesh.checks import check_unit, remedy
 from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import DESIGN, FURTHER, PASSIVE, mesh_surfaces, mesh_volumes
 from dolfinopt.mesh.measured import (
@@ -52,6 +52,7 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
     open_file(gmsh, path)
     model = gmsh.model
     everywhere = _vertices(model, model.getEntities(1))
+    check_unit(everywhere, arm)
     found = no_groups(arm)
     if arm.is_solid:
         _glue_solids(model, found)

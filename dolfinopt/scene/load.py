@@ -444,8 +444,7 @@ def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
     arm = tree["arms"][loc[1]]
     if not isinstance(arm, dict):
         return
-    others = MESH_KEYS if loc[2] == "cells" else OF_OTHER_MESHES
-    for key in others:
+    for key in MESH_KEYS if loc[2] == "cells" else ("cells",):
         arm.pop(key, None)
 
 

@@ -9,6 +9,7 @@ import pytest
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 from runs import ROOT, refusal, run
 
+from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import implausible_inertias, read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.scene.load import load_scene
@@ -239,7 +240,31 @@ def test_meshes_are_found_in_their_package(tmp_path, monkeypatch, how):
     link = read_robot(file, stated).links["b"]
     assert not link.missing and link.volume == pytest.approx(1.0)
     if how == "option":
-        assert read_robot(file).links["b"].missing == ("package://arm/meshes/a.stl",)
+        assert read_robot(file).links["b"].missing == ("mesh package://arm/meshes/a.stl not found",)
+
+
+def test_a_mesh_whose_name_differs_by_capitals_is_named(tmp_path):
+    mesh = '<collision><geometry><mesh filename="meshes/Arm.STL"/></geometry></collision>'
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "arm.stl").write_bytes(b"")
+    file = tmp_path / "r.urdf"
+    file.write_text(f'<robot name="r"><link name="a">{mesh}</link></robot>')
+    assert read_robot(file).links["a"].missing == (
+        "mesh meshes/Arm.STL not found; there is arm.stl",
+    )
+
+
+def test_a_loop_is_told_where_to_stand(tmp_path):
+    joints = "".join(
+        f'<joint name="{parent}{child}" type="revolute"><parent link="{parent}"/>'
+        f'<child link="{child}"/><axis xyz="0 0 1"/><limit effort="1" velocity="1"/></joint>'
+        for parent, child in ("ab", "ac", "bc")
+    )
+    file = tmp_path / "r.urdf"
+    links = "".join(f'<link name="{name}"/>' for name in "abc")
+    file.write_text(f'<robot name="r">{links}{joints}</robot>')
+    with pytest.raises(InputError, match=r"held by 2 joints.*--closures"):
+        read_robot(file)
 
 
 def test_limits_and_friction_come_into_the_scene(tmp_path):

@@ -368,7 +368,7 @@ BOTH = 'Physical Surface("design") = {1}; Physical Surface("passive") = {1};'
         (PLAIN + ENDS, {"length": 0.6}, ["(0.5, 0) m", "(length, 0) = (0.6, 0) m"]),
         (PLAIN + ENDS, {"height": 0.1}, ["0.06 m", "height = 0.1 m within 0.005 m"]),
         (PLAIN + ENDS, {"height": 0.04}, ["0.06 m", "height = 0.04 m within 0.002 m"]),
-        (MILLIMETRES + ENDS, {}, ["(500, 0) m", "(length, 0) = (0.5, 0) m", "millimetres"]),
+        (MILLIMETRES + ENDS, {}, ["500 x 60 m", "0.5 x 0.06 m", "millimetres", "mesh_scale"]),
         (PLAIN + ENDS, {"mesh_size": 0.01}, ['no parameter "mesh size (m)"']),
         (PLAIN.replace("0.03, 0,", "0.03, 1,") + ENDS, {}, ["1 m off the plane z = 0"]),
         (PLAIN + ENDS + "Point(9) = {foo, 0, 0};", {}, ["'foo'"]),
@@ -424,6 +424,24 @@ def test_meshes_that_cannot_be_an_arm(shared_tmp_path, write):
     refused(write("none.msh", "hello\n"), "not a mesh of Gmsh")
     refused(BORES, "half the height, 0.03 m", passive=0.02)
     refused(BORES, "overlap", "length 0.05 m", length=0.05)
+
+
+def test_a_mesh_in_millimetres(shared_tmp_path, write):
+    """The unit is told before what follows from it; with its scale the arm is that in metres."""
+    text = PLAIN + ENDS + 'Physical Surface("design") = {1};'
+
+    def scaled(gmsh):
+        gmsh.model.geo.dilate(gmsh.model.getEntities(), 0, 0, 0, 1e3, 1e3, 1e3)
+        gmsh.model.geo.synchronize()
+        gmsh.model.mesh.setSize(gmsh.model.getEntities(0), 20.0)
+        gmsh.model.mesh.generate(2)
+
+    path = remade(shared_tmp_path / "mm.msh", text, scaled)
+    refused(path, "500 x 60 m", "0.5 x 0.06 m", "arms.mesh_scale = 0.001")
+    mesh = arm_mesh(COMM, entry(path, mesh_scale=1e-3))
+    plain = arm_mesh(COMM, entry(write("m.geo", text)))
+    areas = [COMM.allreduce(one.area[: one.num_cells].sum()) for one in (mesh, plain)]
+    assert areas == pytest.approx([0.5 * 0.06] * 2, rel=1e-12)
 
 
 solid_box = lifted(bar_with_straight_ends, 0.0, 0.01)

@@ -171,8 +171,7 @@ def test_sets_are_interfaces_and_regions(surfaces, tmp_path) -> None:
     [
         ("solid bar\n", ["bar.inp", "begins with *"]),
         ("*NODE\n1, 0, 0, 0\n*INCLUDE, INPUT=/etc/passwd\n", ["line 3, *INCLUDE", "one file"]),
-        ("*NODE\n1, 0, 0\n*ELEMENT, TYPE=C3D8\n1, 1\n",
-         ["line 4, *ELEMENT, TYPE=C3D8", "8 nodes"]),
+        ("*NODE\n1, 0, 0\n*ELEMENT, TYPE=C3D8\n1, 1\n", ["line 4, *ELEMENT, TYPE=C3D8", "8 nodes"]),
         ("*NODE\n1, 0, a\n", ["line 2, *NODE", "'a' is not a number"]),
         ("*NODE\n1, 0\n*ELEMENT, TYPE=C3D6\n", ["line 3, *ELEMENT, TYPE=C3D6", "hexahedra"]),
         ("*NODE\n1, 0\n1, 1\n", ["line 3, *NODE", "node 1 for the second time"]),
@@ -240,7 +239,7 @@ def test_what_is_missing_is_told(folder) -> None:
          ["not of length zero"]),
         ({"cell_shape": None}, ["tetrahedron", ".inp"]),
         ({"mesh": None, "cells": (20, 4), "cell_shape": None, "mesh_scale": 0.001},
-         ["only with the mesh file"]),
+         ["only with mesh"]),
     ],
 )  # fmt: skip
 def test_keys_that_do_not_fit(folder, keys, words) -> None:

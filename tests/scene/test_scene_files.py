@@ -83,6 +83,18 @@ def test_a_mesh_excludes_cells():
     assert back.arms == (Arm(**ARM, cells=(20, 2)), Arm(**ARM | {"name": "arm2"}, cells=(20, 2)))
 
 
+def test_a_mesh_that_is_set_keeps_what_else_is_stated():
+    """`--set` changes one key and no other."""
+    data = minimal(1)
+    bores = {"point": [0.0, 0.0, 0.0], "axis": [0.0, 0.0, 1.0], "radius": 0.01}
+    data["arms"][0] |= {
+        "mesh": "meshes/arm_bores.geo", "cell_shape": "triangle", "mesh_scale": 0.001,
+    }  # fmt: skip
+    (arm,) = scene_from_dict(data, overrides=["arms.mesh=meshes/arm_bores.geo"]).arms
+    assert arm.mesh_scale == 0.001 and arm.cell_shape == "triangle"
+    refused(data | {"arms": [data["arms"][0] | {"inboard_bore": bores}]}, "solid arm")
+
+
 SIZED = 'DefineConstant[ h = {1, Name "Parameters/1 mesh size (m)"} ];'
 
 

@@ -216,7 +216,10 @@ def _ordered(
                 raise InputError(f"{file}: joint {joint.name!r}: no link {name!r}, its {word}")
     for name, count in Counter(joint.child for joint in joints).items():
         if count > 1:
-            raise InputError(f"{file}: link {name!r} is held by {count} joints; expected a tree")
+            raise InputError(
+                f"{file}: link {name!r} is held by {count} joints; expected a tree: "
+                "leave out the joints that close a loop and state it in --closures"
+            )
     held = {joint.child for joint in joints}
     roots = [name for name in links if name not in held]
     if len(roots) != 1:
@@ -261,8 +264,8 @@ def _shapes(
     for element in elements:
         try:
             shape = _shape(file, link, element.geometry, package_path)
-        except FileNotFoundError:
-            missing.append(element.geometry.mesh.filename or "without a name")
+        except FileNotFoundError as error:
+            missing.append(str(error))
             continue
         pose = _pose(element.origin)
         _check_finite(f"{file}: link {link!r}: origin of a shape", pose)
@@ -311,18 +314,31 @@ def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -
 def _mesh(file: Path, mesh: Any, package_path: Sequence[Path]) -> Trimesh:
     import trimesh
 
-    path = mesh_path(file, mesh.filename, package_path) if mesh.filename else None
+    if not mesh.filename:
+        raise FileNotFoundError("a mesh without a name")
+    path = mesh_path(file, mesh.filename, package_path)
     if path is None:
-        raise FileNotFoundError(mesh.filename)
+        raise FileNotFoundError(f"mesh {mesh.filename} not found{_similar(file, mesh.filename)}")
     try:
         found: Any = trimesh.load_mesh(os.fspath(path))
     except Exception as error:  # every format has its own
-        raise FileNotFoundError(mesh.filename) from error
+        raise FileNotFoundError(f"mesh {mesh.filename} cannot be read") from error
     if not isinstance(found, trimesh.Trimesh) or not len(found.faces):
-        raise FileNotFoundError(mesh.filename)
+        raise FileNotFoundError(f"mesh {mesh.filename} holds no triangles")
     if mesh.scale is not None:
         found.apply_scale(mesh.scale)
     return found
+
+
+def _similar(file: Path, name: str) -> str:
+    """Name a file in the folder of a missing one whose name differs by capitals alone."""
+    inner = Path(name.partition("://")[2] or name)
+    for above in _folders_above(file):
+        places = sorted((above / inner).parent.glob("*"))
+        for place in places:
+            if place.name.casefold() == inner.name.casefold():
+                return f"; there is {place.name}"
+    return ""
 
 
 def sources_of(file: Path) -> list[Path]:
@@ -402,7 +418,7 @@ def implausible_inertias(robot: Robot) -> list[str]:
 def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
     mass, tensor = link.own.mass, link.own.tensor
     for name in link.missing:
-        yield f"mesh {name} cannot be read; its size is not known"
+        yield f"{name}; the size of the link is not known"
     if mass < 0.0:
         yield f"mass {mass:g} kg is negative"
         return

@@ -124,7 +124,7 @@ class RobotLink:
         inertia: in the link's frame; None where the file has none.
         shapes: closed or open surfaces in the link's frame, collision ones if there are any, else
             visual ones.
-        missing: mesh files that are not there or cannot be read.
+        missing: a phrase for every mesh file that is not there or cannot be read.
         visual: reads the visual surfaces where `shapes` are collision ones; None without them.
     """
 

@@ -188,7 +188,7 @@ class Arm(Table):
     )
     interface_offset: Length | None = Field(
         default=None,
-        description="how far the middles of a solid mesh file's interfaces may lie from the joints "
+        description="how far the middles of the interfaces of a solid mesh file, or hull, may lie from the joints "
         "at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: a twentieth of "
         "the larger of height and thickness [m]",
     )
@@ -196,7 +196,8 @@ class Arm(Table):
         default=1.0,
         ge=1e-9,
         le=1e9,
-        description="length of the mesh file's unit, of a solid arm: 0.001 of a file in mm [m]",
+        description="length of the mesh file's unit: 0.001 of a file in mm; a .step file states "
+        "its own [m]",
     )
     element: ElementName | None = Field(
         default=None,
@@ -519,10 +520,16 @@ class Arm(Table):
     def _check_mesh(self) -> Arm:
         check_bores(self)
         if self.mesh is None:
-            for key in (*SIZE_KEYS, "interface_offset"):
+            for key in (*SIZE_KEYS, *["interface_offset"] * (self.hull is None)):
                 if getattr(self, key) is not None:
                     raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
+            if self.mesh_scale != 1.0:
+                raise Refusal(
+                    "expected only with mesh; a rectangular arm has cells", ("mesh_scale",)
+                )
             return self
+        if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
+            raise Refusal("expected none: a STEP file states its unit", ("mesh_scale",), ("mesh",))
         if self.interface_offset is not None and not self.is_solid:
             raise Refusal("expected only with the mesh of a solid arm", ("interface_offset",))
         if self.cells is not None:

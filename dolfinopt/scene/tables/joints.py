@@ -148,9 +148,10 @@ def check_bores(arm: Arm) -> None:
     bores = {key: getattr(arm, key) for key in ("inboard_bore", "outboard_bore")}
     stated = [key for key, bore in bores.items() if bore is not None]
     if arm.mesh is None or not arm.is_solid:
-        used = [*stated, *["mesh_scale"] * (arm.mesh_scale != 1.0)]
-        if used:
-            raise Refusal("expected only with the mesh file of a solid arm", (used[0],), ("mesh",))
+        if stated:
+            raise Refusal(
+                "expected only with the mesh file of a solid arm", (stated[0],), ("mesh",)
+            )
         return
     if len(stated) == 1:
         (other,) = set(bores) - set(stated)
