@@ -19,10 +19,10 @@ from dolfinopt.mesh.checks import (
     FlatMesh,
     check_cells,
     check_extents,
-    check_unit,
     check_facets,
     check_mesh,
     check_place,
+    check_unit,
 )
 from dolfinopt.mesh.file_check import open_file
 from dolfinopt.mesh.gmsh_session import (
