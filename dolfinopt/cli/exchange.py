@@ -380,9 +380,7 @@ def _write_scene(folder: Path, scene: RobotScene, t: np.ndarray, rows: np.ndarra
     for body in scene.bodies:
         if body.size is not None:
             sides = " x ".join(f"{one:.3g}" for one in (body.length, *body.size))
-            box = (
-                "a box to edit" if body.measured else "a box whose height and thickness are a guess"
-            )
+            box = "a box to edit" if body.measured else "a box of guessed height and thickness"
             what = box if body.mesh is None else f"its shape, {body.mesh.cells} cells"
             click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
             if body.mesh is not None and body.mesh.done:

@@ -466,10 +466,8 @@ def add_cells(gmsh: Any, mesh: InterfaceMesh) -> None:
     if isinstance(mesh, Tetrahedra):
         for k, (name, own) in enumerate(mesh.further.items(), FURTHER):
             names[k], facets[k] = name, own
-    groups = into_model(
-        gmsh, SolidCells(mesh.points, {DESIGN: mesh.cells}, facets), mesh.points.shape[1]
-    )
     model, dim = gmsh.model, mesh.points.shape[1]
+    groups = into_model(gmsh, SolidCells(mesh.points, {DESIGN: mesh.cells}, facets), dim)
     for group in (DESIGN, *facets):
         d = dim - (group != DESIGN)
         model.addPhysicalGroup(d, groups[group], group)

@@ -188,9 +188,9 @@ class Arm(Table):
     )
     interface_offset: Length | None = Field(
         default=None,
-        description="how far the middles of the interfaces of a solid mesh file, or hull, may lie from the joints "
-        "at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: a twentieth of "
-        "the larger of height and thickness [m]",
+        description="how far the middles of the interfaces of a solid mesh file, or hull, may lie "
+        "from the joints at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: "
+        "a twentieth of the larger of height and thickness [m]",
     )
     mesh_scale: float = Field(
         default=1.0,
@@ -520,13 +520,9 @@ class Arm(Table):
     def _check_mesh(self) -> Arm:
         check_bores(self)
         if self.mesh is None:
-            for key in (*SIZE_KEYS, *["interface_offset"] * (self.hull is None)):
-                if getattr(self, key) is not None:
+            for key in (*SIZE_KEYS, "mesh_scale", *["interface_offset"] * (self.hull is None)):
+                if getattr(self, key) != Arm.model_fields[key].default:
                     raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
-            if self.mesh_scale != 1.0:
-                raise Refusal(
-                    "expected only with mesh; a rectangular arm has cells", ("mesh_scale",)
-                )
             return self
         if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
             raise Refusal("expected none: a STEP file states its unit", ("mesh_scale",), ("mesh",))
