@@ -154,9 +154,15 @@ def _record(folder: Path, name: str) -> dict[str, Any]:
 )
 @designs_option
 @click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
+@click.option("--keep", is_flag=True, help="keep the folder of every simulation in DIR/cases")
 @study_command
 def sweep(
-    scene: Scene, preset: Any, vary: tuple[str, ...], designs: tuple[Path, ...], reoptimize: bool
+    scene: Scene,
+    preset: Any,
+    vary: tuple[str, ...],
+    designs: tuple[Path, ...],
+    reoptimize: bool,
+    keep: bool,
 ) -> Question:
     """Simulate designs of SCENE for a range of values: tables and curves of what they do.
 
@@ -171,7 +177,7 @@ def sweep(
         )
     from dolfinopt.study.studies import study, sweep_name
 
-    do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize)
+    do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize, keep=keep)
     return sweep_name(preset, vary), designs, do, {}
 
 

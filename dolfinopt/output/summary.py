@@ -159,6 +159,28 @@ def summarise(
         }
 
 
+def figures(run: RankResult, wall: float) -> dict[str, Any]:
+    """Return what a table of many simulations needs of summary.json; on one rank alone.
+
+    Args:
+        run: the design and what came of it.
+        wall: seconds that it took.
+    """
+    volumes = {k: _volume(run.scene, k, arm) for k, arm in run.arms.items()}
+    grayness = sum(volumes[k] * arm.grayness(run.x_phys[k]) for k, arm in run.arms.items())
+    return {
+        "name": run.scene.name,
+        **_figures(run.evaluation),
+        "max_deviation_time": run.evaluation.max_deviation_time,
+        "grayness": grayness / (sum(volumes.values()) or 1.0),
+        "iterations": run.iterations,
+        "stop_reason": run.stop_reason,
+        "seconds": {"total": wall},
+        "versions": versions(),
+        "scene": run.scene.to_dict(),
+    }
+
+
 @dataclass(frozen=True)
 class _Traits:
     """What is known of one design beside its motion."""

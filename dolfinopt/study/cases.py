@@ -1,7 +1,8 @@
 """What studies compute: cases, known by what they compute, done once, shared out over the ranks.
 
-The results of a case are the usual files in DIR/cases/<key>/; that the summary is there tells that
-the case is done. Every case runs on one rank alone: its bits do not depend on how many there are.
+The results of a case are in DIR/cases/<key>/: the usual files of an optimisation, and of a
+simulation where they are to be kept; else figures and the deviation alone, in a fifth of the time.
+That the summary is there tells that the case is done. Every case runs on one rank alone: its bits do not depend on how many there are.
 
 The ranks are the pool: each takes the next job whose design is there, by creating the job's file in
 a folder of this run (`_Place`). Progress is read from the files that appear.
@@ -29,7 +30,7 @@ from uuid import uuid4
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.disk import make_folder, write_text
+from dolfinopt.disk import make_folder, write_arrays, write_text
 from dolfinopt.dynamics.simulation import simulate_all
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
@@ -40,7 +41,7 @@ from dolfinopt.output import checkpoint
 from dolfinopt.output.design import arms_with_design, read_history
 from dolfinopt.output.folders import working_alone
 from dolfinopt.output.run_folder import optimize, write_result
-from dolfinopt.output.summary import versions, write_summary
+from dolfinopt.output.summary import figures, versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.responses.evaluation import evaluate
@@ -158,7 +159,8 @@ class Outcome:
 
     def deviation(self) -> tuple[np.ndarray, np.ndarray]:
         """Return sample instants (n,), s, and the end-effector's distance from its path (n,), m."""
-        with np.load(self.folder / "trajectory.npz", allow_pickle=False) as data:
+        brief, whole = self.folder / DEVIATION, self.folder / TRAJECTORY
+        with np.load(brief if brief.exists() else whole, allow_pickle=False) as data:
             return data["t"], lengths(data["deviation"])
 
     def summary(self) -> dict[str, Any]:
@@ -282,7 +284,8 @@ def simulate_samples(
 
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
-SUMMARY, HISTORY = "summary.json", "history.csv"
+SUMMARY, HISTORY, TRAJECTORY = "summary.json", "history.csv", "trajectory.npz"
+DEVIATION = "deviation.npz"  # t and deviation of a simulation whose other files are not kept
 IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
 FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
@@ -296,6 +299,7 @@ class _Place:
 
     cases: Path
     work: Path
+    keep: bool  # all files of simulations
     untold: list[Case] = field(default_factory=list)  # this rank tells when they end, by any rank
 
     def __getitem__(self, case: Case) -> Path:
@@ -328,19 +332,25 @@ class _Place:
 
 
 def run_cases(
-    cases: Iterable[Case], folder: Path, world: MPI.Comm, *, shown: bool = True
+    cases: Iterable[Case],
+    folder: Path,
+    world: MPI.Comm,
+    *,
+    shown: bool = True,
+    keep: bool = True,
 ) -> Outcomes:
     """Do all cases that are not done yet, and those they depend on (collective).
 
     A case that fails to converge is reported in its outcome, and so are those that need its
     design; it is tried again in the next run. Ranks share a file system; `shown`: the root tells
-    of every case on its standard error. InputError where a scene or design cannot be used, the
+    of every case on its standard error; `keep`: simulations leave all their files. InputError where a scene or design cannot be used, the
     others stay unfinished; another run works in the folder DIR, or it cannot be written.
     """
     both = (one for case in cases for one in (case.design, case))
     wanted = list(dict.fromkeys(one for one in both if isinstance(one, Case)))
     with working_alone(world, folder):
-        place = _Place(folder / CASES, folder / (WORK + on_root(world, lambda: uuid4().hex)))
+        work = folder / (WORK + on_root(world, lambda: uuid4().hex))
+        place = _Place(folder / CASES, work, keep)
         try:
             done = on_root(world, _begin, place, wanted)
             missing = [case for case, there in zip(wanted, done, strict=True) if not there]
@@ -361,7 +371,7 @@ def _begin(place: _Place, wanted: Sequence[Case]) -> list[bool]:
         shutil.rmtree(left, ignore_errors=True)
     make_folder(place.cases)
     make_folder(place.work)
-    done = [_is_complete(place[case]) for case in wanted]
+    done = [_is_complete(place[case], place.keep or case.action != "simulate") for case in wanted]
     for case, there in zip(wanted, done, strict=True):
         if not there and case.action == "optimize":
             (place[case] / SUMMARY).unlink(missing_ok=True)  # its checkpoint stays
@@ -370,7 +380,10 @@ def _begin(place: _Place, wanted: Sequence[Case]) -> list[bool]:
     return done
 
 
-def _is_complete(folder: Path) -> bool:
+def _is_complete(folder: Path, keep: bool) -> bool:
+    """Tell whether a case is done, with all its files where they are to be kept."""
+    if keep and (folder / DEVIATION).exists():
+        return False
     try:
         json.loads((folder / SUMMARY).read_text("utf-8"))["seconds"]["total"]
     except (OSError, ValueError, KeyError, TypeError):
@@ -477,8 +490,19 @@ def _simulate(job: Job, design: Path | None, place: _Place) -> None:
             place.fail(case, str(result))
         else:
             make_folder(part)
-            write_result(part, result, wall, paraview=False)
+            if place.keep:
+                write_result(part, result, wall, paraview=False)
+            else:
+                _write_figures(part, result, wall)
             os.rename(part, place[case])
+
+
+def _write_figures(folder: Path, result: RankResult, wall: float) -> None:
+    """Write the figures and the deviation over time of a simulation."""
+    assert result.trajectory is not None  # on a single rank
+    sampled = result.trajectory.sampled
+    write_arrays(folder / DEVIATION, {"t": sampled.t, "deviation": sampled.deviation})
+    write_summary(folder, figures(result, wall))
 
 
 def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:

@@ -93,6 +93,7 @@ def study(
     reoptimize: bool = False,
     kinds: Sequence[str] = (),
     shown: bool = True,
+    keep: bool = True,
 ) -> Study:
     """Do a study (collective); the result is the same on all ranks.
 
@@ -100,7 +101,7 @@ def study(
         scene, preset: what is varied; which study, None for a sweep over `vary` alone.
         vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
-        folder, world, shown: see `run_cases`.
+        folder, world, shown, keep: see `run_cases`.
         reoptimize: optimise for every scenario, too.
         kinds: of objectives to compare; by default all.
 
@@ -110,12 +111,15 @@ def study(
     plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize, kinds)
     if any(case.action == "optimize" for _, case in plan.rows):
         scene.check_designed()
-    return carry_out(plan, folder, world, shown=shown)
+    return carry_out(plan, folder, world, shown=shown, keep=keep)
 
 
-def carry_out(plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True) -> Study:
+def carry_out(
+    plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True, keep: bool = True
+) -> Study:
     """Do what is planned, see `study`."""
-    outcomes = run_cases([case for _, case in plan.rows], folder, world, shown=shown)
+    cases = [case for _, case in plan.rows]
+    outcomes = run_cases(cases, folder, world, shown=shown, keep=keep)
     with together(world):
         tables, figures = plan.report(tabulated(plan, outcomes))
     failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)

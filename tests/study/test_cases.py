@@ -244,6 +244,21 @@ def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, simula
 
 
 @alone
+def test_simulations_that_are_not_kept_have_the_same_figures(plan, done, tmp_path):
+    """Two files in place of five, the same figures; all files once they are to be kept."""
+    _, outcomes = done
+    case = plan[3]
+    brief = run_cases([case], tmp_path, SELF, shown=False, keep=False)[case]
+    assert {path.name for path in brief.folder.iterdir()} == {"deviation.npz", "summary.json"}
+    assert_close(brief, outcomes[case])
+    assert np.array_equal(brief.deviation(), outcomes[case].deviation())
+    assert run_cases([case], tmp_path, SELF, shown=False, keep=False).computed == 0
+    kept = run_cases([case], tmp_path, SELF, shown=False)
+    assert kept.computed == 1 and kept[case].design.exists()
+    assert run_cases([case], tmp_path, SELF, shown=False, keep=False).computed == 0
+
+
+@alone
 def test_damaged_summary_is_done_anew(plan, done, tmp_path):
     """As are its other files; what a killed run has left is removed."""
     folder, outcomes = done
