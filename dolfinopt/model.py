@@ -18,13 +18,17 @@ from __future__ import annotations
 
 import io
 import os
+import time
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from html import escape
 from math import nan
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 from mpi4py import MPI
@@ -34,7 +38,7 @@ from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.build import check_forces, check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.budget import check_budget
-from dolfinopt.optimization.result import Result
+from dolfinopt.optimization.result import RankResult, Result
 from dolfinopt.optimization.state import HistoryRow, fields_of
 from dolfinopt.output.design import (
     ArmView,
@@ -44,17 +48,19 @@ from dolfinopt.output.design import (
     physical,
     read_design,
 )
-from dolfinopt.output.run_folder import optimize
+from dolfinopt.output.folders import check_unused, working_alone
+from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import limits_of
-from dolfinopt.responses.evaluation import evaluate, gradient
+from dolfinopt.responses.evaluation import constraint_gradients, evaluate, gradient
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
 from dolfinopt.scene.tables.objective import GradientKind
+from dolfinopt.scene.toml import toml_value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,6 +73,22 @@ if TYPE_CHECKING:
     from dolfinopt.study.studies import Preset
 
 Densities = Mapping[str, np.ndarray]
+
+
+class Responses(NamedTuple):
+    """Objective and limits of a design, and their gradients by the physical densities.
+
+    Attributes:
+        values: by name: "objective" in the scene's unit; every limit, e.g. "deviation" or
+            "first_frequency_arm2", relative: kept where it is at most 0.
+        gradients: of the values by the densities (n_cells,) of every arm, as a design is given;
+            with patterns, of the arms whose design others repeat; empty but on rank 0. Limits of
+            extremes are differentiated by their smooth value, its ratio to the extreme held
+            (Le, Norato, Bruns, Ha & Tortorelli 2010, doi:10.1007/s00158-009-0440-y).
+    """
+
+    values: dict[str, float]
+    gradients: dict[str, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -200,6 +222,37 @@ class SimulationResult(Result):
             f"max_deviation={1e3 * self.max_deviation:.4g} mm)"
         )
 
+    @property
+    def mass(self) -> dict[str, float]:
+        """Mass of every arm, kg, by its name; empty but on rank 0."""
+        if self.trajectory is None:
+            return {}
+        bodies = self.trajectory.mechanism.bodies
+        return {a.name: float(b.mass) for a, b in zip(self.scene.arms, bodies, strict=True)}
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A sentence on everything of the scene and the motion that puts the figures in doubt.
+
+        Those on the shape of the design, which take longer, are in the summary that `save` writes.
+        Empty but on rank 0.
+        """
+        from dolfinopt.output.summary import motion_warnings
+
+        return () if self.trajectory is None else tuple(motion_warnings(self))
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
+        """Write the files of `dolfinopt simulate` or `optimize`, but for pictures (collective).
+
+        Args:
+            folder: where; made if need be.
+            overwrite: replace the results that the folder holds.
+
+        Raises:
+            InputError: the folder holds results, and `overwrite` is not set.
+        """
+        Model(self.scene).save(self, folder, overwrite=overwrite)
+
     def _repr_png_(self) -> bytes | None:
         """Return the picture that notebooks show."""
         if (figure := self.plot()) is None:
@@ -207,6 +260,23 @@ class SimulationResult(Result):
         stream = io.BytesIO()
         figure.savefig(stream, format="png")
         return stream.getvalue()
+
+    def _repr_html_(self) -> str | None:
+        """Return picture and figures as notebooks show them; None but on rank 0."""
+        if (picture := self._repr_png_()) is None:
+            return None
+        rows = {
+            "objective": with_unit(f"{self.objective:.4g}", self.unit),
+            "largest deviation": f"{1e3 * self.max_deviation:.4g} mm",
+            "mass": f"{sum(self.mass.values()):.4g} kg",
+            **{limit.words: limit.usage.removeprefix(limit.words) for limit in self.limits},
+        }
+        cells = "".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>"
+            for name, value in rows.items()
+        )
+        data = b64encode(picture).decode()
+        return f'<img src="data:image/png;base64,{data}"/><table>{cells}</table>'
 
 
 class OptimizationResult(SimulationResult):
@@ -245,7 +315,7 @@ class Model:
 
     Args:
         scene: path of a scene file, its content as nested dictionaries, or a `Scene`.
-        *overrides: "key.path=value", as given to --set.
+        *overrides: "key.path=value", as given to --set, or mappings {"key.path": value}.
         comm: the ranks that work on it; by default all.
 
     Raises:
@@ -255,7 +325,7 @@ class Model:
     def __init__(
         self,
         scene: str | os.PathLike[str] | Mapping[str, Any] | Scene,
-        *overrides: str,
+        *overrides: str | Mapping[str, Any],
         comm: MPI.Comm | None = None,
     ):
         self._world = MPI.COMM_WORLD if comm is None else comm
@@ -269,6 +339,10 @@ class Model:
     def __repr__(self) -> str:
         arms = ", ".join(arm.name for arm in self.scene.arms)
         return f"Model({self.scene.name!r}, arms: {arms})"
+
+    def __reduce__(self) -> tuple[Callable[[Scene, bool], Model], tuple[Scene, bool]]:
+        """Pickle the scene: arms are built again, on all ranks or on the one that reads it."""
+        return _model_of, (self.scene, self._world.size == 1)
 
     @property
     def centroids(self) -> dict[str, np.ndarray]:
@@ -341,6 +415,34 @@ class Model:
         _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
         return self._gathered(gradient(scene, partition, arms, trajectory, self._profile))
 
+    def evaluate(self, x: Design = None) -> Responses:
+        """Return objective and limits of a design with their gradients, for a loop of one's own.
+
+        Args:
+            x: the design, see the class; None: the initial one.
+
+        Raises:
+            InputError, ConvergenceError: as `simulate` does.
+        """
+        self.scene.check_designed()
+        partition, arms, x_phys = self._prepared(x)
+        if needs(self.scene, "motion"):
+            choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
+        place = self.scene, partition, arms
+        evaluation, trajectory = evaluate(*place, x_phys, self._profile, simulated=False)
+        rows = constraint_gradients(*place, trajectory, self._profile, evaluation.responses)
+        by_cells = [gradient(*place, trajectory, self._profile), *(row.cells for row in rows)]
+        zero = {k: np.zeros_like(x_phys[k]) for k in arms}
+        names = ["objective", *(limit.name for limit in limits_of(self.scene, evaluation))]
+        values = [evaluation.objective, *evaluation.constraints]
+        return Responses(
+            dict(zip(names, values, strict=True)),
+            {
+                name: self._gathered(zero | dict(one))
+                for name, one in zip(names, by_cells, strict=True)
+            },
+        )
+
     def state_space(self, t: float, x: Design = None, *, below: float | None = None) -> StateSpace:
         """Return the machine linearised about its motion at an instant.
 
@@ -369,23 +471,28 @@ class Model:
         *,
         resume: bool = False,
         overwrite: bool = False,
-        report: Callable[[HistoryRow], None] | None = None,
+        x0: Densities | SimulationResult | None = None,
+        callback: Callable[[HistoryRow], None] | None = None,
     ) -> OptimizationResult:
-        """Optimise the scene's arms from its initial design.
+        """Optimise the scene's arms.
 
         Args:
-            folder: for history.csv and the checkpoint; None: nothing is written.
+            folder: for the files of `dolfinopt optimize` but for pictures: history.csv and the
+                checkpoint while it goes on, the others in the end; None: nothing is written.
             resume: go on from the folder's checkpoint.
             overwrite: replace the results that the folder holds.
-            report: called on rank 0 with every row of the history.
+            x0: design variables to begin with, before filter and projection, or a result, whose
+                densities they are; None: the scene's initial design.
+            callback: called on rank 0 with every row of the history.
 
         Raises:
             InputError: there is no fitting checkpoint to go on from; the folder holds results, and
                 neither `resume` nor `overwrite` is set; another run works there.
             ConvergenceError: a simulation failed.
         """
-        place = None if folder is None else Path(folder)
+        begun, place = time.perf_counter(), None if folder is None else Path(folder)
         partition, arms = self._arms()
+        first = None if x0 is None else self._prepared(x0)[2]
         built = partition, {k: arm.fresh() for k, arm in arms.items()}
         found = optimize(
             self.scene,
@@ -393,9 +500,12 @@ class Model:
             resume=resume,
             overwrite=overwrite,
             world=self._world,
-            report=report,
+            report=callback,
             built=built,
+            x0=first,
         )
+        if place is not None:
+            write_result(place, found, time.perf_counter() - begun)
         stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
             **fields_of(found, Result),
@@ -403,6 +513,28 @@ class Model:
             views=gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
             filtered=self._gathered(found.x_filtered or {}, found.partition),
         )
+
+    def save(
+        self, result: SimulationResult, folder: str | Path, *, overwrite: bool = False
+    ) -> None:
+        """Write a result of this scene, see `SimulationResult.save` (collective)."""
+        begun, place = time.perf_counter(), Path(folder)
+        check = None if overwrite else partial(check_unused, place)
+        partition, arms, x_phys = self._prepared(result)
+        filtered = self._prepared(result.filtered)[2] if result.filtered else None
+        with together(self._world):
+            for k, arm in arms.items():
+                arm.set_design(x_phys[k])
+        run = RankResult(
+            **fields_of(result, Result),
+            partition=partition,
+            arms=arms,
+            x_phys=x_phys,
+            x_filtered=filtered,
+            profile=self._profile,
+        )
+        with working_alone(self._world, place, check):
+            write_result(place, run, time.perf_counter() - begun)
 
     def check_parts(
         self,
@@ -541,7 +673,7 @@ class Model:
         # A search for modes that set out from another design's would end in other last digits.
         partition, arms = self._arms()
         for arm in arms.values():
-            arm.forget_modes()
+            arm.forget()
         if x is None:
             return partition, arms, self._uniform()
         if isinstance(x, SimulationResult):
@@ -619,9 +751,11 @@ class Model:
 
 
 def _load(
-    scene: str | os.PathLike[str] | Mapping[str, Any] | Scene, overrides: Sequence[str]
+    scene: str | os.PathLike[str] | Mapping[str, Any] | Scene,
+    changes: Sequence[str | Mapping[str, Any]],
 ) -> Scene:
     """Read and check a scene (root only)."""
+    overrides = [text for one in changes for text in _texts(one)]
     if isinstance(scene, Scene):
         loaded = scene_from_dict(scene.to_tree(), scene.source, overrides) if overrides else scene
     elif isinstance(scene, Mapping):
@@ -634,3 +768,15 @@ def _load(
         if arm.sid is not None:
             fixed_body(loaded, index)
     return loaded
+
+
+def _model_of(scene: Scene, alone: bool) -> Model:
+    """Return the model of a scene that was pickled."""
+    return Model(scene, comm=MPI.COMM_SELF if alone else None)
+
+
+def _texts(change: str | Mapping[str, Any]) -> list[str]:
+    """Return changes of a scene as they are given to --set."""
+    if isinstance(change, str):
+        return [change]
+    return [f"{key}={toml_value(value)}" for key, value in change.items()]

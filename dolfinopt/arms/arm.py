@@ -388,10 +388,12 @@ class Arm:
             if one.shape[1]:
                 self.initial.loaded[place] = one
 
-    def forget_modes(self) -> None:
-        """Let the next searches for modes set out from nothing."""
+    def forget(self) -> None:
+        """Let the next design owe nothing to earlier ones: initial vectors, stiffening."""
         self.initial.basis = None
         self.initial.loaded.clear()
+        if self.stiffening is not None:
+            self.stiffening, self._state = None, None
 
     # -- measures ----------------------------------------------------------------------------
 

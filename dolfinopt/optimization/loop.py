@@ -70,6 +70,7 @@ def run(
     recorder: Recorder | None = None,
     report: Report | None = None,
     compared: bool = False,
+    x0: Mapping[int, np.ndarray] | None = None,
 ) -> RankResult:
     """Optimise the scene's arms (collective).
 
@@ -83,11 +84,12 @@ def run(
         report: called on the root with every row of the history.
         compared: look at solid arms before, and at bars of the same mass after the iterations,
             where these are many enough for it to cost at most a twentieth.
+        x0: design variables (n_cells,) of this rank's arms to begin with; None: the scene's.
 
     Raises:
         ConvergenceError: a simulation failed.
     """
-    run_ = _Run(Evaluator(scene, partition, arms, profile), recorder, report)
+    run_ = _Run(Evaluator(scene, partition, arms, profile), recorder, report, x0)
     run_.compared = compared and scene.optimizer.max_iterations >= COMPARED_ITERATIONS
     return run_.go(memory)
 
@@ -101,13 +103,20 @@ class _Run:
     """One optimisation under way."""
 
     def __init__(
-        self, evaluator: Evaluator, recorder: Recorder | None, report: Report | None
+        self,
+        evaluator: Evaluator,
+        recorder: Recorder | None,
+        report: Report | None,
+        x0: Mapping[int, np.ndarray] | None,
     ) -> None:
         self.evaluator, self.recorder, self.report = evaluator, recorder, report
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
         variables = evaluator.variables
-        x = np.clip(variables.initial, variables.xmin, variables.xmax)
+        initial = variables.initial
+        if x0 is not None:
+            initial = variables.join({k: x0[k] for k in variables.arms})
+        x = np.clip(initial, variables.xmin, variables.xmax)
         self.iterate = Iterate(evaluator, x)
         self.history: list[HistoryRow] = []  # rows so far (root only)
         self.finished: StopCode | None = None  # why the iterations have ended

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
@@ -133,6 +134,7 @@ def optimize(
     report: Report | None = None,
     built: tuple[Partition, dict[int, Arm]] | None = None,
     compared: bool = False,
+    x0: Mapping[int, np.ndarray] | None = None,
 ) -> RankResult:
     """Optimise the scene's arms (collective on `world`).
 
@@ -147,7 +149,7 @@ def optimize(
         report: called on the root with every row of the history.
         built: which ranks do which arm, and this rank's, without a design yet; None: they are
             meshed.
-        compared: see `loop.run`.
+        compared, x0: see `loop.run`.
 
     Raises:
         InputError: `resume` without a matching checkpoint; the folder holds results, and neither
@@ -159,11 +161,11 @@ def optimize(
         raise InputError("resume, overwrite: expected only one of them")
     scene.check_designed()
     if folder is None:
-        return _optimize(scene, None, False, False, world, report, built, compared)
+        return _optimize(scene, None, False, False, world, report, built, compared, x0)
     on_root(world, check_sources, folder, RUN_FILES, scene)
     check = None if resume or overwrite else partial(check_unused, folder, resume=checkpoint.NAME)
     with working_alone(world, folder, check):
-        return _optimize(scene, folder, resume, overwrite, world, report, built, compared)
+        return _optimize(scene, folder, resume, overwrite, world, report, built, compared, x0)
 
 
 def _optimize(
@@ -175,6 +177,7 @@ def _optimize(
     report: Report | None,
     built: tuple[Partition, dict[int, Arm]] | None,
     compared: bool,
+    x0: Mapping[int, np.ndarray] | None,
 ) -> RankResult:
     """Optimise in a folder that no other run works in."""
     if folder is not None and not (resume or overwrite):
@@ -205,4 +208,5 @@ def _optimize(
         recorder=recorder,
         report=report,
         compared=compared,
+        x0=x0,
     )

@@ -43,7 +43,7 @@ from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.dynamics.trajectory import Trajectory
-    from dolfinopt.optimization.result import RankResult
+    from dolfinopt.optimization.result import RankResult, Result
 
 # Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
 SUMMARY_UNITS = {
@@ -345,18 +345,25 @@ def _bars(run: RankResult) -> dict[str, Any]:
     return {**_figures(run.bars), "constraints": summary_of(limits_of(run.scene, run.bars))}
 
 
-def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
+def motion_warnings(run: Result) -> list[str]:
+    """Return a sentence on everything of a scene and its motion that puts the figures in doubt."""
     return [
         *implausible(run.scene),
-        *(note for one in traits.values() for note in one.notes),
         *_warnings(run.scene, run.evaluation),
         *_too_few(run.scene, run.choice),
-        *_unstiffened(stiffening_of(run.arms)),
         *torsion_warnings(run.trajectory),
         *_limits_exceeded(run.trajectory),
         *unjudged(run.scene),
         *_on_closures(run.scene, run.trajectory),
         *([] if (rest := forced_rest(run.scene)) is None else [rest]),
+    ]
+
+
+def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
+    return [
+        *(note for one in traits.values() for note in one.notes),
+        *motion_warnings(run),
+        *_unstiffened(stiffening_of(run.arms)),
         *([] if is_grey(run.scene, _grayness(traits)) else _contact_warnings(run, traits)),
         *(one.sentence for one in _too_narrow(run, traits)),
     ]

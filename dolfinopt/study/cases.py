@@ -1,8 +1,9 @@
 """What studies compute: cases, known by what they compute, done once, shared out over the ranks.
 
 The results of a case are in DIR/cases/<key>/: the usual files of an optimisation, and of a
-simulation where they are to be kept; else figures and the deviation alone, in a fifth of the time.
-That the summary is there tells that the case is done. Every case runs on one rank alone: its bits do not depend on how many there are.
+simulation where they are to be kept; else figures and the deviation alone, in half of the time.
+That the summary is there tells that the case is done. Every case runs on one rank alone: its bits
+do not depend on how many there are.
 
 The ranks are the pool: each takes the next job whose design is there, by creating the job's file in
 a folder of this run (`_Place`). Progress is read from the files that appear.
@@ -343,8 +344,9 @@ def run_cases(
 
     A case that fails to converge is reported in its outcome, and so are those that need its
     design; it is tried again in the next run. Ranks share a file system; `shown`: the root tells
-    of every case on its standard error; `keep`: simulations leave all their files. InputError where a scene or design cannot be used, the
-    others stay unfinished; another run works in the folder DIR, or it cannot be written.
+    of every case on its standard error; `keep`: simulations leave all their files. InputError
+    where a scene or design cannot be used, the others stay unfinished; another run works in the
+    folder DIR, or it cannot be written.
     """
     both = (one for case in cases for one in (case.design, case))
     wanted = list(dict.fromkeys(one for one in both if isinstance(one, Case)))
