@@ -1,12 +1,17 @@
 """dolfinopt.Model: the same figures as the functions below it, on any number of ranks."""
 
+import importlib.util
+import pickle
+
 import numpy as np
 import pytest
 from mpi4py import MPI
+from runs import ROOT as FOLDER
 from runs import TWO_ARM, refusal
 
 import dolfinopt as do
 from dolfinopt import Model, OptimizationResult
+from dolfinopt.arms.arm import stiffening_of
 
 WORLD = MPI.COMM_WORLD
 ROOT = WORLD.rank == 0
@@ -134,3 +139,105 @@ def test_bad_arguments_are_refused(model: Model) -> None:
     refusal(lambda: model.gradient(kind="fast"), "'fast'", "esl, exact")
     refusal(lambda: model.uniform(1.5), "density")
     refusal(lambda: Model(TWO_ARM, "payload.masse=4"), "payload.masse", "payload.mass")
+
+
+def test_changes_as_a_mapping() -> None:
+    """Values keep their types, NumPy's and tables included; strings as before."""
+    model = Model(TWO_ARM, {
+        "payload.mass": np.float64(4.0), "arms.arm1.cells": np.array([24, 4]),
+        "design.shared_volume": True, "name": 'a "name"', "constraints.mass": 1e-6,
+        "scenarios": [{"changes": ["payload.mass=5"]}],
+    }, "arms.arm2.cells=[24,4]")  # fmt: skip
+    scene = model.scene
+    assert (scene.payload.mass, scene.arms[0].cells, scene.name) == (4.0, (24, 4), 'a "name"')
+    assert scene.design.shared_volume is True and scene.constraints.mass == 1e-6
+    assert len(scene.scenarios) == 1
+    refusal(lambda: Model(TWO_ARM, {"payload.masse": 4}), "payload.masse", "payload.mass")
+
+
+def test_values_and_gradients_by_name() -> None:
+    """Central differences; a limit's smooth value is differentiated, its scale is held."""
+    model = Model(TWO_ARM, *SMALL, {
+        "objective.kind": "mass", "constraints.deviation": 0.02, "constraints.first_frequency": 9.0,
+    })  # fmt: skip
+    x = model.uniform(0.6)
+    at = model.evaluate(x)
+    assert {"objective", "deviation", "first_frequency_arm2"} <= at.values.keys()
+    assert at.values.keys() == at.gradients.keys()
+    found = model.simulate(x)
+    assert at.values["objective"] == found.objective
+    assert at.values["deviation"] == pytest.approx(found.max_deviation / 0.02 - 1.0, rel=1e-12)
+    rng, h = np.random.default_rng(3), 1e-4
+    way = {name: rng.uniform(-1.0, 1.0, one.shape) for name, one in x.items()}
+    up, down = (
+        model.evaluate({name: x[name] + sign * h * way[name] for name in x}).values
+        for sign in (1.0, -1.0)
+    )
+    for name in ("objective", "first_frequency_arm1"):
+        slope = sum(float(g @ way[arm]) for arm, g in at.gradients[name].items())
+        slope = WORLD.bcast(slope, root=0)
+        assert (up[name] - down[name]) / (2.0 * h) == pytest.approx(slope, rel=1e-5, abs=1e-9)
+
+
+def test_stiffening_is_decided_for_each_design() -> None:
+    """Its estimate is that of the design, whatever the model has simulated before."""
+    used, fresh = (Model(TWO_ARM, *SMALL) for _ in range(2))
+    used.simulate(used.uniform(0.4))
+    found = [
+        stiffening_of(one._arms()[1]) for one in (used, fresh) if one.simulate(one.uniform(1.0))
+    ]
+    assert found[0] == found[1]
+
+
+def test_a_design_to_begin_with(model: Model) -> None:
+    """The first row of the history is the design given; the callback sees every row."""
+    x = {name: 0.3 + 0.4 * points[:, 0] for name, points in model.centroids.items()}
+    rows = []
+    found = model.optimize(x0=x, callback=rows.append)
+    assert [row.iteration for row in rows] == ([0, 1, 2] if ROOT else [])
+    if ROOT:
+        assert found.history["volume_fraction"].iloc[0] == pytest.approx(0.5, rel=1e-3)
+        assert found.history["objective"].iloc[0] != model.optimize().history["objective"].iloc[0]
+    else:
+        model.optimize()
+
+
+def test_results_are_saved_and_pickled(model: Model, result, shared_tmp_path) -> None:
+    """What was pickled saves the same design, and a model that was simulates the same."""
+    copy = pickle.loads(pickle.dumps(result))
+    copy.save(shared_tmp_path / "run")
+    WORLD.barrier()
+    names = {path.name for path in (shared_tmp_path / "run").iterdir()}
+    assert {"design.npz", "summary.json", "trajectory.npz"} <= names
+    refusal(lambda: result.save(shared_tmp_path / "run"), "overwrite")
+    assert model.simulate(shared_tmp_path / "run" / "design.npz").evaluation == (
+        model.simulate(result).evaluation
+    )
+    if WORLD.size == 1:
+        again = pickle.loads(pickle.dumps(model))
+        assert again.simulate(result).evaluation == model.simulate(result).evaluation
+
+
+def test_a_notebook_shows_picture_and_figures(model: Model, result) -> None:
+    found = model.simulate()
+    assert found.warnings == ()
+    html = result._repr_html_()
+    if ROOT:
+        assert html.startswith('<img src="data:image/png;base64,') and "largest deviation" in html
+        assert sum(found.mass.values()) == pytest.approx(2 * 2700.0 * 0.06 * 0.01 * 0.5, rel=0.05)
+    else:
+        assert html is None
+
+
+def test_the_algorithm_on_one_page_is_optimize() -> None:
+    """demos/demo_algorithm.py, of public parts, has the same history."""
+    path = FOLDER / "demos" / "demo_algorithm.py"
+    spec = importlib.util.spec_from_file_location("demo_algorithm", path)
+    demo = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(demo)
+    told = [*demo.SETTINGS, "arms.cells=[30,4]", "optimizer.max_iterations=10"]
+    history = demo.main(told)
+    result = do.optimize(do.load_scene(TWO_ARM, told))
+    if ROOT:
+        rows = [row.objective for row in result.rows]
+        np.testing.assert_allclose(history, rows, rtol=1e-9)
