@@ -1,4 +1,4 @@
-"""The command: parse, call, exit code; and `init`, `keys` and `schema`, which need no solver."""
+"""The command: parse, call, exit code; and `init` and `keys`, which need no solver."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ def init(name: Path, template: str) -> None:
 
 @click.command()
 @click.argument("pattern", required=False)
-def keys(pattern: str | None) -> None:
+@click.option("--schema", is_flag=True, help="print the JSON schema of scene files, for editors")
+def keys(pattern: str | None, schema: bool) -> None:
     """Explain the keys of a scene.
 
     Lists unit, allowed values, default and meaning of the keys that contain PATTERN (payload, mass)
@@ -90,7 +91,13 @@ def keys(pattern: str | None) -> None:
     the materials of the catalogue, too, and "dolfinopt keys steel" those whose name contains it.
     """
     from dolfinopt.scene.load import describe_keys
+    from dolfinopt.scene.schema import scene_schema
 
+    if schema:
+        if pattern is not None:
+            raise InputError(f"{pattern}: expected no PATTERN with --schema")
+        click.echo(json.dumps(scene_schema(), indent=2))
+        return
     known = describe_keys()
     found = [info for info in known if _fits(info.key, pattern)]
     materials = _materials(pattern, found)
@@ -149,17 +156,6 @@ def _explained(info: KeyInfo) -> str:
     )
 
 
-# -- `dolfinopt schema` --------------------------------------------------------------------------
-
-
-@click.command()
-def schema() -> None:
-    """Print the JSON schema of scene files, for editors."""
-    from dolfinopt.scene.schema import scene_schema
-
-    click.echo(json.dumps(scene_schema(), indent=2))
-
-
 # -- the command and its end: parse, call, exit code ---------------------------------------------
 
 
@@ -188,8 +184,26 @@ def _with_help(error: click.ClickException) -> str:
     return f"{error.format_message()} (see {command} --help)"
 
 
+GROUPS = {
+    "Begin": (init, import_robot, keys),
+    "Look": (simulate, plot, gradient),
+    "Design": (optimize, part),
+    "Compare": (sweep, compare, uncertainty),
+    "Files for other programs": (export,),
+    "Evidence": (reproduce, bench),
+}
+
+
 class _Commands(click.Group):
     """A group whose help is printed by the root alone, and that knows what a wrong word meant."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands by what a user wants."""
+        for title, group in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(str(one.name), one.get_short_help_str(60)) for one in group], col_max=14
+                )
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
         given = kwargs["obj"]
@@ -230,18 +244,6 @@ def commands(ctx: click.Context) -> None:
         click.echo(ctx.get_help())
 
 
-STARTING = (init, import_robot, keys, schema)
-WORKING = (optimize, simulate, gradient, part, export, plot)
-STUDYING = (sweep, compare, uncertainty, reproduce, bench)
-for command in (*STARTING, *WORKING, *STUDYING):
-    commands.add_command(command)
-
-
-@commands.command(hidden=True, context_settings={"ignore_unknown_options": True})
-@click.argument("words", nargs=-1, type=click.UNPROCESSED)
-def study(words: tuple[str, ...]) -> None:
-    """Name the commands that took the place of this one."""
-    raise InputError(
-        "study: now sweep (values, --vary), compare (objectives, reductions) and uncertainty "
-        "(--random); --designs is --design, once for every file"
-    )
+for group in GROUPS.values():
+    for command in group:
+        commands.add_command(command)

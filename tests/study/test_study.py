@@ -94,7 +94,6 @@ BAD = [
     ([*SWEEP, "coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
     ([*SWEEP, "--design", "a.npz", "b.npz"], "b.npz"),  # a file that looks like a preset
     ([*SWEEP, "coordinates", "--reoptimize"], "compare reductions"),
-    (["study", TWO_ARM, "payload"], "sweep"),  # the command of before
     (["compare", TWO_ARM, "designs"], "objectives"),
     ([*OBJECTIVES, "--coordinates", "4"], "--coordinates"),
     ([*OBJECTIVES, "--design", "a.npz"], "--design", "sections"),
