@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from collections.abc import Mapping
@@ -315,6 +316,7 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     "[[closures]] with links and points in their frames",
 )
 @click.option("--boxes", is_flag=True, help="solid boxes, whatever the links' geometry")
+@overwrite_option
 @out_option("the scene; default: ROBOT without its ending")
 def import_robot(
     robot: Path,
@@ -324,6 +326,7 @@ def import_robot(
     package_path: tuple[Path, ...],
     closures: Path | None,
     boxes: bool,
+    overwrite: bool,
     out: Path | None,
 ) -> None:
     """Make a scene of ROBOT, a URDF file.
@@ -350,7 +353,7 @@ def import_robot(
                 write_mesh = None if boxes else msh_bytes
                 table = os.fspath(trajectory)
                 found = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
-            _write_scene(out or Path(robot.stem), *found)
+            _write_scene(out or Path(robot.stem), overwrite, *found)
 
 
 def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
@@ -363,16 +366,26 @@ def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
     return read_robot(file, package_path)
 
 
-def _write_scene(folder: Path, scene: RobotScene, t: np.ndarray, rows: np.ndarray) -> None:
+def _write_scene(
+    folder: Path, overwrite: bool, scene: RobotScene, t: np.ndarray, rows: np.ndarray
+) -> None:
     """Write scene, table and record, and say what they are."""
-    from dolfinopt.output.folders import prepare_folder, write_new
+    from dolfinopt.output.folders import check_new, prepare_folder, write_new
     from dolfinopt.scene.load import load_scene
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
     new = scene.files(folder, t, rows)
     *_, path = new
+    replaced: dict[Path, str | bytes] = {
+        folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"
+    }
+    if overwrite:
+        _keep_edited(path, new[path])
+        new, replaced = {}, {**replaced, **new}
+    else:
+        check_new(new, ", or --overwrite to replace the import; an edited scene is kept beside it")
     prepare_folder(folder)
-    write_new(new, {folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
+    write_new(new, replaced)
     click.echo(
         f"{path}: {len(scene.bodies)} arms, {rows.shape[1]} joints that move, "
         f"{float(t[-1]):g} s of motion"
@@ -389,6 +402,17 @@ def _write_scene(folder: Path, scene: RobotScene, t: np.ndarray, rows: np.ndarra
         load_scene(path)
     except InputError as error:
         warn([f"correct the scene before you simulate it: {error}"])
+
+
+def _keep_edited(path: Path, text: str | bytes) -> None:
+    """Give a scene that differs from the one to be written another name."""
+    data = text if isinstance(text, bytes) else text.encode()
+    if not path.exists() or path.read_bytes() == data:
+        return
+    names = (path.with_name(f"{path.stem}.{k}.toml") for k in itertools.count(1))
+    kept = next(name for name in names if not name.exists())
+    path.rename(kept)
+    click.echo(f"{kept}: the scene that was there")
 
 
 # -- `dolfinopt export RUN --urdf`: a robot with the links of a finished run ---------------------

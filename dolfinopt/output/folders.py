@@ -145,16 +145,16 @@ def remove_stale(
             ) from None
 
 
-def check_new(files: Iterable[Path]) -> None:
-    """Raise InputError if one of the files exists."""
+def check_new(files: Iterable[Path], hint: str = "") -> None:
+    """Raise InputError if one of the files exists; `hint` ends the message."""
     for path in files:
         if path.exists():
             raise InputError(
-                f"{path}: exists already and stays as it is; give another name or folder"
+                f"{path}: exists already and stays as it is; give another name or folder{hint}"
             )
 
 
-def write_new(new: Mapping[Path, str | bytes], replaced: Mapping[Path, str]) -> None:
+def write_new(new: Mapping[Path, str | bytes], replaced: Mapping[Path, str | bytes]) -> None:
     """Write all files of `new`, none of which may be there yet, and those of `replaced`.
 
     They get their names, in this order, when all of them are on the disk.

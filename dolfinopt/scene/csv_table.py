@@ -40,8 +40,9 @@ def read_table(
 ) -> Table:
     """Read a CSV file with a line of column names, UTF-8.
 
-    Columns stand in any order, separated by commas; a column t may be there besides `columns`.
-    Blank lines and lines that start with # count for nothing.
+    Columns stand in any order, separated by commas, or by semicolons or tabulators, beside which
+    numbers may have decimal commas; a column t may be there besides `columns`. Blank
+    lines and lines that start with # count for nothing.
 
     Args:
         file: its path.
@@ -101,12 +102,16 @@ def _lines(file: str) -> list[tuple[int, list[str]]]:
         reason = getattr(error, "strerror", None) or "not a file name"
         raise InputError(f"{file}: cannot be read ({reason}); name a table (CSV)") from None
     numbered = enumerate(text.splitlines(), start=1)
-    return [(k, _cells(x)) for k, x in numbered if x.strip() and not x.lstrip().startswith("#")]
+    lines = [(k, x) for k, x in numbered if x.strip() and not x.lstrip().startswith("#")]
+    first = lines[0][1] if lines else ""
+    separator = next((one for one in (";", "\t") if one in first), ",")
+    return [(k, _cells(x, separator)) for k, x in lines]
 
 
-def _cells(line: str) -> list[str]:
-    """Split a line at its commas; spreadsheets may put names in quotes."""
-    return [cell.strip().strip('"') for cell in line.split(",")]
+def _cells(line: str, separator: str) -> list[str]:
+    """Split a line; spreadsheets may put names in quotes, and commas before decimals."""
+    cells = (cell.strip().strip('"') for cell in line.split(separator))
+    return [cell.replace(",", ".") for cell in cells]
 
 
 def _row(where: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:

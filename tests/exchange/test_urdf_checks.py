@@ -32,8 +32,15 @@ def test_import_says_what_it_made(tmp_path, capsys):
     assert scene.is_spatial and scene.driven == tuple(columns[1:])
     assert "7.879 kg" in (tmp_path / "a" / "robot.toml").read_text()
     before = (tmp_path / "a" / "robot.toml").read_bytes()
-    refusal(lambda: run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a"), "exists already")
+    refusal(lambda: run_import(DEMO, "upper_arm", DEMO_MOTION, tmp_path / "a"), "--overwrite")
     assert (tmp_path / "a" / "robot.toml").read_bytes() == before
+    # With --overwrite the import is replaced, and a scene that was edited is kept beside it.
+    run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a", "--overwrite")
+    assert not (tmp_path / "a" / "robot.1.toml").exists()
+    (tmp_path / "a" / "robot.toml").write_bytes(before + b"# mine\n")
+    run_import(DEMO, "forearm", DEMO_MOTION, tmp_path / "a", "--overwrite")
+    assert (tmp_path / "a" / "robot.toml").read_bytes() == before
+    assert (tmp_path / "a" / "robot.1.toml").read_bytes() == before + b"# mine\n"
 
 
 def test_a_joint_that_follows_and_those_not_named_have_columns(tmp_path, capsys):

@@ -78,9 +78,10 @@ UNEVEN_LINKS = (
 )  # fmt: skip
 
 
-def run_import(file: Path, links: str, motion: Path, folder: Path) -> None:
+def run_import(file: Path, links: str, motion: Path, folder: Path, *more: str) -> None:
     """Import a robot with boxes for solids."""
-    run("import", file, "--links", links, "--trajectory", motion, "--out", folder, "--boxes")
+    told = "--links", links, "--trajectory", motion, "--out", folder, "--boxes"
+    run("import", file, *told, *more)
 
 
 def inertial(rng: np.random.Generator) -> str:

@@ -287,13 +287,23 @@ def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path: Pa
     assert read_table(written(tmp_path, "x,y\n1,2\n1,2\n"), ("x", "y")).t is None
 
 
+@pytest.mark.parametrize("separator", [";", "\t", " ; "])
+def test_decimal_commas(tmp_path: Path, separator: str) -> None:
+    """As spreadsheets write tables where numbers have commas; points are read, too."""
+    text = "t|x|y\n0|1,5|2\n0,5|-4.25|1e-1\n".replace("|", separator)
+    found = read_table(written(tmp_path, text), ("x", "y"))
+    assert found.rows.tolist() == [[1.5, 2.0], [-4.25, 0.1]]
+    assert found.t is not None and found.t.tolist() == [0.0, 0.5]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", ["no rows", "x,y or t,x,y"]),
         ("# x,y\n\n", ["no rows", "x,y or t,x,y"]),
         ("1,2\n3,4\n5,6\n", ["line 1", "column '1'", "x,y or t,x,y"]),
-        ("\nx;y\n0;1\n1;1\n", ["line 2", "column 'x;y'", "x,y or t,x,y"]),
+        ("\nx|y\n0|1\n1|1\n", ["line 2", "column 'x|y'", "x,y or t,x,y"]),
+        ("x;y\n0;1\n1,5;1,,5\n", ["line 3, column y = '1..5'", "a finite number"]),
         ("t,x,y,z\n0,0,0,0\n", ["line 1", "column 'z'", "x,y or t,x,y"]),
         ("x,y,x\n0,0,0\n", ["line 1", "repeated column 'x'", "x,y or t,x,y"]),
         ("t,x\n0,0\n1,1\n", ["line 1", "column 'y'", "x,y or t,x,y"]),
