@@ -37,7 +37,7 @@ TESTED = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(PAGES.glob("tuto
           PAGES / "develop" / "own-form.md"]  # fmt: skip
 # Of every scene that a page simulates, so that it takes a fraction of a second.
 SETTINGS = {"cells": "[20, 3]", "max_iterations": "2", "mesh_size": "0.01", "load_cases": "4"}
-SUFFIXES = (".npz", ".md", ".gif", ".csv", ".vtu", ".xdmf", ".png", ".json", ".toml", ".py")
+SUFFIXES = (".npz", ".md", ".gif", ".csv", ".vtu", ".png", ".json", ".toml", ".py")
 
 
 class Block(NamedTuple):

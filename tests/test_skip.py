@@ -301,4 +301,4 @@ def test_nothing_is_drawn_exported_or_gathered_unless_asked(
     folder = run("optimize", "optimizer.max_iterations=3")
     assert len(gathered) == 1
     kinds = {path.suffix for path in folder.iterdir()}
-    assert kinds == {".json", ".npz", ".csv", ".vtu", ".xdmf"}
+    assert kinds == {".json", ".npz", ".csv", ".vtu"}

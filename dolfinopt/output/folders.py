@@ -30,7 +30,7 @@ RUN_FILES = (
     "feed_forward.csv",
     "budget.csv",
     "design.npz",
-    "design.xdmf",
+    "design.xdmf",  # of earlier versions
     "design.vtu",
     "design.png",
     "history.png",

@@ -66,7 +66,7 @@ def write_result(
         folder: exists; of an optimisation history and checkpoint are there already.
         result: what came of a simulation or an optimisation.
         wall: seconds that it took up to now; the summary's total also counts what follows.
-        paraview: write design.vtu and design.xdmf, too.
+        paraview: write design.vtu, too.
         pictures: called with the arms' views before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall

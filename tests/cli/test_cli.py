@@ -63,7 +63,7 @@ def test_pictures_are_drawn_anew(optimised):
 
 def test_optimize_writes_every_file(optimised):
     """And --overwrite knows them all; the design has a density at every cell's centroid."""
-    expected = """checkpoint.npz design.npz design.png design.vtu design.xdmf deviation.png
+    expected = """checkpoint.npz design.npz design.png design.vtu deviation.png
         history.csv history.png machine.png stress.png summary.json trajectory.csv trajectory.npz
         budget.csv"""
     assert {path.name for path in optimised.iterdir()} == set(expected.split()) <= set(RUN_FILES)

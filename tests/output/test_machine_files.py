@@ -160,7 +160,7 @@ def test_prescribed_motion_leaves_what_it_left(tmp_path):
 
 
 SMALL = ("arms.cells=[20,3]", "optimizer.max_iterations=1", "simulation.sample=0.01")
-PARAVIEW = {"design.vtu", "design.xdmf"}
+PARAVIEW = {"design.vtu"}
 FILES = {"budget.csv", "design.npz", "summary.json", "trajectory.csv", "trajectory.npz"}
 
 
