@@ -115,7 +115,7 @@ class Adjoint:
         window = self._stages.window(part.start, part.stop)
         q, qd, a = (x[part] for x in self._at)
         exact = tangent_at(window, q, qd, a)
-        own = exact if len(slow) == q.shape[2] else exact.step_mean(1, slow)
+        own = exact if len(slow) == q.shape[2] else exact.step_mean(len(exact.matrix), slow)
         matrix = matrix_of(window, own, slow)
         if len(window.h) == len(self._stages.h):
             self._kept = {key: (matrix, exact)}

@@ -69,7 +69,7 @@ def estimate(
     if matrix is not None:
         # Of smooth motions the mean tangent of every step serves at all of its stages, 30 % faster.
         keep = np.searchsorted(matrix.slow, slow)
-        mean = matrix.tangent.step_mean(a.shape[1], keep)
+        mean = matrix.tangent.step_mean(len(a), keep)
         corrections = _corrected(matrix_of(richer, mean, slow), begin, b)
     every, alone = corrections or _corrections(richer, begin, b, slow)
     q, _ = stage_values(richer, *begin, b)

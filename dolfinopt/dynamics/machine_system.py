@@ -341,8 +341,13 @@ class MachineSystem:
         """Return the largest deflection of an arm in a motion y (n, S), over its length."""
         return float(self.mechanism.deflections(y[:, self.elastic_columns])[0].max(initial=0.0))
 
-    def elastic_mass(self, t: np.ndarray) -> np.ndarray:
-        """Return the mass (n, N, N) of the undeformed mechanism at instants t (n,), s."""
+    @cached_property
+    def rest_mass(self) -> np.ndarray:
+        """Mass (3, N, N) of the undeformed mechanism at the beginning, middle, end of the motion.
+
+        With 1 to 9 instants modes of their mean are as good.
+        """
+        t = np.linspace(0.0, self.breakpoints[-1], 3)
         size = self.mechanism.num_coordinates
         rest = np.zeros((len(t), size))
         tangent = linearise(self.mechanism, self.motion(t), rest, rest, rest)
@@ -355,8 +360,7 @@ class MachineSystem:
         """
         if self.mechanism.num_coordinates == 0:
             return 0.0
-        [mass] = self.elastic_mass(np.zeros(1))
-        squares = np.linalg.eigvals(np.linalg.solve(self.mechanism.stiffness(), mass))
+        squares = np.linalg.eigvals(np.linalg.solve(self.mechanism.stiffness(), self.rest_mass[0]))
         return float(np.sqrt(1.0 / np.abs(squares).max()))
 
     def preconditioner(self) -> Preconditioner:

@@ -32,8 +32,7 @@ def modes_of(system: MachineSystem) -> Preconditioner:
     Those of an arm are ordered by descending frequencies.
     """
     mechanism, parts, size = system.mechanism, system.body_columns, system.num_coordinates
-    t = np.linspace(0.0, system.breakpoints[-1], 3)  # 1 to 9 are as good
-    mass = system.elastic_mass(t).mean(axis=0)
+    mass = system.rest_mass.mean(axis=0)
     bodies, transforms, inverses, frequencies = [], [], [], np.zeros(size)
     k, d, m = np.ones(size), np.zeros(size), np.ones(size)
     for part, own, body in zip(parts, mechanism.slices, mechanism.bodies, strict=True):

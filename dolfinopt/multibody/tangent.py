@@ -46,10 +46,10 @@ class Tangent:
         count, rows, size, _ = self.matrix.shape
         return self.matrix.reshape(count, rows, 3 * size)
 
-    def step_mean(self, stages: int, keep: np.ndarray) -> Tangent:
-        """Return its mean over every `stages` instants, by some of the coordinates, ascending."""
+    def step_mean(self, steps: int, keep: np.ndarray) -> Tangent:
+        """Return its mean over the instants of each step, by some of the coordinates, ascending."""
         kept = self.matrix.take(self.order[keep], axis=2)
-        mean = kept.reshape(-1, stages, *kept.shape[1:]).mean(axis=1)
+        mean = kept.reshape(steps, -1, *kept.shape[1:]).mean(axis=1)
         return Tangent(mean, self.own[keep], np.arange(len(keep)))
 
     def dense(self) -> np.ndarray:
