@@ -21,8 +21,8 @@ from dolfinopt.motion.build import (
     rigid_motion,
     table_rows,
 )
+from dolfinopt.motion.machine import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.motion.measured import DENSE_INSTANTS
-from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals

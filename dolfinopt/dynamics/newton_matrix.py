@@ -209,8 +209,8 @@ def factorise(
         return matrix_of(stages, tangent_at(stages, q, qd, a, slow), slow)
     count = a.shape[1]
     middle = count // 2
-    rates = (x[:, middle] for x in (q, qd, a))
-    tangent = stages.instants[middle::count].linearise(*rates, slow)
+    at_middle = stages.instants[middle::count]
+    tangent = at_middle.linearise(q[:, middle], qd[:, middle], a[:, middle], slow)
     return matrix_of(stages, tangent, slow)
 
 

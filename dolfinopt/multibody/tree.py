@@ -294,6 +294,15 @@ class Mechanism:
             found.insert(0, (joint.parent, joint.interface))
         return tuple(found)
 
+    @cached_property
+    def reach(self) -> float:
+        """Length of the links from the ground to the end-effector together, m."""
+        total, point = 0.0, np.zeros(self.dim.d)
+        for i, number in self.way:
+            total += float(np.linalg.norm(point + self.joints[i].origin))
+            point = self.constants[i].points[number]
+        return total + float(np.linalg.norm(point)) or 1.0
+
     def is_felt(self, i: int) -> bool:
         """Return whether a body inboard of body i deforms under its load."""
         return any(self.bodies[k].num_modes for k, _ in self.way_to((i, 0))[:-1])
