@@ -18,7 +18,7 @@ import numpy as np
 from dolfinopt.dynamics.collocation import (
     Solution,
     Stages,
-    lagrange_integrals,
+    lagrange,
     radau_iia,
     stage_values,
     stages_of,
@@ -137,8 +137,8 @@ def _sampled(
     step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(solution.a) - 1)
     h = np.diff(solution.time_grid)[step]
     tau = (t - solution.time_grid[step]) / h
-    integrals = lagrange_integrals(solution.nodes, tau)
-    weights = [integrals[2 - k] * (h ** (2 - k))[:, None] for k in range(len(by_rates))]
+    orders = range(len(by_rates))
+    weights = [lagrange(solution.nodes, tau, k - 2) * (h ** (2 - k))[:, None] for k in orders]
     by_instant = sum(w[:, :, None] * by[:, None] for w, by in zip(weights, by_rates, strict=True))
     late = (h * tau)[:, None] * by_rates[0]
     if len(by_rates) > 1:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dolfinopt.dynamics.collocation import lagrange_integrals
+from dolfinopt.dynamics.collocation import lagrange
 from dolfinopt.multibody.rigid_motion import RigidMotion
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -137,11 +137,11 @@ def stage_values_of(
     t = first[:, None] + length * (1.0 + points)
     h = np.diff(time_grid)
     tau = (t - time_grid[step][:, None]) / h[step][:, None]
-    basis = lagrange_integrals(nodes, tau.ravel())[0].reshape(*t.shape, -1)
+    basis = lagrange(nodes, tau.ravel()).reshape(*t.shape, -1)
     f = function(t.ravel()).reshape(*t.shape, -1)
     parts = basis.swapaxes(1, 2) @ (f * (length * weights)[:, :, None])
     moments = np.add.reduceat(parts, np.searchsorted(step, steps))
-    lengths = h[steps, None, None] * lagrange_integrals(nodes, np.ones(1))[1][0][:, None]
+    lengths = h[steps, None, None] * lagrange(nodes, np.ones(1), -1)[0][:, None]
     values = values.reshape(len(h), len(nodes), -1)
     values[steps] = moments / lengths
     return values.reshape(-1, values.shape[2])

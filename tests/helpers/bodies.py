@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.bench.field_machines import plane_body
 from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.rotations import skew
-from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
+from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals
 from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
