@@ -24,6 +24,7 @@ from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
     rigid_bar,
+    rigid_body,
     rigid_spatial_body,
 )
 from dolfinopt.multibody.tree import (
@@ -148,7 +149,7 @@ def crank(body: ShapeIntegrals) -> Crank:
     mechanism = Mechanism(
         bodies=arms,
         joints=tuple(Joint(f"joint {k}", "revolute", k - 1, k + 1, *flat) for k in range(2)),
-        loads={(1, 0): Constants.of_point(SLIDER_MASS, 0.0)},
+        loads={(1, 0): Constants(rigid_body(SLIDER_MASS, np.zeros(2), 0.0, np.zeros(2)))},
         gravity=np.zeros((2, 1)),
         end=(1, 0),
         origin=np.zeros(2),

@@ -39,7 +39,7 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.multibody.dimension import DIMENSIONS, product
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -83,11 +83,6 @@ class Constants:
         self.K = _diagonal_or_matrix(body.K)
         self.D = _diagonal_or_matrix(body.D) if body.D.any() else None
         self.points = body.points if self.dim.d == 3 else body.outboard_point[None]
-
-    @classmethod
-    def of_point(cls, mass: float, inertia: float) -> Constants:
-        """Return those of a mass (kg) with rotary inertia (kg m2) at the origin, in the plane."""
-        return cls(rigid_body(mass, np.zeros(2), inertia, np.zeros(2)))
 
     def outboard(self, number: int) -> slice:
         """Return an interface's place among the pushes."""

@@ -357,10 +357,6 @@ class Mechanism:
         """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
         return np.sqrt(np.maximum(self.energies(q), 0.0).max(axis=-2))
 
-    def compliance(self, q: np.ndarray) -> np.ndarray:
-        """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper; q (n, N)."""
-        return self.energies(q)[:, : self.num_arms]
-
     def deflections(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return every arm's largest deflection over its length, and its largest rotation, rad.
 
