@@ -327,13 +327,8 @@ class BodyMotion:
             virtual: (d + r, n) multiplies (F, T).
             zeta: (q, n) multiplies the rows.
         """
-        dim, (u, phi) = self.dim, np.split(virtual, [self.dim.d])
-        by_a = self.constants.mass * u + dim.velocity(phi, self.moments[0])
-        by_entries = [product(x.swapaxes(0, 1), virtual) for x in self._load_by_entries]
-        if self.is_flexible:
-            by_a += product(self.V[: dim.d], zeta)
-            by_entries = [x + product(Y, zeta) for x, Y in zip(by_entries, (self.Y, self.Yd))]
-        return np.concatenate([by_a, dim.spin_gradient(self.w, *by_entries)])
+        found = product(self.load_by_motion.swapaxes(0, 1), virtual)
+        return found + product(self.rows_by_motion, zeta) if self.is_flexible else found
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:
