@@ -23,8 +23,8 @@ from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import (
     ShapeIntegrals,
-    plane_body,
     rigid_bar,
+    rigid_body,
     rigid_spatial_body,
 )
 from dolfinopt.multibody.tree import (
@@ -47,6 +47,36 @@ SPEED, END = 150.0, 0.1  # rad/s, s
 PI = np.pi
 
 STEPS, STAGES = 3200, 5  # fewer leave axial vibrations of the undamped rod in the multipliers
+
+
+def plane_body(
+    mass: float,
+    moment: np.ndarray,
+    inertia: float,
+    C: np.ndarray,
+    j: np.ndarray,
+    r: np.ndarray,
+    M: np.ndarray,
+    G: np.ndarray,
+    K: np.ndarray,
+    D: np.ndarray,
+    outboard: np.ndarray,
+    outboard_point: np.ndarray,
+    K0: np.ndarray | None = None,
+) -> ShapeIntegrals:
+    """Return a plane body from its integrals by name, see `ShapeIntegrals`.
+
+    K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
+    """
+    none = np.zeros((0, *K.shape))
+    W = np.array(
+        [np.block([[inertia, j], [j[:, None], M]]), np.block([[0.0, 0.0 - r], [r[:, None], G]])]
+    )
+    w, K0 = np.column_stack([moment, C]), none if K0 is None else K0
+    further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
+    return ShapeIntegrals(
+        float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:], further, none
+    )
 
 
 def rod() -> ShapeIntegrals:
@@ -119,7 +149,7 @@ def crank(body: ShapeIntegrals) -> Crank:
     mechanism = Mechanism(
         bodies=arms,
         joints=tuple(Joint(f"joint {k}", "revolute", k - 1, k + 1, *flat) for k in range(2)),
-        loads={(1, 0): Constants.of_point(SLIDER_MASS, 0.0)},
+        loads={(1, 0): Constants(rigid_body(SLIDER_MASS, np.zeros(2), 0.0, np.zeros(2)))},
         gravity=np.zeros((2, 1)),
         end=(1, 0),
         origin=np.zeros(2),

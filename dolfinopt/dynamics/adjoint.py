@@ -18,7 +18,7 @@ import numpy as np
 from dolfinopt.dynamics.collocation import (
     Solution,
     Stages,
-    lagrange_integrals,
+    lagrange,
     radau_iia,
     stage_values,
     stages_of,
@@ -115,7 +115,7 @@ class Adjoint:
         window = self._stages.window(part.start, part.stop)
         q, qd, a = (x[part] for x in self._at)
         exact = tangent_at(window, q, qd, a)
-        own = exact if len(slow) == q.shape[2] else exact.step_mean(1, slow)
+        own = exact if len(slow) == q.shape[2] else exact.step_mean(len(exact.matrix), slow)
         matrix = matrix_of(window, own, slow)
         if len(window.h) == len(self._stages.h):
             self._kept = {key: (matrix, exact)}
@@ -137,8 +137,8 @@ def _sampled(
     step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(solution.a) - 1)
     h = np.diff(solution.time_grid)[step]
     tau = (t - solution.time_grid[step]) / h
-    integrals = lagrange_integrals(solution.nodes, tau)
-    weights = [integrals[2 - k] * (h ** (2 - k))[:, None] for k in range(len(by_rates))]
+    orders = range(len(by_rates))
+    weights = [lagrange(solution.nodes, tau, k - 2) * (h ** (2 - k))[:, None] for k in orders]
     by_instant = sum(w[:, :, None] * by[:, None] for w, by in zip(weights, by_rates, strict=True))
     late = (h * tau)[:, None] * by_rates[0]
     if len(by_rates) > 1:

@@ -11,7 +11,7 @@ import numpy as np
 from dolfinopt.dynamics.drives import Drives, Springs
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import FILE_ROUNDING, KEPT_INSTANTS_LIMIT
-from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table
+from dolfinopt.dynamics.tables import LoadedMotion, Table
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import (
     breakpoints,
@@ -21,8 +21,8 @@ from dolfinopt.motion.build import (
     rigid_motion,
     table_rows,
 )
+from dolfinopt.motion.machine import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.motion.measured import DENSE_INSTANTS
-from dolfinopt.multibody.build import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -92,8 +92,7 @@ def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
     if loads or len(rows):
         mechanism = replace(mechanism, forces=forces_of(scene))
         motion = LoadedMotion(motion, loads, rows)
-        tables = [load.table for load in loads if load.table is not None]
-        instants = with_ends(instants, tables, scene.horizon)
+        instants = with_ends(instants, loads, scene.horizon)
     if not is_machine(scene):
         return MachineSystem(mechanism, motion, instants)
     drives = _drives(scene)
@@ -239,19 +238,18 @@ def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
     )
 
 
-def loads_of(scene: Scene) -> tuple[LoadHistory, ...]:
+def loads_of(scene: Scene) -> tuple[Table, ...]:
     """Return the scene's forces and moments over time, N and N m."""
     return tuple(_load(force, scene.dimension, scene.lead) for force in scene.forces)
 
 
-def _load(force: Force, dimension: int, lead: float) -> LoadHistory:
+def _load(force: Force, dimension: int, lead: float) -> Table:
     """Return force and moment, (3,) or in space (6,), and the table's."""
     constant = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
-    if force.table is None:
-        return LoadHistory(force.factor * constant)
-    table = _table(force.table, FORCE_COLUMNS[dimension])
-    values = force.factor * table.values
-    return LoadHistory(force.factor * constant, Table(table.t + lead, values))
+    table = Table(np.zeros(1), np.zeros((1, len(constant))))
+    if force.table is not None:
+        table = _table(force.table, FORCE_COLUMNS[dimension])
+    return Table(table.t + lead, force.factor * table.values, force.factor * constant)
 
 
 def _table(file: str, columns: tuple[str, ...]) -> Table:

@@ -15,6 +15,7 @@ from enum import Enum
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from dolfinopt.dynamics.system import Instants, Preconditioner, State, inverse_size
 from dolfinopt.multibody.tangent import Tangent
@@ -36,7 +37,7 @@ def radau_iia(stages: int) -> Collocation:
     c = (legendre.basis(stages) - legendre.basis(stages - 1)).roots()
     c = np.sort(0.5 * (1.0 + c.real))
     c[-1] = 1.0
-    _, A, _ = lagrange_integrals(c, c)
+    A = lagrange(c, c, -1)
     return Collocation(c, A, A @ A)
 
 
@@ -210,7 +211,7 @@ class Solution:
         step = np.clip(np.searchsorted(self.time_grid, t, side="left") - 1, 0, len(self.a) - 1)
         h = np.diff(self.time_grid)[step]
         tau = (t - self.time_grid[step]) / h
-        integrals = lagrange_integrals(self.nodes, tau)[2 - derivative]
+        integrals = lagrange(self.nodes, tau, derivative - 2)
         weights = integrals * (h ** (2 - derivative))[:, None]
         value = (weights[:, None] @ self.a[step])[:, 0]
         if derivative == 0:
@@ -231,33 +232,14 @@ class Solution:
         return self.sample(times.ravel() * stretch, 2).reshape(*times.shape, -1)
 
 
-def lagrange_integrals(
-    nodes: np.ndarray, tau: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Lagrange polynomials of `nodes` at tau, their integral from 0 and its integral.
+def lagrange(nodes: np.ndarray, tau: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """Return the Lagrange polynomials of `nodes` (s,), or a derivative, at tau (m,), (m, s).
 
-    Returns:
-        Three arrays (len(tau), s).
+    Of a negative order it is an integral from 0.
     """
-    s = len(nodes)
-    powers = np.arange(s)
-    coefficients = np.linalg.inv(nodes[:, None] ** powers)  # (power, node)
-    value = tau[:, None] ** powers
-    first = tau[:, None] ** (powers + 1) / (powers + 1)
-    second = tau[:, None] ** (powers + 2) / ((powers + 1) * (powers + 2))
-    return value @ coefficients, first @ coefficients, second @ coefficients
-
-
-def lagrange_derivatives(nodes: np.ndarray, tau: np.ndarray) -> np.ndarray:
-    """Return Lagrange polynomials of `nodes`, their first and second derivatives (3, m, s) at tau.
-
-    Args:
-        nodes: (s,).
-        tau: (m,).
-    """
-    powers = np.arange(len(nodes), dtype=float)
-    coefficients = np.linalg.inv(nodes[:, None] ** powers)  # (power, node)
-    value = tau[:, None] ** powers
-    first = powers * tau[:, None] ** np.maximum(powers - 1.0, 0.0)
-    second = powers * (powers - 1.0) * tau[:, None] ** np.maximum(powers - 2.0, 0.0)
-    return np.stack([value, first, second]) @ coefficients
+    coefficients = np.linalg.inv(polynomial.polyvander(nodes, len(nodes) - 1))  # (power, node)
+    if derivative > 0:
+        coefficients = polynomial.polyder(coefficients, derivative)
+    else:
+        coefficients = polynomial.polyint(coefficients, -derivative)
+    return polynomial.polyvander(tau, len(coefficients) - 1) @ coefficients

@@ -16,9 +16,8 @@ import numpy as np
 from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import MATRIX_BYTES
-from dolfinopt.multibody.gradient import body_gradient
-from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals, add_integrals
-from dolfinopt.multibody.tangent import Tangent, linearise
+from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
+from dolfinopt.multibody.tangent import Tangent
 
 
 class DriveForces:
@@ -75,54 +74,26 @@ class _Chunk:
 
     @cached_property
     def tangent(self) -> Tangent:
-        """Of inverse dynamics by rigid, motors' and elastic coordinates."""
-        mechanism, motion = self.state.machine.mechanism, self.state.motion
-        every = np.arange(mechanism.num_rigid + len(mechanism.motor_joints))
-        return linearise(mechanism, motion, *self.state.elastic, None, every)
+        """Of what moves the machine freed, by its unknowns."""
+        matrix = self.state.freed.matrix()
+        every = np.arange(len(matrix[0]))
+        return Tangent(matrix, every, every)
 
     def gradient(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
         """Return `DriveForces.gradient`."""
         state, system = self.state, self.state.machine
-        drives, joints = system.drives, system.mechanism.motor_joints
-        given = np.hstack([weights, np.zeros((len(weights), len(joints)))])
-        given[:, drives.free] = 0.0
+        drives, rigid = system.drives, system.mechanism.num_rigid
+        motors, joints = system.freed.motor_columns, system.mechanism.motor_joints
+        rows = np.zeros((len(weights), system.freed.num_coordinates))
+        rows[:, :rigid] = weights
+        rows[:, drives.free] = 0.0
         if not len(drives.springs.joints):
-            given[:, weights.shape[1] :] = weights[:, joints]
-        by, by_motion, bodies = self._of_inverse_dynamics(given)
+            rows[:, motors] = weights[:, joints]
+        every = np.stack(self.tangent.transposed(rows))
+        by, by_motion = every[:, :, system.among_freed], every[:, :, :rigid]
+        by_motion[:, :, joints] += every[:, :, motors]
         passed = state.passing * weights[:, drives.free]
         by[0][:, system.drive_columns] -= passed * drives.stiffness
         by[1][:, system.drive_columns] -= passed * drives.damping
+        bodies = state.freed.body_gradient(rows)
         return by, by_motion, state.with_feed_forward(bodies, weights[:, drives.free])
-
-    def _of_inverse_dynamics(
-        self, weights: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
-        """Return the part of drives on a given motion: inverse dynamics, less the closure's."""
-        state, system = self.state, self.state.machine
-        mechanism, none = system.mechanism, np.zeros_like(state.elastic[0])
-        bodies = body_gradient(mechanism, state.motion, *state.elastic, none, weights)
-        by = np.zeros((3, *state.rates[0].shape))
-        by_motion = np.zeros((3, len(weights), mechanism.num_rigid))
-        if not weights.any():
-            return by, by_motion, bodies
-        rows = np.concatenate([weights, none], axis=1)
-        every = np.stack(self.tangent.transposed(rows))
-        by[:, :, system.motor_columns] = every[:, :, system.motor_coordinates]
-        rigid, moving = mechanism.num_rigid, system.ends[1]
-        by_motion += every[:, :, :rigid]
-        by_motion[:, :, mechanism.motor_joints] += every[:, :, rigid : weights.shape[1]]
-        every = np.delete(every, np.s_[rigid : weights.shape[1]], axis=2)
-        by[:, :, :moving] = every[:, :, system.columns]
-        if state.closed is None:
-            return by, by_motion, bodies
-        weights, multipliers = weights[:, :rigid], state.multipliers
-        hessian = state.closed.hessian(multipliers)[:, :rigid]
-        H = hessian[:, :, system.columns]
-        by_motion[0] -= np.einsum("ni,nic->nc", weights, hessian[:, :, :rigid])
-        J = state.closed.jacobian[:, :, :rigid]
-        by[0][:, :moving] -= np.einsum("ni,nic->nc", weights, H)
-        by[2][:, system.constraint_columns] -= np.einsum("nmi,ni->nm", J, weights)
-        moved = np.concatenate([weights, none], axis=1)
-        parts = state.closed.gradient(np.zeros_like(multipliers), multipliers, -moved)
-        bodies = [add_integrals(a, part) for a, part in zip(bodies, parts, strict=True)]
-        return by, by_motion, bodies

@@ -15,8 +15,7 @@ from dolfinopt.dynamics.collocation import (
     Collocation,
     Stages,
     at_stages,
-    lagrange_derivatives,
-    lagrange_integrals,
+    lagrange,
     radau_iia,
     residual_at,
     stage_values,
@@ -64,12 +63,12 @@ def estimate(
     richer = stages_of(stages.preconditioner, method, time_grid, stages.size)
     begin = step_beginnings(stages, state, a)
     slow = up_to_angle(richer, SLOW_ANGLES[0])
-    b = lagrange_integrals(stages.method.c, method.c)[0] @ a
+    b = lagrange(stages.method.c, method.c) @ a
     corrections = None
     if matrix is not None:
         # Of smooth motions the mean tangent of every step serves at all of its stages, 30 % faster.
         keep = np.searchsorted(matrix.slow, slow)
-        mean = matrix.tangent.step_mean(a.shape[1], keep)
+        mean = matrix.tangent.step_mean(len(a), keep)
         corrections = _corrected(matrix_of(richer, mean, slow), begin, b)
     every, alone = corrections or _corrections(richer, begin, b, slow)
     q, _ = stage_values(richer, *begin, b)
@@ -211,7 +210,8 @@ def _jumps(
 ) -> np.ndarray:
     """Return the jumps of F, F', F'' (3, P, N) at breakpoints, from zero at first."""
     k, d, m = stages.preconditioner.uncoupled
-    ends = lagrange_derivatives(stages.method.c, np.array([0.0, 1.0]))  # (3, 2, s)
+    c, both = stages.method.c, np.array([0.0, 1.0])
+    ends = np.stack([lagrange(c, both, order) for order in range(3)])  # (3, 2, s)
     sides = []
     for end, steps in zip(
         ends.swapaxes(0, 1), (breakpoint_steps, breakpoint_steps[1:] - 1), strict=True

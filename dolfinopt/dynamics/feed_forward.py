@@ -27,7 +27,7 @@ from dolfinopt.dynamics.adjoint import Adjoint, add_gradients
 from dolfinopt.dynamics.collocation import (
     Solution,
     end_gain,
-    lagrange_integrals,
+    lagrange,
     radau_iia,
     stage_values,
     stages_of,
@@ -289,7 +289,7 @@ def _sampled(
     step = np.clip(np.searchsorted(solution.time_grid, t, side="left") - 1, 0, len(a) - 1)
     h = np.diff(solution.time_grid)[step]
     tau = (t - solution.time_grid[step]) / h
-    weights = lagrange_integrals(solution.nodes, tau)[2] * (h * h)[:, None]
+    weights = lagrange(solution.nodes, tau, -2) * (h * h)[:, None]
     by_a = (by_y[:, :, None] * weights[:, None, :, None]).reshape(*by_y.shape[:2], -1)
     by_first = np.concatenate([by_y, by_y * (h * tau)[:, None, None]], axis=2)
     out = np.empty((len(t), by_y.shape[1], y.shape[2]))

@@ -175,14 +175,11 @@ class MachineState:
 
         Those of free coordinates by their law; of prescribed ones, what moves them as they move.
         """
-        machine, drives = self.machine, self.machine.drives
-        every = inverse_dynamics(machine.mechanism, self.motion, *self.elastic)[1]
-        forces, motors = np.split(every, [machine.mechanism.num_rigid], axis=1)
-        if self.closed is not None:
-            forces -= self.closed.generalised_force(self.multipliers)[:, : forces.shape[1]]
+        drives, mechanism, rows = self.machine.drives, self.machine.mechanism, self.freed.residual()
+        forces = rows[:, : mechanism.num_rigid]
         forces[:, drives.free] = self.drive_forces
         if not len(drives.springs.joints):
-            forces[:, machine.mechanism.motor_joints] += motors
+            forces[:, mechanism.motor_joints] += rows[:, self.machine.freed.motor_columns]
         if drives.friction is not None:
             forces[:, drives.free] += drives.friction.force(
                 self.instants.desired.qd[:, drives.free]
@@ -259,30 +256,26 @@ class MachineState:
         if self.instants.redundant is not None:
             matrix[:, rows, rows, 2] += CLOSURE_COMPLIANCE_SHARE * self.instants.redundant[0]
 
+    @property
+    def freed(self) -> MachineState:
+        """The same motion of the machine freed, see `MachineSystem.freed`."""
+        machine, free = self.machine, self.machine.freed
+        nothing = np.zeros((len(self.instants), free.ends[0]))
+        instants = replace(self.instants, machine=free, ahead=nothing, winding=None)
+        y, yd, ydd = np.zeros((3, len(nothing), free.num_coordinates))
+        for new, old in zip((y, yd, ydd), self.rates, strict=True):
+            new[:, machine.among_freed] = old
+        return MachineState(instants, (y, yd, ydd))
+
     def by_command(self, joints: np.ndarray) -> np.ndarray:
         """Return the residual's derivative by desired coordinates (n, S, F, 3) and their rates.
 
-        Rotors that are not unknown turn with their joints.
+        Motors turn with their joints.
         """
-        machine, mechanism = self.machine, self.machine.mechanism
-        rigid = mechanism.num_rigid
-        every = np.arange(rigid + len(mechanism.motor_joints))
-        tangent = linearise(mechanism, self.motion, *self.elastic, None, every)
-        columns = tangent.matrix[:, :, tangent.order]
-        by = columns[:, :, joints]
-        for k, joint in enumerate(mechanism.motor_joints):
-            by[:, :, joints == joint, 1:] += columns[:, :, [rigid + k], 1:]
-        out = np.zeros((len(by), machine.num_coordinates, len(joints), 3))
-        out[:, : machine.ends[0]] = by[:, machine.drives.free]
-        out[:, machine.elastic_columns] = by[:, len(every) :]
-        out[:, machine.motor_columns] = by[:, machine.motor_coordinates]
-        if self.closed is not None:
-            moving = machine.columns
-            hessian = self.closed.hessian(self.multipliers)
-            out[:, : machine.ends[1], :, 0] -= hessian[:, moving[:, None], joints]
-            gaps = machine.gap_scale * self.closed.jacobian[:, :, joints]
-            out[:, machine.constraint_columns, :, 0] += gaps
-        return out
+        machine, freed = self.machine, self.machine.freed
+        matrix = self.freed.matrix()
+        matrix[:, :, machine.mechanism.motor_joints] += matrix[:, :, freed.motor_columns]
+        return matrix[:, machine.among_freed[:, None], joints]
 
     # -- derivatives by the bodies -----------------------------------------------------------
 

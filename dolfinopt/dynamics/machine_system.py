@@ -20,12 +20,12 @@ multipliers s - 1. Source: Hairer, Lubich & Roche (1989), doi:10.1007/BFb0093947
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from dolfinopt.dynamics.drives import NO_COORDINATES, NOTHING, Drives
+from dolfinopt.dynamics.drives import NO_COORDINATES, NOTHING, Drives, Springs
 from dolfinopt.dynamics.equilibrium import equilibrium
 from dolfinopt.dynamics.known_forces import known_forces
 from dolfinopt.dynamics.machine_instants import MachineInstants
@@ -40,7 +40,7 @@ from dolfinopt.multibody.ranks import complement
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.tangent import linearise
-from dolfinopt.multibody.tree import Mechanism
+from dolfinopt.multibody.tree import Friction, Mechanism
 
 PRESCRIBED = Drives(NO_COORDINATES, NOTHING, NOTHING, NOTHING, NO_COORDINATES > 0)
 
@@ -129,6 +129,25 @@ class MachineSystem:
     def motor_coordinates(self) -> np.ndarray:
         """The mechanism's coordinates (M,) of motors behind springs that are controlled."""
         return self.mechanism.num_rigid + np.arange(len(self.drives.springs.joints))
+
+    @cached_property
+    def freed(self) -> MachineSystem:
+        """The same with every rigid coordinate and motor free and no drive: rows are what moves it.
+
+        Its unknowns are those of all rigid coordinates, elastic, constraints, motors.
+        """
+        every, motors = np.arange(self.mechanism.num_rigid), self.mechanism.motor_joints
+        none, still = np.zeros(len(every)), np.zeros(len(motors))
+        springs = Springs(motors, still, still, Friction.none(len(motors)))
+        drives = Drives(every, none, none, none + np.inf, every >= 0, springs=springs)
+        return replace(self, drives=drives)
+
+    @cached_property
+    def among_freed(self) -> np.ndarray:
+        """Places of the unknowns among those of the same machine freed."""
+        rigid, R = self.mechanism.num_rigid, self.ends[0]
+        rest = rigid + np.arange(self.num_coordinates - R)
+        return np.concatenate([self.drives.free, rest])
 
     # -- at instants -------------------------------------------------------------------------
 
@@ -341,8 +360,13 @@ class MachineSystem:
         """Return the largest deflection of an arm in a motion y (n, S), over its length."""
         return float(self.mechanism.deflections(y[:, self.elastic_columns])[0].max(initial=0.0))
 
-    def elastic_mass(self, t: np.ndarray) -> np.ndarray:
-        """Return the mass (n, N, N) of the undeformed mechanism at instants t (n,), s."""
+    @cached_property
+    def rest_mass(self) -> np.ndarray:
+        """Mass (3, N, N) of the undeformed mechanism at the beginning, middle, end of the motion.
+
+        With 1 to 9 instants modes of their mean are as good.
+        """
+        t = np.linspace(0.0, self.breakpoints[-1], 3)
         size = self.mechanism.num_coordinates
         rest = np.zeros((len(t), size))
         tangent = linearise(self.mechanism, self.motion(t), rest, rest, rest)
@@ -355,8 +379,7 @@ class MachineSystem:
         """
         if self.mechanism.num_coordinates == 0:
             return 0.0
-        [mass] = self.elastic_mass(np.zeros(1))
-        squares = np.linalg.eigvals(np.linalg.solve(self.mechanism.stiffness(), mass))
+        squares = np.linalg.eigvals(np.linalg.solve(self.mechanism.stiffness(), self.rest_mass[0]))
         return float(np.sqrt(1.0 / np.abs(squares).max()))
 
     def preconditioner(self) -> Preconditioner:

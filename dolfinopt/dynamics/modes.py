@@ -32,21 +32,20 @@ def modes_of(system: MachineSystem) -> Preconditioner:
     Those of an arm are ordered by descending frequencies.
     """
     mechanism, parts, size = system.mechanism, system.body_columns, system.num_coordinates
-    t = np.linspace(0.0, system.breakpoints[-1], 3)  # 1 to 9 are as good
-    mass = system.elastic_mass(t).mean(axis=0)
-    bodies, transforms, inverses, frequencies = [], [], [], np.zeros(size)
+    mass = system.rest_mass.mean(axis=0)
+    bodies, frequencies = [], np.zeros(size)
+    every, inverses = np.eye(size), np.eye(size)
     k, d, m = np.ones(size), np.zeros(size), np.ones(size)
     for part, own, body in zip(parts, mechanism.slices, mechanism.bodies, strict=True):
         T, inverse, squares = _vibrations(body.K, mass[own, own])
         bodies.append(_changed(body, T))
-        transforms.append(T)
-        inverses.append(inverse)
+        every[part, part], inverses[part, part] = T, inverse
         frequencies[part] = 1.0 / np.sqrt(np.maximum(squares, np.finfo(float).tiny))
         k[part], d[part] = np.diag(bodies[-1].K), np.diag(bodies[-1].D)
         m[part] = k[part] / frequencies[part] ** 2
     changed = replace(system, mechanism=replace(mechanism, bodies=tuple(bodies)))
-    maps = tuple(transforms), tuple(inverses)
-    return Preconditioner(changed, frequencies, (k, d, m), True, _coupled(system), parts, *maps)
+    guided = True, _coupled(system)
+    return Preconditioner(changed, frequencies, (k, d, m), every, inverses, *guided)
 
 
 def _coupled(system: MachineSystem) -> bool:

@@ -71,7 +71,7 @@ def integrate(
     if guess is not None and guess.a.shape[2] == system.num_coordinates:
         grid = known_grid(system, guess, tolerance, stages)
     if grid is None:
-        grid = first_grid(preconditioner.system, tolerance, stages)
+        grid = first_grid(system, tolerance, stages)
     solution = _Integration(preconditioner, grid, tolerance, stages, guess).run()
     profile.counts.newton_iterations += solution.iterations
     return solution

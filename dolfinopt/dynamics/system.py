@@ -16,9 +16,7 @@ pivots. tests/dynamics/test_system.py has examples.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from math import prod
 from typing import Any, Protocol
 
 import numpy as np
@@ -98,7 +96,7 @@ class System(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Preconditioner:
-    """Coordinates z of a system in which its residual is nearly uncoupled, q = T z part by part.
+    """Coordinates z of a system in which its residual is nearly uncoupled, q = T z.
 
     Attributes:
         system: in z, a `System`.
@@ -106,46 +104,39 @@ class Preconditioner:
         uncoupled: stiffness, damping and mass (N,) of every coordinate by itself.
         guided: whether zero is a guess of the whole motion: then all steps are solved at once.
         coupled: whether constraints couple fast coordinates: then these are treated densely, too.
-        parts: the coordinates that change; the others stay.
-        transforms, inverses: T and T^-1 (q, q) of every part.
+        T, inverse: (N, N), of q = T z.
     """
 
     system: Any
     frequencies: np.ndarray
     uncoupled: tuple[np.ndarray, np.ndarray, np.ndarray]
+    T: np.ndarray
+    inverse: np.ndarray
     guided: bool = False
     coupled: bool = False
-    parts: tuple[slice, ...] = ()
-    transforms: tuple[np.ndarray, ...] = ()
-    inverses: tuple[np.ndarray, ...] = ()
 
     def to_modes(self, q: np.ndarray) -> np.ndarray:
         """Return z (..., N) of coordinates q (..., N)."""
-        return self._each(q, self.inverses)
+        return q @ self.inverse.T
 
     def from_modes(self, z: np.ndarray) -> np.ndarray:
         """Return q (..., N)."""
-        return self._each(z, self.transforms)
+        return z @ self.T.T
 
     def gradient_to_modes(self, by_q: np.ndarray) -> np.ndarray:
         """Return dJ/dz = T' dJ/dq (..., N)."""
-        return self._each(by_q, (T.T for T in self.transforms))
+        return by_q @ self.T
 
     def gradient_from_modes(self, by_z: np.ndarray) -> np.ndarray:
         """Return dJ/dq = T^-T dJ/dz (..., N)."""
-        return self._each(by_z, (inverse.T for inverse in self.inverses))
-
-    def _each(self, x: np.ndarray, maps: Iterable[np.ndarray]) -> np.ndarray:
-        rows = x.reshape(prod(x.shape[:-1]), x.shape[-1]).copy()
-        for part, T in zip(self.parts, maps, strict=True):
-            rows[:, part] = rows[:, part] @ T.T
-        return rows.reshape(x.shape)
+        return by_z @ self.inverse
 
 
 def unchanged(system: System) -> Preconditioner:
     """Return a system in its own coordinates: all are treated densely, and it is marched."""
     one = np.ones(system.num_coordinates)
-    return Preconditioner(system, 0.0 * one, (one, 0.0 * one, one))
+    same = np.diag(one)
+    return Preconditioner(system, 0.0 * one, (one, 0.0 * one, one), same, same)
 
 
 def relative_error(system: System | Mechanism, error: np.ndarray, q: np.ndarray) -> float:

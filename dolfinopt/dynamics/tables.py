@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dolfinopt.dynamics.collocation import lagrange_integrals
+from dolfinopt.dynamics.collocation import lagrange
 from dolfinopt.multibody.rigid_motion import RigidMotion
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -23,37 +23,26 @@ Function = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A polygon through the rows of a file, zero beyond the last one.
+    """A polygon through the rows of a file, zero beyond the last one, and a constant.
 
     Attributes:
         t: (m,) ascending, s.
         values: (m, k).
+        constant: (k,) or a number that is added.
     """
 
     t: np.ndarray
     values: np.ndarray
+    constant: np.ndarray | float = 0.0
 
     def __call__(self, t: np.ndarray) -> np.ndarray:
         """Return the values (n, k) at instants t (n,), s."""
         columns = [np.interp(t, self.t, column) for column in self.values.T]
-        return np.stack(columns, axis=1) * (t <= self.t[-1])[:, None]
+        return np.stack(columns, axis=1) * (t <= self.t[-1])[:, None] + self.constant
 
     def at_stages(self, time_grid: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return the values (n s, k) at the stages of the steps of a grid, see the module."""
         return stage_values_of(self, self.t, time_grid, nodes)
-
-
-@dataclass(frozen=True, eq=False)
-class LoadHistory:
-    """Force and moment on an interface over time: a constant, and a table's value.
-
-    Attributes:
-        constant: (k,) N and N m.
-        table: of k columns, or None.
-    """
-
-    constant: np.ndarray
-    table: Table | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +51,12 @@ class LoadedMotion:
 
     Attributes:
         motion: the rigid coordinates.
-        loads: of every applied force of the mechanism.
+        loads: force and moment of every applied force of the mechanism, N and N m.
         rows: (m,) instants of the rows of the motion's own table, s; None without.
     """
 
     motion: Callable[[np.ndarray], RigidMotion]
-    loads: tuple[LoadHistory, ...] = ()
+    loads: tuple[Table, ...] = ()
     rows: np.ndarray | None = None
 
     def __call__(self, t: np.ndarray) -> RigidMotion:
@@ -90,10 +79,7 @@ class LoadedMotion:
     def _loaded(self, motion: RigidMotion, values: Callable[[Table], np.ndarray]) -> RigidMotion:
         if not self.loads:
             return motion
-        applied = np.tile([load.constant for load in self.loads], (len(motion.q), 1, 1))
-        for k, load in enumerate(self.loads):
-            if load.table is not None:
-                applied[:, k] += values(load.table)
+        applied = np.stack([values(load) for load in self.loads], axis=1)
         return replace(motion, applied=applied)
 
 
@@ -137,11 +123,11 @@ def stage_values_of(
     t = first[:, None] + length * (1.0 + points)
     h = np.diff(time_grid)
     tau = (t - time_grid[step][:, None]) / h[step][:, None]
-    basis = lagrange_integrals(nodes, tau.ravel())[0].reshape(*t.shape, -1)
+    basis = lagrange(nodes, tau.ravel()).reshape(*t.shape, -1)
     f = function(t.ravel()).reshape(*t.shape, -1)
     parts = basis.swapaxes(1, 2) @ (f * (length * weights)[:, :, None])
     moments = np.add.reduceat(parts, np.searchsorted(step, steps))
-    lengths = h[steps, None, None] * lagrange_integrals(nodes, np.ones(1))[1][0][:, None]
+    lengths = h[steps, None, None] * lagrange(nodes, np.ones(1), -1)[0][:, None]
     values = values.reshape(len(h), len(nodes), -1)
     values[steps] = moments / lengths
     return values.reshape(-1, values.shape[2])

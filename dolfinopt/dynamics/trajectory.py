@@ -194,7 +194,7 @@ class Trajectory:
     @cached_property
     def compliance(self) -> np.ndarray:
         """q' K q of every arm (n, arms), N m."""
-        return self.mechanism.compliance(self.q_e)
+        return self.mechanism.energies(self.q_e)[:, : self.mechanism.num_arms]
 
     @cached_property
     def deflections(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion.constraints import Constraints, Target
+from dolfinopt.motion.machine import loops_of, skeleton
 from dolfinopt.motion.measured import DENSE_INSTANTS, TABLE_CORNERS_LIMIT
 from dolfinopt.motion.paths import (
     Curve,
@@ -25,7 +26,6 @@ from dolfinopt.motion.paths import (
 )
 from dolfinopt.motion.plane import Chain
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
-from dolfinopt.multibody.build import loops_of, skeleton
 from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.rotations import roll_pitch_yaw

@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.multibody.build import reach_of
 from dolfinopt.multibody.closures import ClosedLoops, Loops, SiteMotion
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.tree import Mechanism
@@ -57,10 +56,10 @@ class Constraints:
     has_path: bool
     turned: bool
 
-    @cached_property
+    @property
     def reach(self) -> float:
         """Length of its links together, m."""
-        return reach_of(self.mechanism)
+        return self.mechanism.reach
 
     @cached_property
     def units(self) -> np.ndarray:

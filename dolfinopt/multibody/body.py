@@ -39,7 +39,7 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.multibody.dimension import DIMENSIONS, product
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, rigid_body
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -83,11 +83,6 @@ class Constants:
         self.K = _diagonal_or_matrix(body.K)
         self.D = _diagonal_or_matrix(body.D) if body.D.any() else None
         self.points = body.points if self.dim.d == 3 else body.outboard_point[None]
-
-    @classmethod
-    def of_point(cls, mass: float, inertia: float) -> Constants:
-        """Return those of a mass (kg) with rotary inertia (kg m2) at the origin, in the plane."""
-        return cls(rigid_body(mass, np.zeros(2), inertia, np.zeros(2)))
 
     def outboard(self, number: int) -> slice:
         """Return an interface's place among the pushes."""
@@ -332,13 +327,8 @@ class BodyMotion:
             virtual: (d + r, n) multiplies (F, T).
             zeta: (q, n) multiplies the rows.
         """
-        dim, (u, phi) = self.dim, np.split(virtual, [self.dim.d])
-        by_a = self.constants.mass * u + dim.velocity(phi, self.moments[0])
-        by_entries = [product(x.swapaxes(0, 1), virtual) for x in self._load_by_entries]
-        if self.is_flexible:
-            by_a += product(self.V[: dim.d], zeta)
-            by_entries = [x + product(Y, zeta) for x, Y in zip(by_entries, (self.Y, self.Yd))]
-        return np.concatenate([by_a, dim.spin_gradient(self.w, *by_entries)])
+        found = product(self.load_by_motion.swapaxes(0, 1), virtual)
+        return found + product(self.rows_by_motion, zeta) if self.is_flexible else found
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:

@@ -142,13 +142,7 @@ class CarriedFrame:
 
         Both are (d + 2 r, n).
         """
-        dim, d, out = self.dim, self.dim.d, self.in_carrier(by).copy()
-        if self.spin is not None and dim.r > 1:
-            out[d : dim.b] += dim.commutator(self.spin[0], out[dim.b :])
-        if self.is_offset:
-            by_entries = (product(x.swapaxes(0, 1), out[:d]) for x in self._accelerated)
-            out[d:] += dim.spin_gradient(self.carrier[1], *by_entries)
-        return out
+        return np.asarray(np.einsum("nij,in->jn", self.transform, by))
 
     @cached_property
     def of_loads(self) -> np.ndarray:
@@ -279,20 +273,7 @@ class Interface(CarriedFrame):
 
     def displacement_gradient(self, by: np.ndarray) -> np.ndarray:
         """Return derivatives (b, 3, n) by (u, theta) and its rates, from those by the motion."""
-        dim, d, turning, (a, w, wd) = self.dim, self.dim.d, self.turning, self._unturned
-        by_a, by_w, by_wd = np.split(self.in_carrier(by), [d, dim.b])
-        by_spins = np.stack([-dim.moment(a, by_a), by_w, by_wd], axis=1)
-        if dim.r > 1:
-            by_spins[:, 0] += dim.commutator(by_w, w) + dim.commutator(by_wd, wd)
-            by_spins[:, 1] += dim.commutator(by_wd, self.carrier[1])
-        by_rotation = turning.jacobian_transposed(by_spins)
-        if self.spin_by_rotation is not None:
-            of_v, of_change, of_rate = (x.swapaxes(0, 1) for x in self.spin_by_rotation)
-            by_rotation[:, 0] += product(of_v, by_w) + product(of_change, by_wd)
-            by_rotation[:, 1] += product(of_rate, by_wd)
-        # 2 Omega is skew.
-        by_place = dim.apply(dim.transposed(self.alpha), by_a), -dim.apply(self.beta, by_a), by_a
-        return np.concatenate([np.stack(by_place, axis=1), by_rotation])
+        return np.asarray(np.einsum("srkn,sn->krn", self.by_coordinates, by))
 
     def load_gradient(
         self, load: np.ndarray, turning: np.ndarray, virtual: np.ndarray, x: np.ndarray
@@ -304,13 +285,9 @@ class Interface(CarriedFrame):
             virtual: displacement and rotation of the body (d + r, n).
             x: (b, n) those of (u, theta).
         """
-        dim, d, moved = self.dim, self.dim.d, self.virtual(virtual, x)
-        moment = dim.moment(turning[:d], moved[:d]) + dim.commutator(turning[d:], moved[d:])
-        by_rotation = self.turning.jacobian_transposed(moment)
-        by_theta = self.turning.by_theta(load[d:], -1.0)
-        if by_theta is not None:
-            by_rotation += product(by_theta.swapaxes(0, 1), x[d:])
-        return np.concatenate([-dim.velocity(virtual[d:], load[:d]), by_rotation])
+        by_load = self.load_by_coordinates(load, turning).swapaxes(0, 1)
+        by_coefficients = self.coefficients_by_coordinates(load, turning).swapaxes(0, 1)
+        return product(by_load, virtual) + product(by_coefficients, x)
 
     @cached_property
     def V(self) -> np.ndarray:

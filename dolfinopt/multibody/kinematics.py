@@ -320,8 +320,6 @@ def no_gradient(mechanism: Mechanism) -> list[dict[str, np.ndarray]]:
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
     """Return the lengths (n,) of vectors (n, 2), or (n, 3) in space."""
-    if vectors.shape[1] == 2:
-        return np.hypot(vectors[:, 0], vectors[:, 1])
     out: np.ndarray = np.linalg.norm(vectors, axis=1)
     return out
 

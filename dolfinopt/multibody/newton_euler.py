@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.multibody.body import BodyMotion
-from dolfinopt.multibody.dimension import compose
 from dolfinopt.multibody.frames import Interface, MovingJoint, MovingRotor
+from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates
 from dolfinopt.multibody.tree import GROUND, Mechanism, Site
@@ -91,7 +91,7 @@ def outward_pass(
         links[i] = Link(moving, body, interfaces, carried, {}, rotor)
     found = [links[i] for i in range(len(links))]
     if tree.forces:
-        _apply_forces(tree, found, motion)
+        _apply_forces(tree, found, motion, rates[0])
     return found
 
 
@@ -104,33 +104,19 @@ def _motor_rates(tree: Mechanism, motion: RigidMotion, i: int) -> np.ndarray:
     return np.stack([motion.qd[:, k], motion.qdd[:, k]])
 
 
-def _apply_forces(tree: Mechanism, links: list[Link], motion: RigidMotion) -> None:
+def _apply_forces(tree: Mechanism, links: list[Link], motion: RigidMotion, q: np.ndarray) -> None:
     """Add the motion's given forces to the interfaces on which they act."""
     assert motion.applied is not None, "a motion without the values of the mechanism's forces"
-    turned = rotations(tree, links)
+    posed = Posed(tree, motion.q, q)
     for force in tree.forces:
         i, s = force.site
         values = -motion.applied[:, force.column].T
         load, in_world = values, 0.0 * values
         if force.in_world:
-            load = in_world = tree.dim.turn(turned[i].swapaxes(0, 1), values)
+            load = in_world = tree.dim.turn(posed.body(i)[2].swapaxes(0, 1), values)
         if (before := links[i].applied.get(s)) is not None:
             load, in_world = before.load + load, before.in_world + in_world
         links[i].applied[s] = Applied(load, in_world)
-
-
-def rotations(tree: Mechanism, links: list[Link]) -> dict[int, np.ndarray]:
-    """Return every body's rotation from its frame to the world's, (d, d, n) or (d, d)."""
-    found: dict[int, np.ndarray] = {}
-    for i in tree.order:
-        joint, R = tree.joints[i], links[i].joint.R
-        if joint.parent != GROUND:
-            interface = links[joint.parent].interfaces[joint.interface]
-            if interface.R is not None:
-                R = compose(interface.R, R)
-            R = compose(found[joint.parent], R)
-        found[i] = R
-    return found
 
 
 def instants_last(rates: Rates) -> np.ndarray:

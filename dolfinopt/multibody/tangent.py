@@ -46,10 +46,10 @@ class Tangent:
         count, rows, size, _ = self.matrix.shape
         return self.matrix.reshape(count, rows, 3 * size)
 
-    def step_mean(self, stages: int, keep: np.ndarray) -> Tangent:
-        """Return its mean over every `stages` instants, by some of the coordinates, ascending."""
+    def step_mean(self, steps: int, keep: np.ndarray) -> Tangent:
+        """Return its mean over the instants of each step, by some of the coordinates, ascending."""
         kept = self.matrix.take(self.order[keep], axis=2)
-        mean = kept.reshape(-1, stages, *kept.shape[1:]).mean(axis=1)
+        mean = kept.reshape(steps, -1, *kept.shape[1:]).mean(axis=1)
         return Tangent(mean, self.own[keep], np.arange(len(keep)))
 
     def dense(self) -> np.ndarray:
@@ -220,37 +220,45 @@ class _Passes:
 
     def _add_rows(self, i: int, outboard: dict[int, np.ndarray]) -> None:
         """Add the derivative of a body's elastic rows."""
-        link, kept, part, frame = self.links[i], self.kept[i], self.tree.slices[i], self.frames[i]
+        link, kept = self.links[i], self.kept[i]
         body, loads = link.body, self.loads.outboard[i]
-        rows = self.matrix[:, len(self.rows) + part.start : len(self.rows) + part.stop]
-        rows[:, :, : frame.shape[2]] += by_instant(body.rows_by_motion.swapaxes(0, 1)) @ frame
-        own = body.rows_by_rates(kept, interface_coefficients(link, loads))
+        first, part = len(self.rows), self.tree.slices[i]
+        rows = self.matrix[:, first + part.start : first + part.stop]
+        frame = self.frames[i]
+        moved = rows[:, :, : frame.shape[2]]
+        by_motion = body.rows_by_motion.swapaxes(0, 1)
+        moved += by_instant(by_motion) @ frame
+        pulls = interface_coefficients(link, loads)
+        own = body.rows_by_rates(kept, pulls)
         for s, interface in link.interfaces.items():
-            V, turning = by_instant(interface.V), carried_load(link, loads, s)
+            V = by_instant(interface.V)
             Vt = V.swapaxes(1, 2)
             rows += (Vt @ interface.of_coefficients) @ outboard[s]
-            by_displacement = interface.coefficients_by_coordinates(loads[s], turning)
-            own[..., 0] += Vt @ (by_instant(by_displacement) @ V[:, :, kept])
+            turning = carried_load(link, loads, s)
+            by_x = interface.coefficients_by_coordinates(loads[s], turning)
+            own[..., 0] += Vt @ (by_instant(by_x) @ V[:, :, kept])
             if s in link.applied:
-                rows[:, :, : frame.shape[2] : 3] += (
-                    Vt @ by_instant(interface.coefficients(_given(link, s))) @ self._turned(i)
-                )
+                given = interface.coefficients(_given(link, s))
+                moved[:, :, ::3] += Vt @ by_instant(given) @ self._turned(i)
         rows[:, :, self.own[i]] += own.reshape(*rows.shape[:2], -1)
 
     def _on_frame(self, i: int, outboard: dict[int, np.ndarray]) -> np.ndarray:
         """Return the derivative of what a body and all behind it ask of its frame."""
-        link, kept, frame, loads = self.links[i], self.kept[i], self.frames[i], self.loads.outboard
+        link, kept, frame = self.links[i], self.kept[i], self.frames[i]
+        body, loads = link.body, self.loads.outboard[i]
         out = np.zeros((self.count, self.dim.b, self.matrix.shape[2]))
-        moved, own = out[:, :, : frame.shape[2]], out[:, :, self.own[i]]
-        moved += by_instant(link.body.load_by_motion) @ frame
-        if link.body.is_flexible:
-            own += link.body.load_by_rates(kept).reshape(own.shape)
+        moved = out[:, :, : frame.shape[2]]
+        moved += by_instant(body.load_by_motion) @ frame
+        own = out[:, :, self.own[i]]
+        if body.is_flexible:
+            own += body.load_by_rates(kept).reshape(own.shape)
         for s, interface in link.interfaces.items():
             out += interface.of_loads @ outboard[s]
-            if link.body.is_flexible:
-                turning = carried_load(link, loads[i], s)
-                by_displacement = by_instant(interface.load_by_coordinates(loads[i][s], turning))
-                own[:, :, ::3] += by_displacement @ by_instant(interface.V[:, kept])
+            if body.is_flexible:
+                turning = carried_load(link, loads, s)
+                by_x = interface.load_by_coordinates(loads[s], turning)
+                V = by_instant(interface.V[:, kept])
+                own[:, :, ::3] += by_instant(by_x) @ V
             if s in link.applied:
                 given = self.dim.shifted(interface.place, _given(link, s))
                 moved[:, :, ::3] += by_instant(given) @ self._turned(i)

@@ -294,6 +294,15 @@ class Mechanism:
             found.insert(0, (joint.parent, joint.interface))
         return tuple(found)
 
+    @cached_property
+    def reach(self) -> float:
+        """Length of the links from the ground to the end-effector together, m."""
+        total, point = 0.0, np.zeros(self.dim.d)
+        for i, number in self.way:
+            total += float(np.linalg.norm(point + self.joints[i].origin))
+            point = self.constants[i].points[number]
+        return total + float(np.linalg.norm(point)) or 1.0
+
     def is_felt(self, i: int) -> bool:
         """Return whether a body inboard of body i deforms under its load."""
         return any(self.bodies[k].num_modes for k, _ in self.way_to((i, 0))[:-1])
@@ -347,10 +356,6 @@ class Mechanism:
     def norm(self, q: np.ndarray) -> np.ndarray:
         """Return every body's largest sqrt(q' K q) over n instants (..., bodies); q (..., n, N)."""
         return np.sqrt(np.maximum(self.energies(q), 0.0).max(axis=-2))
-
-    def compliance(self, q: np.ndarray) -> np.ndarray:
-        """Return q_e' K_ee q_e of every arm (n, arms), N m; eq. (7) of the paper; q (n, N)."""
-        return self.energies(q)[:, : self.num_arms]
 
     def deflections(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return every arm's largest deflection over its length, and its largest rotation, rad.

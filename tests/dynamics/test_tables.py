@@ -13,7 +13,7 @@ from scipy.integrate import trapezoid
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import radau_iia
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.tables import LoadedMotion, LoadHistory, Table, stage_values_of
+from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_values_of
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.profiling import Profile
@@ -61,7 +61,7 @@ def loaded(rows: np.ndarray) -> MachineSystem:
     t = np.union1d(rows, PULSE)
     values = np.zeros((len(t), 3))
     values[:, 1] = np.interp(t, PULSE, [0.0, 400.0, 400.0, 0.0])
-    motion = LoadedMotion(still, (LoadHistory(np.zeros(3), Table(t, values)),))
+    motion = LoadedMotion(still, (Table(t, values),))
     return MachineSystem(mechanism, motion, (0.0, 1.0))
 
 

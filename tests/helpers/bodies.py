@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from dolfinopt.bench.field_machines import plane_body
 from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.rotations import skew
-from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, plane_body
+from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, rigid_body
 from dolfinopt.multibody.tree import (
     GROUND,
     Joint,
@@ -61,6 +62,7 @@ def plane_chain(
         hardware: what sits at every arm's ends, or none.
         cart_mass: kg.
     """
+    none = np.zeros(2)
     hardware, last = hardware or (JointHardware(),) * len(bodies), len(bodies) - 1
     joints = [
         Joint(f"joint {k}", "revolute", k - 1, 1 + k, np.ones(1), np.zeros(2), np.eye(2), one.rotor)
@@ -72,7 +74,11 @@ def plane_chain(
     return Mechanism(
         bodies=tuple(bodies),
         joints=tuple(joints),
-        loads={at: Constants.of_point(*x) for at, x in loads.items() if x.any() or at[0] == last},
+        loads={
+            at: Constants(rigid_body(x[0], none, x[1], none))
+            for at, x in loads.items()
+            if x.any() or at[0] == last
+        },
         gravity=np.array(gravity, dtype=float)[:, None],
         end=(last, 0),
         origin=np.array([0.0, joint_height]),

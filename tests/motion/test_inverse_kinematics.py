@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.motion.build import breakpoints, rigid_motion, target_of
+from dolfinopt.motion.machine import skeleton
 from dolfinopt.motion.poses import relative_vectors
-from dolfinopt.multibody.build import skeleton
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.scene.load import load_scene, scene_from_dict
 

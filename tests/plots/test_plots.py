@@ -14,10 +14,11 @@ from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
+from dolfinopt.bench.field_machines import plane_body
 from dolfinopt.multibody.closures import Along, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, plane_body
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView

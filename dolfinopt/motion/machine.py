@@ -1,4 +1,7 @@
-"""A scene as a machine: rigid bodies, what they carry, joints and what is in them, closures."""
+"""A scene as a machine: rigid bodies, what they carry, joints and what is in them, closures.
+
+Both rigid motions and dynamics begin with it; `multibody` knows no scene.
+"""
 
 from __future__ import annotations
 
@@ -196,7 +199,7 @@ def loops_of(scene: Scene) -> Loops | None:
     """Return the scene's closures; None of a tree."""
     if not scene.closures:
         return None
-    d, reach, first = scene.dimension, reach_of(skeleton(scene)), len(scene.movable)
+    d, reach, first = scene.dimension, skeleton(scene).reach, len(scene.movable)
     places = {one.name: first + k for k, one in enumerate(scene.rods)}
     ties = []
     for one in scene.closures:
@@ -206,15 +209,6 @@ def loops_of(scene: Scene) -> Loops | None:
         point, rotation = np.array(one.point[:d], dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]
         ties.append(Tie(one.name, a, b, point, rotation, equations))
     return Loops(tuple(ties))
-
-
-def reach_of(mechanism: Mechanism) -> float:
-    """Return the length of the links from the ground to the end-effector together, m."""
-    total, point = 0.0, np.zeros(mechanism.dim.d)
-    for i, number in mechanism.way:
-        total += float(np.linalg.norm(point + mechanism.joints[i].origin))
-        point = mechanism.constants[i].points[number]
-    return total + float(np.linalg.norm(point)) or 1.0
 
 
 # Which axes of the two frames face each other: 0 along the closure's axis, 1 and 2 across it.
