@@ -40,9 +40,11 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        left, values, right = np.linalg.svd(A)
+        # By the energy of every coordinate: what is small does not depend on their units.
+        unit = 1.0 / np.sqrt(np.diag(state.basis.stiffness))
+        left, values, right = np.linalg.svd(A / np.outer(unit, unit))
         keep = values > LOAD_CASES_RANK_SHARE * values[0]
-        V = state.basis.V
+        V = state.basis.V * unit
         pair = combine(V, left[:, keep] * -values[keep]), combine(V, right[keep].T)
         interfaces = partial(pairs_at_interfaces, state.elastic, (pair,))
         return by(state, Products(stiffness=(pair,), interfaces=interfaces))

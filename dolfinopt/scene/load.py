@@ -530,7 +530,7 @@ Keys = tuple[tuple[str, str], ...]
 
 
 def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
-    """Complete times of the motion, number of coordinates, limit of the volume and gradient.
+    """Complete lengths, times of the motion, number of coordinates, volume's limit and gradient.
 
     Returns:
         The keys that follow from others, as (table, key).
@@ -539,7 +539,40 @@ def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys
         InputError: a stated duration is too short for the limits.
     """
     timed = _time_motion(tree, source, changes)
-    return *timed, *_count_coordinates(tree), *_limit_volume(tree), *_freeze_loads(tree)
+    others = _count_coordinates(tree), _limit_volume(tree), _freeze_loads(tree)
+    return *_measure_path(tree), *timed, *(key for keys in others for key in keys)
+
+
+FILTERED = 1.0 / 8.0  # radius of the filter over the height of the lowest arm
+SHOULDER, ARC = -0.25, 0.5  # place of the shoulder and radius of the arc over the arms' length
+
+
+def _measure_path(tree: dict[str, Any]) -> Keys:
+    """Complete the lengths of path and filter from the arms'; return their (table, key)."""
+    arms = tree.get("arms")
+    rows = [arm for arm in arms if isinstance(arm, dict)] if isinstance(arms, list) else []
+    lengths, heights = (_sizes(rows, key) for key in ("length", "height"))
+    motion, design = tree.get("motion"), tree.setdefault("design", {})
+    found: dict[tuple[str, str], float] = {}
+    if isinstance(motion, dict) and lengths and not tree.get("joints"):
+        found["motion", "joint_height"] = SHOULDER * sum(lengths)
+        if motion.get("path") == "arc":
+            found["motion", "radius"] = ARC * sum(lengths)
+    widths = isinstance(design, dict) and (
+        design.get("minimum_member") or design.get("minimum_gap")
+    )
+    if isinstance(design, dict) and heights and not widths:
+        found["design", "filter_radius"] = FILTERED * min(heights)
+    derived = [key for key in found if key[1] not in tree[key[0]]]
+    for table, key in derived:
+        tree[table][key] = found[table, key]
+    return tuple(derived)
+
+
+def _sizes(arms: Iterable[Mapping[str, Any]], key: str) -> list[float]:
+    """Return the sizes of arms that are numbers above 0; validation tells of others."""
+    values = (arm.get(key) for arm in arms)
+    return [x for x in values if isinstance(x, (int, float)) and x > 0.0]
 
 
 def _count_coordinates(tree: dict[str, Any]) -> Keys:

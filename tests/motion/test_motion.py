@@ -250,7 +250,13 @@ def test_angles_do_not_depend_on_the_instants_asked_for(arms: int) -> None:
     assert rigid_motion(np.empty(0), of).q.shape == (0, 1 + arms)
 
 
-LINE = {"path": "line", "base": "fixed", "start": [-1, 0.1], "end": [1, 0.1]}
+LINE = {
+    "path": "line",
+    "base": "fixed",
+    "start": [-1, 0.1],
+    "end": [1, 0.1],
+    "joint_height": -0.5,
+}
 FAR = {"path": "line", "start": [0, 0], "end": [1e4, 1e4], "cart_follow": 1e3}
 UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, keys that help
     ((1.0, 1.0), {"radius": 4.0}, 0.95, 4.5, "than 0 m and less than 2 m", "motion.joint_height"),
@@ -259,12 +265,13 @@ UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, k
     ((1.0, 1.0), {"joint_height": -0.9999999}, 0.95, 2.0, "less than 2 m", "motion.radius"),
     ((1.0, 1.0), {"radius": 1e-6, "joint_height": 0.0, "cart_follow": 0.0}, None, 1e-6,
      "more than 0 m", "motion.radius"),
-    ((1.4, 0.6), {}, 0.0, np.sqrt(0.5), "more than 0.8 m", "motion.cart_follow"),
+    ((1.4, 0.6), {"joint_height": -0.5}, 0.0, np.sqrt(0.5), "more than 0.8 m", "motion.cart_follow"),
     ((1.0, 1.0), {"flattening": 0.0, "joint_height": 0.0, "cart_follow": 0.0}, 0.95, 0.0,
      "more than 0 m", "motion.flattening"),
-    ((0.5, 0.5, 0.5), {"cart_follow": 0.0}, 0.95, 1.5, "elbows bent alike", "the arms' length"),
+    ((0.5, 0.5, 0.5), {"cart_follow": 0.0, "radius": 1.0, "joint_height": -0.5}, 0.95, 1.5,
+     "elbows bent alike", "the arms' length"),
     ((1.0, 0.2, 0.2), LINE, 0.95, 0.6, "from the shoulder", "motion.base_position"),
-    ((1.2,), {}, 0.95, 1.5, "above the shoulder; arms of 1.2 m", "motion.flattening"),
+    ((1.2,), {"radius": 1.0, "joint_height": -0.5}, 0.95, 1.5, "above the shoulder; arms of 1.2 m", "motion.flattening"),
     ((1.2,), LINE | {"base": "cart", "end": [1, -2]}, 1.9, -1.5, "above the", "motion.end"),
     ((1.0, 1.0), FAR, None, 1e7, "from the shoulder", "motion.start"),
 ]  # fmt: skip

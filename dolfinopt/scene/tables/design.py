@@ -41,7 +41,8 @@ class Design(Table):
         default=0.0075,
         ge=0,
         le=1e4,
-        description="radius of the equivalent cone filter; 0: no filter [m]",
+        description="radius of the equivalent cone filter; 0: no filter; default: an eighth of the "
+        "height of the lowest arm [m]",
     )
     projection: Projection = Field(
         default=False,

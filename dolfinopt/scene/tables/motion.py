@@ -42,7 +42,9 @@ class Motion(Table):
         "coordinates, or a first joint that runs up to constant speed [-]",
     )
     radius: Length = Field(
-        default=1.0, description="radius of the arc, a semicircle about the origin [m]"
+        default=1.0,
+        description="radius of the arc, a semicircle about the origin; default: half the length of "
+        "all arms [m]",
     )
     flattening: float = Field(
         default=1.0,
@@ -136,7 +138,11 @@ class Motion(Table):
         "fixed base or a table of joint coordinates [-]",
     )
     cart_mass: float = Field(default=0.0, ge=0, le=1e9, description="mass of the cart [kg]")
-    joint_height: Position = Field(default=-0.5, description="y of the shoulder joint [m]")
+    joint_height: Position = Field(
+        default=-0.5,
+        description="y of the shoulder joint; default: a quarter of the length of all arms below 0 "
+        "[m]",
+    )
     elbow: Literal[-1, 1] = Field(
         default=-1,
         description="sign of the elbow angle beta; with one arm, of the cosine of its angle [-]",
