@@ -33,16 +33,10 @@ LOAD_CASES_RANK_SHARE = 1e-14  # of the largest direction: less is the rounding 
 # of the p-mean.
 NEGLIGIBLE_POWER_SHARE = 1e-2
 P_MEAN_STRIDE = 2  # of the screened instants every second one makes up the p-mean
-# Part of the largest length up to which directions in which the coefficients hardly vary are
-# bounded, not computed.
-NEGLIGIBLE_DIRECTION_SHARE = 1e-4
-NEGLIGIBLE_COLUMNS_SHARE = 1e-13  # relative square below which a combination of columns is none
 MAP_ERROR_SHARE = 1e-3  # of the largest length, a map's error; with 0 it takes three times as long
 COARSE_INSTANTS = 200  # at most, at which all points are looked at first
 BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
-# Of one block, so that it stays in the cache.
-CHUNK_POINTS = 2048
-CHUNK_INSTANTS = 64
+BLOCK_SIZE = 256  # points, and instants, of one block: it stays in the cache
 
 # -- buckling: instants and modes ------------------------------------------------------------
 

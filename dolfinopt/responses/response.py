@@ -73,6 +73,12 @@ class Analysis:
     profile: Profile
     by: By = by_design
 
+    @property
+    def motion(self) -> Trajectory:
+        """The trajectory, on the root, where there is one."""
+        assert self.trajectory is not None
+        return self.trajectory
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -307,6 +313,8 @@ class Factors:
 
 def factors(scene: Scene, other: Scene, index: int) -> Factors:
     """Return what makes the body of arm `index` in `scene` that of the same design in `other`."""
+    if other is scene:
+        return Factors(1.0, 1.0, scene.damping.stiffness_proportional)
     here, there = scene.material_of(index), other.material_of(index)
     # Only of plane arms may it differ: solid ones would be other bodies.
     thicker = other.arms[index].thickness / scene.arms[index].thickness
