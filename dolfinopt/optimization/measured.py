@@ -9,9 +9,6 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 SHORTER_REACH = 0.5  # on the move limit where the merit rose
 REACH_GROWTH = 1.2  # on it where it did not
 LEAST_REACH = 0.05  # of the scene's move limit
-# While the projection steepens, which makes designs worse by itself: with 0.05 one that steepens
-# within 50 iterations fell apart, ten times as soft.
-LEAST_REACH_RISING = 0.25
 MERIT_RISE = 1e-3  # of the merit, from which on it counts as risen
 SHORTER_STEP = 0.25  # on a step without a motion, or that leaps; reach after a return to the best
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
@@ -22,9 +19,10 @@ NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --
 
-# Beta from which on the move limit falls with its square root: x_phys moves by at most twice what x
-# does, its slope being beta / 2.
-GENTLE_SHARPNESS = 4.0
+# Of its range, that a variable can move at least while beta doubles. The merit rises then by itself
+# and makes steps shorter: with a fixed least length a design that doubles beta within 8 iterations
+# falls apart, five to ten times as soft.
+LEAST_TRAVEL = 0.25
 # Relative violation of a limit from which on beta waits for the design to come back.
 WAITING_EXCESS = 0.02
 # Of a relative excess, in objectives: 1 % costs a tenth; mass and compliance change by 1 to 3 %

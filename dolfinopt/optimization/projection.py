@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
-from dolfinopt.optimization.measured import GENTLE_SHARPNESS, WAITING_EXCESS
+from dolfinopt.optimization.measured import LEAST_TRAVEL, WAITING_EXCESS
 from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
 
@@ -38,9 +38,9 @@ class Projection:
         return not design.projection or self.beta >= design.sharpness
 
     @property
-    def move(self) -> float:
-        """Move limit, shorter where the projection is steep and x_phys would leap."""
-        return self.scene.optimizer.move * min(1.0, (GENTLE_SHARPNESS / self.beta) ** 0.5)
+    def least_move(self) -> float:
+        """Least move limit while beta rises: x can follow it."""
+        return LEAST_TRAVEL / self.scene.design.continuation
 
     def physical_designs(
         self, x: Mapping[int, np.ndarray]

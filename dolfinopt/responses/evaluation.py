@@ -27,7 +27,6 @@ from dolfinopt.responses.measured import (
     STIFFENING_INSTANTS,
     STIFFENING_OFF_CHANGE,
     STIFFENING_ON_CHANGE,
-    STIFFENING_UNKNOWN_CHANGE,
 )
 from dolfinopt.responses.motion import motion_objective, worst_instants
 from dolfinopt.responses.products import By, by_design
@@ -401,9 +400,8 @@ def _decided(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> St
     if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
         return Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE)
     neglected = _neglected(scenes, bodies)
-    if neglected is None:
-        return Stiffening(estimate, estimate >= STIFFENING_UNKNOWN_CHANGE)
-    return Stiffening(estimate, neglected > NEGLECTED_DEVIATION_SHARE, neglected)
+    on = neglected is None or neglected > NEGLECTED_DEVIATION_SHARE
+    return Stiffening(estimate, on, neglected)
 
 
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:

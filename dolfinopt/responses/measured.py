@@ -13,7 +13,6 @@ NEGLECTED_DEVIATION_SHARE = 4e-3
 # into account, without a simulation. Measured: the deviation changes by 0.3 to 3 times as much.
 STIFFENING_OFF_CHANGE = 5e-4
 STIFFENING_ON_CHANGE = 0.05
-STIFFENING_UNKNOWN_CHANGE = 2e-3  # that from which it is taken where the comparison fails
 
 # -- order_selection -------------------------------------------------------------------------
 
@@ -67,8 +66,8 @@ POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tr
 
 # -- poles -----------------------------------------------------------------------------------
 
-# k of the smooth least damping ratio: poles that are damped by 0.0025 more count e times less, and
+# Of the p-norm of 1 - damping ratio: poles that are damped by 0.0025 more count e times less, and
 # ten equal ones are taken for 0.006 less.
-DAMPING_SHARPNESS = 400.0
+DAMPING_EXPONENT = 400.0
 # Of the largest derivative by a pole's value, below which a pole's is left out: 1e-12 of the sum.
 NEGLIGIBLE_POLE_SHARE = 1e-12
