@@ -235,11 +235,9 @@ class Buckling(Response):
                 parts[k] = _gradient_of_arm(state, found[k], weights.get(k, []))
         return [through_motions(analysis, parts)]
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the reciprocals of the least factors, scaled like the smooth one."""
-        return np.array(measured.smooth) * np.array(measured.values) / limits
+    def smooth_of(self, values: np.ndarray) -> np.ndarray:
+        """Return the reciprocals of the factors."""
+        return 1.0 / values
 
     def _found(self, analysis: Analysis) -> dict[int, list[Pressed]]:
         """Return the instants of this rank's designs, once for value and gradient (collective)."""

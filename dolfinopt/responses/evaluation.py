@@ -172,7 +172,7 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     smooth_limits: list[float] = []
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
-        limits = bound.smooth_limits(analysis, found)
+        limits = bound.smooth_limits(found)
         constraints += [float(x) for x in np.array(found.smooth) / limits - 1.0]
         smooth_limits += [float(x) for x in limits]
         measured.append(found)
@@ -253,7 +253,7 @@ def constraint_gradients(
     for k, bound in enumerate(constraints_of(scene), 1):
         rows = bound.response.gradients(analysis)
         values = measured[k] if measured else bound.response.measure(analysis)
-        limits = bound.smooth_limits(analysis, values)
+        limits = bound.smooth_limits(values)
         found += [
             ConstraintGradient(bound.response, row, float(limit))
             for row, limit in zip(rows, limits, strict=True)

@@ -19,7 +19,7 @@ from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
 from dolfinopt.multibody.shape_integrals import integrals_of
 from dolfinopt.responses.measured import DAMPING_EXPONENT, NEGLIGIBLE_POLE_SHARE
 from dolfinopt.responses.motion import LoadCases, MotionResponse, all_instants, followed_by
-from dolfinopt.responses.response import Analysis, Measured, p_norm, response
+from dolfinopt.responses.response import p_norm, response
 from dolfinopt.scene.load import Scene
 
 Seen = list[tuple[Poles, np.ndarray]]  # at every instant, with which of them count
@@ -86,12 +86,9 @@ class PoleResponse(MotionResponse):
         values = self.quantity(trajectory)
         return self.value(values, values)
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the smooth limits, scaled like the smooth value of this design."""
-        true, smooth = np.array(measured.values), np.array(measured.smooth)
-        return self.badness(limits)[0] * smooth / self.badness(true)[0]
+    def smooth_of(self, values: np.ndarray) -> np.ndarray:
+        """Return what is missing to a good pole."""
+        return self.badness(values)[0]
 
     def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion."""
