@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from dolfinopt.arms.arm import PhysicalDesign
 from dolfinopt.optimization.measured import ERODED_LIMIT_FACTOR, LIMIT_PRICE
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import objective_of, worst_of
+from dolfinopt.responses.response import find, objective_of, worst_of
 from dolfinopt.scene.load import Scene
 
 
@@ -19,22 +19,29 @@ from dolfinopt.scene.load import Scene
 class EvaluatedDesign:
     """One design that x stands for, what it does, and the gradients of that by x.
 
-
     Attributes:
         physical: of this rank's arms.
         evaluation: values.
-        objective: (n,) gradient of the objective.
-        constraints: (k, n) gradients of `Evaluation.constraints`.
-        of_nominal: (k,) True for constraints that the nominal one of robust designs carries alone.
-        differentiated: whether the gradients are known; they are empty of one that is only tried.
+        objective: (n,) gradient of the objective; empty of one that is only tried.
+        constraints: (k, n) gradients of `Evaluation.constraints`, likewise.
     """
 
     physical: Mapping[int, PhysicalDesign]
     evaluation: Evaluation
-    objective: np.ndarray
-    constraints: np.ndarray
-    of_nominal: np.ndarray
-    differentiated: bool = True
+    objective: np.ndarray = field(default_factory=lambda: np.empty(0))
+    constraints: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def differentiated(self) -> bool:
+        """Whether the gradients are known."""
+        return len(self.objective) > 0
+
+    @property
+    def of_nominal(self) -> np.ndarray:
+        """True (k,) for constraints that the nominal one of robust designs carries alone."""
+        limited = self.evaluation.responses[1:]
+        own = [find(one.response).declared.of_nominal for one in limited for _ in one.values]
+        return np.array(own, dtype=bool)
 
     @property
     def x_phys(self) -> dict[int, np.ndarray]:
