@@ -189,8 +189,9 @@ class Iterate:
         self.stuck = ""
         self.change = float(np.abs(new - self.x).max())
         steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
+        most = NEWTON_ITERATIONS * steps * len(self.designs)
         try:
-            with counted(NEWTON_ITERATIONS * steps if steps else np.inf):
+            with counted(most if steps else np.inf):
                 designs = self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.stuck = str(error)

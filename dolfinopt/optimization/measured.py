@@ -13,8 +13,8 @@ MERIT_RISE = 1e-3  # of the merit, from which on it counts as risen
 SHORTER_STEP = 0.25  # on a step without a motion, or that leaps; reach after a return to the best
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
 LEAP_FACTOR = 2.0  # on a limit, or on the objective of a design that keeps all: leads nowhere
-# For each time step of the last motion before a design is given up; most take 3 to 10,
-# machines 16 to 44, what falls apart thousands.
+# For each time step of the last motion, and each of robust designs, before a design is given up;
+# most take 3 to 10, machines 16 to 44, what falls apart thousands.
 NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --

@@ -127,7 +127,6 @@ def problem_of(
     """
     held = limits_at(scene, designs) if held is None else held
     nominal, robust = designs[-1], len(designs) > 1
-    known = nominal.differentiated
     scales = [
         np.array(one.evaluation.smooth_limits) / limits
         for one, limits in zip(designs, held, strict=True)
@@ -136,29 +135,23 @@ def problem_of(
         (1.0 + np.array(one.evaluation.constraints)) * scale - 1.0
         for one, scale in zip(designs, scales, strict=True)
     ]
-    own = nominal.of_nominal
-    dfdx = nominal.constraints[own]
-    if robust and known and scene.design.controls_widths:
-        ratio = (1.0 + f[-1][own]) / (1.0 + f[1][own])
-        dfdx = ratio[:, None] * designs[1].constraints[own]
-    bound: Sequence[int] = range(len(designs))
+    own, binding = nominal.of_nominal, list(range(len(designs)))
     if robust and scene.design.limits_on == "nominal":
-        bound = [0, len(designs) - 1]
+        binding = [0, len(designs) - 1]
+    dfdx = np.empty((0, 0))
+    if nominal.differentiated:
+        by_nominal = nominal.constraints[own]
+        if robust and scene.design.controls_widths:
+            ratio = (1.0 + f[-1][own]) / (1.0 + f[1][own])
+            by_nominal = ratio[:, None] * designs[1].constraints[own]
+        by_all = [designs[i].constraints[~own] * scales[i][~own, None] for i in binding]
+        dfdx = np.vstack([by_nominal, *by_all])
     f0, df0dx = _objective(scene, designs)
     variants = [limits_of(scene, one.evaluation) for one in designs]
     limits = variants[-1] if scene.design.limits_on == "nominal" else worst_limits(variants)
-    rows = [np.flatnonzero(own), *[np.flatnonzero(~own)] * len(bound)]
-    return Problem(
-        f0,
-        df0dx,
-        np.concatenate([f[-1][own], *(f[i][~own] for i in bound)]),
-        np.vstack([dfdx, *(designs[i].constraints[~own] * scales[i][~own, None] for i in bound)])
-        if known
-        else np.empty((0, 0)),
-        limits,
-        np.concatenate(rows),
-        objective_of(scene).turned,
-    )
+    rows = np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(binding)])
+    values = np.concatenate([f[-1][own], *(f[i][~own] for i in binding)])
+    return Problem(f0, df0dx, values, dfdx, limits, rows, objective_of(scene).turned)
 
 
 def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float, np.ndarray]:
