@@ -91,16 +91,6 @@ class Evaluation(Motion):
         """Return the true values of a response, by its name; none where it was not asked for."""
         return next((one.values for one in self.responses if one.response == name), ())
 
-    @property
-    def loaded_frequencies(self) -> tuple[float, ...]:
-        """Of every flexible arm with what it carries, Hz; empty unless asked for."""
-        return self.values_of("eigenfrequency")
-
-    @property
-    def tip_deflections(self) -> tuple[float, ...]:
-        """Largest static one of every designed arm, m; empty unless asked for."""
-        return self.values_of("tip_deflection")
-
 
 def evaluate(
     scene: Scene,
