@@ -628,7 +628,8 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> 
         done += len(batch)
     instant = int(values.argmax())
     point = _point_of(comm, A, a[instant])
-    return Screened(values[instant], instant, point, values[coarse], len(coarse) + done)
+    found = float(values[instant])
+    return Screened(found, instant, point, values[coarse], len(coarse) + done)
 
 
 def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
