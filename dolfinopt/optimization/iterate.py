@@ -156,10 +156,10 @@ class Iterate:
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
-        rises, move = self.projection.rises(self.problem.excess), self.scene.optimizer.move
+        rises = self.projection.rises(self.problem.excess)
         for attempt in range(STEP_ATTEMPTS):
             shorter = SHORTER_STEP**attempt
-            new, after = self._proposed(shorter * self.reach * move)
+            new, after = self._proposed(shorter * self.reach * self.projection.move)
             if rises:
                 self.projection.advance()
             designs = self._tried(new)
@@ -179,7 +179,7 @@ class Iterate:
         growth = 1.0 if rises else REACH_GROWTH
         least = LEAST_REACH
         if rises:
-            least = self.projection.least_move / self.scene.optimizer.move
+            least = self.projection.least_reach
         elif self.scene.design.projection and self.projection.complete:
             least = 0.0  # a sharp projection leaps however short the step: so it settles
         return min(1.0, max(least, reach * (SHORTER_REACH if rose else growth)))

@@ -19,10 +19,13 @@ NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --
 
-# Of its range, that a variable can move at least while beta doubles. The merit rises then by itself
-# and makes steps shorter: with a fixed least length a design that doubles beta within 8 iterations
-# falls apart, five to ten times as soft.
-LEAST_TRAVEL = 0.25
+# Beta from which on the move limit falls with its square root: x_phys moves by at most twice what x
+# does, its slope being beta / 2.
+GENTLE_SHARPNESS = 4.0
+# Iterations in which beta doubles with which steps may get as short as `LEAST_REACH` meanwhile: the
+# merit rises then by itself, and makes them so. Within 8 iterations and with that length a design
+# falls apart, ten times as soft as with five times the length; it is five times as soft with three.
+SLOW_CONTINUATION = 25.0
 # Relative violation of a limit from which on beta waits for the design to come back.
 WAITING_EXCESS = 0.02
 # Of a relative excess, in objectives: 1 % costs a tenth; mass and compliance change by 1 to 3 %
