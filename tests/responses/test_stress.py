@@ -124,8 +124,7 @@ def test_both_ways_to_the_loads_agree() -> None:
 
 @pytest.mark.serial
 def test_loads_of_a_closed_loop_are_those_of_its_rows() -> None:
-    settings = ["arms.cells=[8,2,2]", "simulation.tolerance=1e-2", "simulation.sample=0.01",
-                "motion.horizon=0.2"]  # fmt: skip
+    settings = ["arms.cells=[8,2,2]", "simulation.tolerance=1e-2", "simulation.sample=0.01"]
     model = do.Model(do.load_scene(ROOT / "demos/five_bar.toml", settings))
     agree_with_rows(model.simulate().trajectory, 1e-10)
 
