@@ -17,7 +17,6 @@ from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
-from dolfinopt.responses.response import constraints_of
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -73,24 +72,11 @@ class Evaluator:
         self.initial_solutions = self.solutions
         self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
         *others, nominal = self.physical_designs(x)
-        found = []
-        for design in others:
-            found.append(self.differentiated(design, self.evaluate_densities(densities(design))))
-        evaluation = self.evaluate_densities(densities(nominal))
-        of_nominal = [
-            one.response.declared.of_nominal
-            for one, measured in zip(
-                constraints_of(self.scene), evaluation.responses[1:], strict=True
-            )
-            for _ in measured.values
+        found = [
+            self.differentiated(one, self.evaluate_densities(densities(one))) for one in others
         ]
-        none = np.empty((len(of_nominal), 0))
-        found.append(
-            EvaluatedDesign(
-                nominal, evaluation, np.empty(0), none, np.array(of_nominal, dtype=bool), False
-            )
-        )
-        return found
+        evaluation = self.evaluate_densities(densities(nominal))
+        return [*found, EvaluatedDesign(nominal, evaluation)]
 
     def accepted(self, designs: list[EvaluatedDesign]) -> list[EvaluatedDesign]:
         """Add the gradients to designs that were `tried` last (collective)."""
@@ -175,8 +161,7 @@ class Evaluator:
                 backward[k] = np.stack(by, axis=1)
         by_x = np.ascontiguousarray(self.variables.join(backward).T)
         limits = np.array([row.limit for row in rows])
-        of_nominal = np.array([row.response.declared.of_nominal for row in rows], dtype=bool)
-        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None], of_nominal)
+        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None])
 
 
 def densities(design: Mapping[int, PhysicalDesign]) -> dict[int, np.ndarray]:

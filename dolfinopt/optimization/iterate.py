@@ -13,7 +13,6 @@ from dolfinopt.optimization.measured import (
     LARGEST_ASYMPTOTE_DISTANCE,
     LEAP_FACTOR,
     LEAST_REACH,
-    LEAST_REACH_RISING,
     MERIT_RISE,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
@@ -167,12 +166,7 @@ class Iterate:
             if designs is not None:
                 self._go_on(new, after, designs, rises)
                 rose = self.problem.merit(size) > merit + MERIT_RISE
-                growth = 1.0 if rises else REACH_GROWTH
-                factor = shorter * (SHORTER_REACH if rose else growth)
-                # A sharp projection leaps however short the step: without a least one it settles.
-                sharp = self.scene.design.projection and self.projection.complete
-                least = LEAST_REACH_RISING if rises else 0.0 if sharp else LEAST_REACH
-                self.reach = min(1.0, max(least, factor * self.reach))
+                self.reach = self._reach_after(shorter * self.reach, rises, rose)
                 return
             self.projection.beta = before
             rises = False  # the shorter step is one of the same projection
@@ -180,13 +174,24 @@ class Iterate:
         self.evaluate_again()
         self.stuck = self.stuck or "every step, however short, makes it twice as bad"
 
+    def _reach_after(self, reach: float, rises: bool, rose: bool) -> float:
+        """Return the factor on the move limit of the next step from that of the last one."""
+        growth = 1.0 if rises else REACH_GROWTH
+        least = LEAST_REACH
+        if rises:
+            least = self.projection.least_reach
+        elif self.scene.design.projection and self.projection.complete:
+            least = 0.0  # a sharp projection leaps however short the step: so it settles
+        return min(1.0, max(least, reach * (SHORTER_REACH if rose else growth)))
+
     def _tried(self, new: np.ndarray) -> list[EvaluatedDesign] | None:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
         self.stuck = ""
         self.change = float(np.abs(new - self.x).max())
         steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
+        most = NEWTON_ITERATIONS * steps * len(self.designs)
         try:
-            with counted(NEWTON_ITERATIONS * steps if steps else np.inf):
+            with counted(most if steps else np.inf):
                 designs = self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.stuck = str(error)

@@ -9,15 +9,12 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 SHORTER_REACH = 0.5  # on the move limit where the merit rose
 REACH_GROWTH = 1.2  # on it where it did not
 LEAST_REACH = 0.05  # of the scene's move limit
-# While the projection steepens, which makes designs worse by itself: with 0.05 one that steepens
-# within 50 iterations fell apart, ten times as soft.
-LEAST_REACH_RISING = 0.25
 MERIT_RISE = 1e-3  # of the merit, from which on it counts as risen
 SHORTER_STEP = 0.25  # on a step without a motion, or that leaps; reach after a return to the best
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
 LEAP_FACTOR = 2.0  # on a limit, or on the objective of a design that keeps all: leads nowhere
-# For each time step of the last motion before a design is given up; most take 3 to 10,
-# machines 16 to 44, what falls apart thousands.
+# For each time step of the last motion, and each of robust designs, before a design is given up;
+# most take 3 to 10, machines 16 to 44, what falls apart thousands.
 NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --
@@ -25,6 +22,10 @@ NEWTON_ITERATIONS = 100.0
 # Beta from which on the move limit falls with its square root: x_phys moves by at most twice what x
 # does, its slope being beta / 2.
 GENTLE_SHARPNESS = 4.0
+# Iterations in which beta doubles with which steps may get as short as `LEAST_REACH` meanwhile: the
+# merit rises then by itself, and makes them so. Within 8 iterations and with that length a design
+# falls apart, ten times as soft as with five times the length; it is five times as soft with three.
+SLOW_CONTINUATION = 25.0
 # Relative violation of a limit from which on beta waits for the design to come back.
 WAITING_EXCESS = 0.02
 # Of a relative excess, in objectives: 1 % costs a tenth; mass and compliance change by 1 to 3 %
@@ -70,8 +71,7 @@ COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a
 
 STEP_RATIO = 4.0  # of one step to the next: remainders of second order fall by 16
 INSIDE_MARGIN = 0.05  # design variables are moved this far inside [0, 1]: steps must not leave it
-OBJECTIVE_ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
-FORCE_ROUNDING = 1e-9  # the same of drive forces, which are made of accelerations
+VALUE_ROUNDING = 1e-9  # part of drive forces that Newton's tolerance leaves open; of others a tenth
 PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 
 # -- Approximation and its dual (mma); what is Svanberg's stands there --

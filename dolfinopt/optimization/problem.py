@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from dolfinopt.arms.arm import PhysicalDesign
 from dolfinopt.optimization.measured import ERODED_LIMIT_FACTOR, LIMIT_PRICE
 from dolfinopt.responses.constraints import Limit, limits_of, worst_limits
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import objective_of, worst_of
+from dolfinopt.responses.response import find, objective_of, worst_of
 from dolfinopt.scene.load import Scene
 
 
@@ -19,22 +19,29 @@ from dolfinopt.scene.load import Scene
 class EvaluatedDesign:
     """One design that x stands for, what it does, and the gradients of that by x.
 
-
     Attributes:
         physical: of this rank's arms.
         evaluation: values.
-        objective: (n,) gradient of the objective.
-        constraints: (k, n) gradients of `Evaluation.constraints`.
-        of_nominal: (k,) True for constraints that the nominal one of robust designs carries alone.
-        differentiated: whether the gradients are known; they are empty of one that is only tried.
+        objective: (n,) gradient of the objective; empty of one that is only tried.
+        constraints: (k, n) gradients of `Evaluation.constraints`, likewise.
     """
 
     physical: Mapping[int, PhysicalDesign]
     evaluation: Evaluation
-    objective: np.ndarray
-    constraints: np.ndarray
-    of_nominal: np.ndarray
-    differentiated: bool = True
+    objective: np.ndarray = field(default_factory=lambda: np.empty(0))
+    constraints: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+
+    @property
+    def differentiated(self) -> bool:
+        """Whether the gradients are known."""
+        return len(self.objective) > 0
+
+    @property
+    def of_nominal(self) -> np.ndarray:
+        """True (k,) for constraints that the nominal one of robust designs carries alone."""
+        limited = self.evaluation.responses[1:]
+        own = [find(one.response).declared.of_nominal for one in limited for _ in one.values]
+        return np.array(own, dtype=bool)
 
     @property
     def x_phys(self) -> dict[int, np.ndarray]:
@@ -120,7 +127,6 @@ def problem_of(
     """
     held = limits_at(scene, designs) if held is None else held
     nominal, robust = designs[-1], len(designs) > 1
-    known = nominal.differentiated
     scales = [
         np.array(one.evaluation.smooth_limits) / limits
         for one, limits in zip(designs, held, strict=True)
@@ -129,29 +135,23 @@ def problem_of(
         (1.0 + np.array(one.evaluation.constraints)) * scale - 1.0
         for one, scale in zip(designs, scales, strict=True)
     ]
-    own = nominal.of_nominal
-    dfdx = nominal.constraints[own]
-    if robust and known and scene.design.controls_widths:
-        ratio = (1.0 + f[-1][own]) / (1.0 + f[1][own])
-        dfdx = ratio[:, None] * designs[1].constraints[own]
-    bound: Sequence[int] = range(len(designs))
+    own, binding = nominal.of_nominal, list(range(len(designs)))
     if robust and scene.design.limits_on == "nominal":
-        bound = [0, len(designs) - 1]
+        binding = [0, len(designs) - 1]
+    dfdx = np.empty((0, 0))
+    if nominal.differentiated:
+        by_nominal = nominal.constraints[own]
+        if robust and scene.design.controls_widths:
+            ratio = (1.0 + f[-1][own]) / (1.0 + f[1][own])
+            by_nominal = ratio[:, None] * designs[1].constraints[own]
+        by_all = [designs[i].constraints[~own] * scales[i][~own, None] for i in binding]
+        dfdx = np.vstack([by_nominal, *by_all])
     f0, df0dx = _objective(scene, designs)
     variants = [limits_of(scene, one.evaluation) for one in designs]
     limits = variants[-1] if scene.design.limits_on == "nominal" else worst_limits(variants)
-    rows = [np.flatnonzero(own), *[np.flatnonzero(~own)] * len(bound)]
-    return Problem(
-        f0,
-        df0dx,
-        np.concatenate([f[-1][own], *(f[i][~own] for i in bound)]),
-        np.vstack([dfdx, *(designs[i].constraints[~own] * scales[i][~own, None] for i in bound)])
-        if known
-        else np.empty((0, 0)),
-        limits,
-        np.concatenate(rows),
-        objective_of(scene).turned,
-    )
+    rows = np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(binding)])
+    values = np.concatenate([f[-1][own], *(f[i][~own] for i in binding)])
+    return Problem(f0, df0dx, values, dfdx, limits, rows, objective_of(scene).turned)
 
 
 def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float, np.ndarray]:

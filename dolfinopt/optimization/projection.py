@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
-from dolfinopt.optimization.measured import GENTLE_SHARPNESS, WAITING_EXCESS
+from dolfinopt.optimization.measured import (
+    GENTLE_SHARPNESS,
+    LEAST_REACH,
+    SLOW_CONTINUATION,
+    WAITING_EXCESS,
+)
 from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
 
@@ -41,6 +46,11 @@ class Projection:
     def move(self) -> float:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
         return self.scene.optimizer.move * min(1.0, (GENTLE_SHARPNESS / self.beta) ** 0.5)
+
+    @property
+    def least_reach(self) -> float:
+        """Least factor on the move limit while beta rises: x can follow it."""
+        return LEAST_REACH * (SLOW_CONTINUATION / self.scene.design.continuation) ** 1.5
 
     def physical_designs(
         self, x: Mapping[int, np.ndarray]

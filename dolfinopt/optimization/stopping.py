@@ -30,7 +30,7 @@ def stop_code(
 
     A run ends where its best design gained at most `optimizer.tolerance` in `WINDOW` iterations
     of one projection; it is looked at every few iterations, so that rounding does not change
-    their number.
+    their number, and where no step leads on.
 
     Args:
         scene: with the tolerance.
@@ -41,7 +41,8 @@ def stop_code(
         stuck: why no step leads on, "" where one does.
     """
     if stuck:
-        return StopCode.STUCK
+        gained_nothing = best.excess == 0.0 and iteration - best.iteration >= WINDOW
+        return StopCode.SETTLED if gained_nothing else StopCode.STUCK
     if iteration and iteration % LOOKED_AT == 0:
         tolerance, feasible = scene.optimizer.tolerance, best.excess == 0.0
         if progress.gain(WINDOW if feasible else INFEASIBLE_WINDOW) <= tolerance:

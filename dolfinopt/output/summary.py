@@ -229,7 +229,7 @@ def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any
         if owner is not None
     }
     flexible = [arm.name for arm in scene.arms if arm.flexible]
-    loaded = zip(flexible, run.evaluation.loaded_frequencies, strict=False)
+    loaded = zip(flexible, run.evaluation.values_of("eigenfrequency"), strict=False)
     return {
         "grayness": _grayness(traits),
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},

@@ -24,7 +24,7 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.modes import BucklingModes, buckling_modes
 from dolfinopt.density.interpolation import interpolate
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.fem.stress import DisplacementGradient, Prestress, PrestressGradient, StressedModulus
+from dolfinopt.fem.stress import Prestress, PrestressGradient, StressedModulus
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BUCKLING_MODES,
@@ -38,6 +38,7 @@ from dolfinopt.responses.measured import (
     LARGEST_FACTOR,
     VOID_STRESS_SHARE,
 )
+from dolfinopt.responses.motion import motions_of
 from dolfinopt.responses.products import Pair, Products
 from dolfinopt.responses.response import (
     Analysis,
@@ -47,8 +48,8 @@ from dolfinopt.responses.response import (
     p_norm,
     response,
 )
-from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
-from dolfinopt.responses.stress import ArmLoads, ByLoads, arm_loads, bodies_by_loads, motions_of
+from dolfinopt.responses.sensitivity import pairs_at_interfaces
+from dolfinopt.responses.stress import ArmGradient, ArmLoads, ByLoads, arm_loads, through_motions
 from dolfinopt.scene.load import Scene
 
 # -- the instants of one arm along one motion at which it comes closest to buckling ---------------
@@ -232,35 +233,18 @@ class Buckling(Response):
         with together(analysis.partition.world):
             for k, state in analysis.designs.items():
                 parts[k] = _gradient_of_arm(state, found[k], weights.get(k, []))
-        by_body = bodies_by_loads(analysis, {k: one.by_loads for k, one in parts.items()})
-        with together(analysis.partition.world):
-            return [
-                {
-                    k: exact_gradient(
-                        analysis.designs[k], by_body[k], one.displaced, analysis.by, one.beside
-                    )
-                    if k in by_body
-                    else analysis.by(analysis.designs[k], Products())  # nothing buckles
-                    for k, one in parts.items()
-                }
-            ]
+        return [through_motions(analysis, parts)]
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the reciprocals of the least factors, scaled like the smooth one."""
-        return np.array(measured.smooth) * np.array(measured.values) / limits
+    def smooth_of(self, values: np.ndarray) -> np.ndarray:
+        """Return the reciprocals of the factors."""
+        return 1.0 / values
 
     def _found(self, analysis: Analysis) -> dict[int, list[Pressed]]:
         """Return the instants of this rank's designs, once for value and gradient (collective)."""
         designs, world = analysis.designs, analysis.partition.world
 
-        def loads() -> dict[int, Loads]:
-            assert analysis.trajectory is not None
-            return _loads(analysis.scene, analysis.trajectory)
-
         def find() -> dict[int, list[Pressed]]:
-            every: dict[int, Loads] = on_root(world, loads)
+            every = on_root(world, lambda: _loads(analysis.scene, analysis.motion))
             with together(world):
                 return {k: _of_design(state, every[k]) for k, state in designs.items()}
 
@@ -280,24 +264,15 @@ class Buckling(Response):
         return float(values.max()), smooth, weights
 
 
-@dataclass(frozen=True, eq=False)
-class _ArmGradient:
-    """Derivatives of the p-norm by one design."""
-
-    by_loads: Sequence[ByLoads] = ()  # see `bodies_by_loads`
-    displaced: DisplacementGradient | None = None  # None where nothing counts
-    beside: Products | None = None  # by the design itself
-
-
 def _gradient_of_arm(
     state: DesignState, found: Sequence[Pressed], weights: Sequence[np.ndarray]
-) -> _ArmGradient:
+) -> ArmGradient:
     """Differentiate by what one design's K0 is made of (collective on the arm's ranks)."""
     least = BUCKLING_WEIGHT_SHARE
     every = zip(found, weights, strict=True)
     counted = [(one, by * (by > least)) for one, by in every if by.max(initial=0.0) > least]
     if not counted:
-        return _ArmGradient()
+        return ArmGradient([], None, Products())
     kept = [by > 0.0 for _, by in counted]
     modes = np.concatenate(
         [one.modes.field[:, :, own] for (one, _), own in zip(counted, kept, strict=True)], axis=2
@@ -313,7 +288,9 @@ def _gradient_of_arm(
     one = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
     pair = (modes * (-by_mu * mu), modes)
     by_loads = [
-        (each.loads.motion, each.loads.place, np.array([each.instant]), by[None] / each.stiffer)
+        ByLoads(
+            each.loads.motion, each.loads.place, np.array([each.instant]), by[None] / each.stiffer
+        )
         for (each, _), by in zip(counted, one.by_a, strict=True)
     ]
     beside = Products(
@@ -323,18 +300,17 @@ def _gradient_of_arm(
         interfaces=partial(_at_interfaces, one, pair),
         prestress=one,
     )
-    return _ArmGradient(_joined(by_loads), one.through, beside)
+    return ArmGradient(_joined(by_loads), one.through, beside)
 
 
 def _joined(every: Sequence[ByLoads]) -> list[ByLoads]:
     """Return one entry for every arm along every motion, instants ascending."""
     found = []
-    for motion, place in sorted({one[:2] for one in every}):
-        own = sorted(
-            (one for one in every if one[:2] == (motion, place)), key=lambda one: one[2][0]
-        )
-        instants, by = (np.concatenate([one[k] for one in own]) for k in (2, 3))
-        found.append((motion, place, instants, by))
+    for motion, place in sorted({(one.motion, one.place) for one in every}):
+        own = [one for one in every if (one.motion, one.place) == (motion, place)]
+        own.sort(key=lambda one: one.instants[0])
+        instants = np.concatenate([one.instants for one in own])
+        found.append(ByLoads(motion, place, instants, np.concatenate([one.by for one in own])))
     return found
 
 

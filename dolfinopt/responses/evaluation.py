@@ -27,7 +27,6 @@ from dolfinopt.responses.measured import (
     STIFFENING_INSTANTS,
     STIFFENING_OFF_CHANGE,
     STIFFENING_ON_CHANGE,
-    STIFFENING_UNKNOWN_CHANGE,
 )
 from dolfinopt.responses.motion import motion_objective, worst_instants
 from dolfinopt.responses.products import By, by_design
@@ -91,16 +90,6 @@ class Evaluation(Motion):
     def values_of(self, name: str) -> tuple[float, ...]:
         """Return the true values of a response, by its name; none where it was not asked for."""
         return next((one.values for one in self.responses if one.response == name), ())
-
-    @property
-    def loaded_frequencies(self) -> tuple[float, ...]:
-        """Of every flexible arm with what it carries, Hz; empty unless asked for."""
-        return self.values_of("eigenfrequency")
-
-    @property
-    def tip_deflections(self) -> tuple[float, ...]:
-        """Largest static one of every designed arm, m; empty unless asked for."""
-        return self.values_of("tip_deflection")
 
 
 def evaluate(
@@ -173,7 +162,7 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     smooth_limits: list[float] = []
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
-        limits = bound.smooth_limits(analysis, found)
+        limits = bound.smooth_limits(found)
         constraints += [float(x) for x in np.array(found.smooth) / limits - 1.0]
         smooth_limits += [float(x) for x in limits]
         measured.append(found)
@@ -254,7 +243,7 @@ def constraint_gradients(
     for k, bound in enumerate(constraints_of(scene), 1):
         rows = bound.response.gradients(analysis)
         values = measured[k] if measured else bound.response.measure(analysis)
-        limits = bound.smooth_limits(analysis, values)
+        limits = bound.smooth_limits(values)
         found += [
             ConstraintGradient(bound.response, row, float(limit))
             for row, limit in zip(rows, limits, strict=True)
@@ -401,9 +390,8 @@ def _decided(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> St
     if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
         return Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE)
     neglected = _neglected(scenes, bodies)
-    if neglected is None:
-        return Stiffening(estimate, estimate >= STIFFENING_UNKNOWN_CHANGE)
-    return Stiffening(estimate, neglected > NEGLECTED_DEVIATION_SHARE, neglected)
+    on = neglected is None or neglected > NEGLECTED_DEVIATION_SHARE
+    return Stiffening(estimate, on, neglected)
 
 
 def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:

@@ -102,11 +102,9 @@ class Eigenfrequency(Response):
                 rows.append(row)
         return rows
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the squared periods of the least frequencies, scaled like the smooth ones, s2."""
-        return np.array(measured.smooth) * (np.array(measured.values) / limits) ** 2
+    def smooth_of(self, values: np.ndarray) -> np.ndarray:
+        """Return the squared periods of frequencies, s2."""
+        return values**-2.0
 
 
 def _frozen(analysis: Analysis) -> FrozenTree:

@@ -13,7 +13,6 @@ NEGLECTED_DEVIATION_SHARE = 4e-3
 # into account, without a simulation. Measured: the deviation changes by 0.3 to 3 times as much.
 STIFFENING_OFF_CHANGE = 5e-4
 STIFFENING_ON_CHANGE = 0.05
-STIFFENING_UNKNOWN_CHANGE = 2e-3  # that from which it is taken where the comparison fails
 
 # -- order_selection -------------------------------------------------------------------------
 
@@ -33,16 +32,10 @@ LOAD_CASES_RANK_SHARE = 1e-14  # of the largest direction: less is the rounding 
 # of the p-mean.
 NEGLIGIBLE_POWER_SHARE = 1e-2
 P_MEAN_STRIDE = 2  # of the screened instants every second one makes up the p-mean
-# Part of the largest length up to which directions in which the coefficients hardly vary are
-# bounded, not computed.
-NEGLIGIBLE_DIRECTION_SHARE = 1e-4
-NEGLIGIBLE_COLUMNS_SHARE = 1e-13  # relative square below which a combination of columns is none
 MAP_ERROR_SHARE = 1e-3  # of the largest length, a map's error; with 0 it takes three times as long
 COARSE_INSTANTS = 200  # at most, at which all points are looked at first
 BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
-# Of one block, so that it stays in the cache.
-CHUNK_POINTS = 2048
-CHUNK_INSTANTS = 64
+BLOCK_SIZE = 256  # points, and instants, of one block: it stays in the cache
 
 # -- buckling: instants and modes ------------------------------------------------------------
 
@@ -73,8 +66,8 @@ POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tr
 
 # -- poles -----------------------------------------------------------------------------------
 
-# k of the smooth least damping ratio: poles that are damped by 0.0025 more count e times less, and
+# Of the p-norm of 1 - damping ratio: poles that are damped by 0.0025 more count e times less, and
 # ten equal ones are taken for 0.006 less.
-DAMPING_SHARPNESS = 400.0
+DAMPING_EXPONENT = 400.0
 # Of the largest derivative by a pole's value, below which a pole's is left out: 1e-12 of the sum.
 NEGLIGIBLE_POLE_SHARE = 1e-12

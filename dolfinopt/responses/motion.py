@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
 from dolfinopt.motion.build import CART
-from dolfinopt.multibody.shape_integrals import add_integrals, integrals_of
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.response import (
     Analysis,
@@ -188,8 +187,7 @@ class MotionResponse(Response):
         parts = self.parts(analysis.scene)
 
         def values() -> list[tuple[float, float]]:
-            assert analysis.trajectory is not None
-            return [one.of_trajectory(analysis.trajectory) for _, one in parts]
+            return [one.of_trajectory(analysis.motion) for _, one in parts]
 
         true, smooth = zip(*on_root(analysis.partition.world, values), strict=True)
         return Measured(self.name, tuple(name for name, _ in parts), true, smooth)
@@ -200,56 +198,88 @@ class MotionResponse(Response):
 
     def _of_part(self, analysis: Analysis) -> CellGradient:
         """Return the gradient of the one value of this response (collective)."""
-        scene, world, profile = analysis.scene, analysis.partition.world, analysis.profile
-        frozen = self.options.gradient == "esl" and not self.declared.exact
+        world, designs = analysis.partition.world, analysis.designs
+        if self.options.gradient == "esl" and not self.declared.exact:
+            moments = on_root(world, lambda: self._frozen_moments(analysis.motion))
+            with together(world):
+                return {k: esl_gradient(one, moments[k], analysis.by) for k, one in designs.items()}
 
-        def by_design() -> dict[int, Any]:
-            trajectory = analysis.trajectory
-            assert trajectory is not None
-            if frozen:
-                return by_owner(scene, self._over_scenarios(trajectory, frozen))
-            profile.counts.adjoints += max(1, len(trajectory.scenarios))
-            with profile.phase("adjoint"):
-                return by_owner(scene, self._over_scenarios(trajectory, frozen))
+        def followed() -> dict[int, ShapeIntegrals]:
+            weights = self._weights_of_scenarios(analysis.motion)
+            return over_motions(analysis, lambda _, one: self.cotangents(one), weights)
 
-        by = on_root(world, by_design)
+        by = on_root(world, followed)
         with together(world):
-            if frozen:
-                designs = analysis.designs.items()
-                return {k: esl_gradient(one, by[k], analysis.by) for k, one in designs}
-            return {
-                k: exact_gradient(one, by[k], by=analysis.by) for k, one in analysis.designs.items()
-            }
+            return {k: exact_gradient(one, by[k], by=analysis.by) for k, one in designs.items()}
 
-    def _over_scenarios(self, trajectory: Trajectory, frozen: bool) -> list[Any]:
-        """Return `load_case_moments`, or `cotangents` by the scene's bodies, of all scenarios."""
-        scene, others = trajectory.scene, trajectory.scenarios
+    def _weights_of_scenarios(self, trajectory: Trajectory) -> list[float]:
+        """Return the derivatives of the value by those of `motions_of`."""
+        others = trajectory.scenarios
         if not others:
-            if frozen:
-                return self.load_case_moments(trajectory)
-            return self.cotangents(trajectory).through(trajectory.feed_forward)
-        _, weights = self.combine(scene, [self.of_motion(one) for one in others])
-        total: list[Any] = []
-        by_coefficients: list[np.ndarray] = []
-        for weight, one in zip(weights, others, strict=True):
-            if frozen:
-                found: list[Any] = self.load_case_moments(one)
-            else:
-                followed = self.cotangents(one)
-                if one.feed_forward is not trajectory.feed_forward:
-                    followed = Followed(followed.through(one.feed_forward))
-                found = followed.bodies
-                if followed.by_coefficients is not None:
-                    by_coefficients.append(weight * followed.by_coefficients)
-            parts: list[Any] = []
-            # Rigid arms and bodies from files have no gradient.
-            for index, part in enumerate(found[: len(scene.arms)]):
-                f = factors(scene, one.scene, index)
-                whole = weight * f.stiffness
-                parts.append(whole * part if frozen else cotangents_of_scene(part, f, weight))
-            total = [a + b for a, b in zip(total, parts, strict=True)] if total else parts
-        by = np.sum(by_coefficients, axis=0) if by_coefficients else None
-        return Followed(total, by).through(trajectory.feed_forward)
+            return [1.0]
+        return self.combine(trajectory.scene, [self.of_motion(one) for one in others])[1]
+
+    def _frozen_moments(self, trajectory: Trajectory) -> dict[int, np.ndarray]:
+        """Return `load_case_moments` of every design, of all scenarios together."""
+        scene, moments = trajectory.scene, dict[int, np.ndarray]()
+        weights = self._weights_of_scenarios(trajectory)
+        for weight, one in zip(weights, motions_of(trajectory), strict=True):
+            found = [
+                weight * factors(scene, one.scene, k).stiffness * A
+                for k, A in enumerate(self.load_case_moments(one)[: len(scene.arms)])
+            ]
+            for k, A in by_owner(scene, found).items():
+                moments[k] = moments[k] + A if k in moments else A
+        return moments
+
+
+def motions_of(trajectory: Trajectory) -> tuple[Trajectory, ...]:
+    """Return what a limit holds for: the scenarios, or the motion where there are none."""
+    return trajectory.scenarios or (trajectory,)
+
+
+def over_motions(
+    analysis: Analysis,
+    of_motion: Callable[[int, Trajectory], Followed | None],
+    weights: Sequence[float] = (),
+) -> dict[int, ShapeIntegrals]:
+    """Differentiate a weighted sum over all motions by the bodies of every design (on the root).
+
+    Args:
+        analysis: with the motions.
+        of_motion: returns the derivatives of one of `motions_of` with its number by its own bodies;
+            None where it does not count.
+        weights: of the motions; all 1 by default.
+
+    Returns:
+        By the bodies of the scene, by the index of the arm that owns the design.
+    """
+    scene, nominal, profile = analysis.scene, analysis.motion.feed_forward, analysis.profile
+    total: dict[int, ShapeIntegrals] = {}
+    by_coefficients: list[np.ndarray] = []
+    for number, one in enumerate(motions_of(analysis.motion)):
+        with profile.phase("adjoint"):
+            found = of_motion(number, one)
+        if found is None:
+            continue
+        profile.counts.adjoints += 1
+        weight = weights[number] if weights else 1.0
+        if one.feed_forward is not nominal:
+            found = Followed(found.through(one.feed_forward))
+        if found.by_coefficients is not None:
+            by_coefficients.append(weight * found.by_coefficients)
+        bodies = found.bodies[: len(scene.arms)]
+        if one.scene is not scene:
+            bodies = [
+                cotangents_of_scene(by, factors(scene, one.scene, k), weight)
+                for k, by in enumerate(bodies)
+            ]
+        for k, by in by_owner(scene, bodies).items():
+            total[k] = total[k] + by if k in total else by
+    if nominal is not None and by_coefficients:
+        further = by_owner(scene, nominal.gradient(np.sum(by_coefficients, axis=0)))
+        total = {k: by + further[k] for k, by in total.items()}
+    return total
 
 
 def followed_by(trajectory: Trajectory, t: np.ndarray, by: ByMotion) -> Followed:

@@ -17,9 +17,9 @@ from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
 from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
 from dolfinopt.multibody.shape_integrals import integrals_of
-from dolfinopt.responses.measured import DAMPING_SHARPNESS, NEGLIGIBLE_POLE_SHARE
+from dolfinopt.responses.measured import DAMPING_EXPONENT, NEGLIGIBLE_POLE_SHARE
 from dolfinopt.responses.motion import LoadCases, MotionResponse, all_instants, followed_by
-from dolfinopt.responses.response import Analysis, Measured, p_norm, response
+from dolfinopt.responses.response import p_norm, response
 from dolfinopt.scene.load import Scene
 
 Seen = list[tuple[Poles, np.ndarray]]  # at every instant, with which of them count
@@ -28,11 +28,14 @@ Seen = list[tuple[Poles, np.ndarray]]  # at every instant, with which of them co
 class PoleResponse(MotionResponse):
     """The least of a function of the poles, of all instants together; limits are lower ones.
 
-    Its smooth value, that of the values of all poles that count (P, 1), grows as the true one
-    falls.
+    Its smooth value is the p-norm of a decreasing function of the values of all poles that count
+    (P, 1): it grows as the true one falls.
+
+    Attributes:
+        of_none: the value where no pole counts.
     """
 
-    of_none: ClassVar[float] = np.inf  # the value where no pole counts
+    of_none: ClassVar[float] = np.inf
 
     @abstractmethod
     def of_poles(self, poles: np.ndarray) -> np.ndarray:
@@ -43,8 +46,24 @@ class PoleResponse(MotionResponse):
         """Return complex g (P,), the change of a pole's value being Re(g dlambda)."""
 
     @abstractmethod
-    def badness(self, value: np.ndarray | float) -> np.ndarray | float:
-        """Return what the smooth value is of a single pole."""
+    def badness(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the smooth value is of a single pole, and its derivative."""
+
+    @property
+    def exponent(self) -> float:
+        """Exponent of the p-norm."""
+        return self.options.exponent
+
+    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
+        """Return the p-norm of all poles, 0 of none."""
+        return p_norm(self.badness(y)[0], self.exponent)[0] if len(y) else 0.0
+
+    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return its derivative by the values."""
+        if not len(y):
+            return y
+        badness, slope = self.badness(y)
+        return p_norm(badness, self.exponent)[1] * slope
 
     def counts(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
         """Return which poles count (P,): by default all."""
@@ -65,14 +84,11 @@ class PoleResponse(MotionResponse):
     def value_at(self, trajectory: Trajectory, cases: LoadCases) -> float:
         """Return the smooth value of the poles at the scene's instants, whatever the cases."""
         values = self.quantity(trajectory)
-        return self.value(values, values) if len(values) else float(self.badness(self.of_none))
+        return self.value(values, values)
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the smooth limits, scaled like the smooth value of this design."""
-        true, smooth = np.array(measured.values), np.array(measured.smooth)
-        return np.asarray(self.badness(limits) * smooth / self.badness(true))
+    def smooth_of(self, values: np.ndarray) -> np.ndarray:
+        """Return what is missing to a good pole."""
+        return self.badness(values)[0]
 
     def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion."""
@@ -86,7 +102,7 @@ class PoleResponse(MotionResponse):
         """
         every = self._poles(_seen(trajectory))
         values = self._values(every)[:, None]
-        by_values = self.gradient(values, values)[:, 0] if len(values) else values[:, 0]
+        by_values = self.gradient(values, values)[:, 0]
         # Poles far from the least one count for nothing, and cost as much.
         least = NEGLIGIBLE_POLE_SHARE * np.abs(by_values).max(initial=0.0)
         by_values = np.where(np.abs(by_values) > least, by_values, 0.0)
@@ -133,10 +149,11 @@ def _seen(trajectory: Trajectory) -> Trajectory:
 class DampingRatio(PoleResponse):
     """Least damping ratio -Re / |lambda| of the closed loop's poles, 1 where none is limited.
 
-    Smooth: 1 less Kreisselmeier and Steinhauser's least, -1/k ln sum exp(-k ratio).
+    Smooth: the p-norm of what is missing to a ratio of 1, with an exponent of its own.
     """
 
     of_none = 1.0
+    exponent = DAMPING_EXPONENT
 
     def counts(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
         """Return which poles are below `constraints.damping_below`."""
@@ -154,20 +171,9 @@ class DampingRatio(PoleResponse):
         size = np.maximum(np.abs(poles), np.finfo(float).tiny) ** 3
         return -poles.imag * (poles.imag + 1j * poles.real) / size
 
-    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
-        """Return 1 less the smooth least ratio."""
-        least = float(y.min())
-        total = np.exp(-DAMPING_SHARPNESS * (y - least)).sum()
-        return float(1.0 - least + np.log(total) / DAMPING_SHARPNESS)
-
-    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return its derivative by the ratios."""
-        powers = np.exp(-DAMPING_SHARPNESS * (y - y.min()))
-        return -powers / powers.sum()
-
-    def badness(self, value: np.ndarray | float) -> np.ndarray | float:
+    def badness(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what is missing to a ratio of 1."""
-        return 1.0 - value
+        return 1.0 - value, -np.ones_like(value)
 
 
 # -- frequency -----------------------------------------------------------------------------------
@@ -189,14 +195,6 @@ class PoleFrequency(PoleResponse):
         size = np.maximum(np.abs(poles), np.finfo(float).tiny)
         return np.conj(poles) / (2.0 * np.pi * size)
 
-    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
-        """Return the smooth longest period, s."""
-        return p_norm(1.0 / y, self.options.exponent)[0]
-
-    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return its derivative by the frequencies."""
-        return -p_norm(1.0 / y, self.options.exponent)[1] / y**2
-
-    def badness(self, value: np.ndarray | float) -> np.ndarray | float:
+    def badness(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the period, s."""
-        return 1.0 / value
+        return 1.0 / value, -1.0 / value**2

@@ -73,6 +73,12 @@ class Analysis:
     profile: Profile
     by: By = by_design
 
+    @property
+    def motion(self) -> Trajectory:
+        """The trajectory, on the root, where there is one."""
+        assert self.trajectory is not None
+        return self.trajectory
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -157,20 +163,12 @@ class Response(ABC):
                 states[k].kept[self.name] = trajectory, found
         return {k: one.kept[self.name][1] for k, one in states.items()}
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the limit of every smooth value, in their unit (collective).
+    def smooth_of(self, values: np.ndarray) -> np.ndarray:
+        """Return what the smooth value is of single true values, but for a factor.
 
-        The true limits, times smooth over true value of this design.
-
-        Args:
-            analysis: of the design.
-            measured: what `measure` returned of it.
-            limits: (values,) of the true values.
+        By default themselves; of what has a lower limit it falls as the true value grows.
         """
-        true, smooth = np.array(measured.values), np.array(measured.smooth)
-        return limits * np.divide(smooth, true, out=np.ones_like(true), where=true > 0.0)
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +191,14 @@ class Constraint:
         """Return the limit of every true value (values,)."""
         return np.broadcast_to(np.array(self.limit), len(measured.values))
 
-    def smooth_limits(self, analysis: Analysis, measured: Measured) -> np.ndarray:
-        """Return the limit of every smooth value (values,), see there (collective)."""
-        return self.response.smooth_limits(analysis, measured, self.limits(measured))
+    def smooth_limits(self, measured: Measured) -> np.ndarray:
+        """Return the limit of every smooth value (values,), in their unit.
+
+        The true limits, times smooth over true value of this design.
+        """
+        smooth, true = np.array(measured.smooth), self.response.smooth_of(np.array(measured.values))
+        share = np.divide(smooth, true, out=np.ones_like(true), where=true > 0.0)
+        return self.response.smooth_of(self.limits(measured)) * share
 
 
 _known: dict[str, type[Response]] = {}
@@ -307,6 +310,8 @@ class Factors:
 
 def factors(scene: Scene, other: Scene, index: int) -> Factors:
     """Return what makes the body of arm `index` in `scene` that of the same design in `other`."""
+    if other is scene:
+        return Factors(1.0, 1.0, scene.damping.stiffness_proportional)
     here, there = scene.material_of(index), other.material_of(index)
     # Only of plane arms may it differ: solid ones would be other bodies.
     thicker = other.arms[index].thickness / scene.arms[index].thickness

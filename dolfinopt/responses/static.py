@@ -96,12 +96,6 @@ class VolumeFraction(Response):
             for row in range(1 + max(rows.values()))
         ]
 
-    def smooth_limits(
-        self, analysis: Analysis, measured: Measured, limits: np.ndarray
-    ) -> np.ndarray:
-        """Return the volumes of designs filled to the limits, m3 (collective)."""
-        return limits * self._volumes(analysis)[:, 1]
-
     def _volumes(self, analysis: Analysis) -> np.ndarray:
         """Return the volume of the design and of its solid arms (values, 2), m3 (collective)."""
         rows, depth, parts = _rows(analysis), _depths(analysis.scene), {}

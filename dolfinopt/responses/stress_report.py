@@ -14,6 +14,7 @@ from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, to
 from dolfinopt.responses.stress import (
     ArmLoads,
     CellStress,
+    Screened,
     arm_loads,
     cell_stress,
     every,
@@ -93,86 +94,68 @@ def stress_report(
         On the root; empty elsewhere.
     """
 
-    def loads() -> dict[int, list[ArmLoads]]:
+    def loads() -> tuple[np.ndarray, dict[int, list[ArmLoads]]]:
         if trajectory is None or not arms:
-            return {}
+            return np.empty(0), {}
         scene = next(iter(arms.values())).scene
-        return arm_loads(scene, [trajectory])
+        return trajectory.t, arm_loads(scene, [trajectory])
 
-    by_owner: dict[int, list[ArmLoads]] = on_root(partition.world, loads)
+    t, by_owner = on_root(partition.world, loads)
     if not by_owner:
         return {}
     counts = replace(profile.counts)
-    peaks: dict[int, list[_Peaks]] = {}
-    values: dict[int, np.ndarray] = {}
+    peaks: dict[int, list[tuple[int, Peak, Peak]]] = {}
+    cells: dict[int, np.ndarray] = {}
     with profile.phase("stress"), together(partition.world):
         for k, arm in arms.items():
             if not arm.solid.law.has_strength:
                 continue
             state = arm.current
             fields = state.load_fields_of(every_instant(by_owner[k]))
-            cells = cell_stress(state, fields, arm.scene.objective.stress_margin)
-            found = [_arm_stress(partition, state, cells, one) for one in by_owner[k]]
-            peaks[k] = [one for one, _ in found]
-            values[k] = np.stack([value for _, value in found], axis=1)
+            stress = cell_stress(state, fields, arm.scene.objective.stress_margin)
+            found = [_arm_stress(partition, state, stress, one, t) for one in by_owner[k]]
+            peaks[k] = [
+                (one.place, centre, points)
+                for one, (centre, points, _) in zip(by_owner[k], found, strict=True)
+            ]
+            cells[k] = np.stack([each for _, _, each in found], axis=1)
     profile.counts = counts
-    every_peak, whole = gather_arms(partition, peaks), gather_cells(partition, values)
-    if trajectory is None:
-        return {}
+    every_peak, every_cell = gather_arms(partition, peaks), gather_cells(partition, cells)
     return {
-        one.place: _of_place(one, whole[k][:, number], trajectory.t)
+        place: ArmStress(centre, points, *every_cell[k][:, number].T)
         for k, each in every_peak.items()
-        for number, one in enumerate(each)
+        for number, (place, centre, points) in enumerate(each)
     }
 
 
-@dataclass(frozen=True, eq=False)
-class _Peaks:
-    """Of one arm: place in the chain; value, place (d,) and number of the instant of both peaks."""
-
-    place: int
-    centre: tuple[float, np.ndarray, int]
-    points: tuple[float, np.ndarray, int]
-
-
-def _of_place(peaks: _Peaks, cells: np.ndarray, t: np.ndarray) -> ArmStress:
-    def peak(value: float, place: np.ndarray, number: int) -> Peak:
-        return Peak(value, tuple(map(float, place)), float(t[number]))
-
-    when = t[cells[:, 1].astype(int)]
-    return ArmStress(peak(*peaks.centre), peak(*peaks.points), cells[:, 0], when)
-
-
 def _arm_stress(
-    partition: Partition, state: DesignState, cells: CellStress, loads: ArmLoads
-) -> tuple[_Peaks, np.ndarray]:
-    """Return one arm's peaks; of cells largest value and instant's number (n, 2) (collective)."""
-    comm, a, coarse = partition.comm, cells.coefficients(loads), every(len(loads.coefficients))
+    partition: Partition, state: DesignState, cells: CellStress, loads: ArmLoads, t: np.ndarray
+) -> tuple[Peak, Peak, np.ndarray]:
+    """Return one arm's peaks at centres and at all points; of cells largest value and instant.
+
+    Collective on the arm's ranks.
+    """
+    comm, a, coarse = partition.comm, cells.coefficients(loads), every(len(t))
+
+    def peak(found: Screened, places: np.ndarray) -> Peak:
+        known = comm.allgather(places[found.point] if found.point >= 0 else None)
+        place = next(one for one in known if one is not None)
+        return Peak(found.largest, tuple(map(float, place)), float(t[found.instant]))
+
     by_cell, when = maxima(comm, cells.A, a)
     largest = screen(comm, cells.A, a, coarse)
     # The map is right to a thousandth: of nearly equal cells the largest is that of the peak.
     by_cell = np.minimum(by_cell, np.nextafter(largest.largest, 0.0))
     if largest.point >= 0:
         by_cell[largest.point], when[largest.point] = largest.largest, largest.instant
-    where = state.mesh.centroid
-    centre = largest.largest, _shared(partition, where, largest.point), largest.instant
+    centre = peak(largest, state.mesh.centroid)
     operators = state.elastic.operators
     points = stress_points(operators.cell)
-    operator = stress_operator(operators, points)
-    A = cells.fields.stress(operator)
+    A = cells.fields.stress(stress_operator(operators, points))
     solid = state.solid.modulus * cells.root * (cells.weights > 0.0)
     A *= np.repeat(solid, len(points))[:, None]
-    largest = screen(comm, A, a, coarse)
     places = places_of(operators, points).reshape(-1, state.mesh.dim)
-    place = _shared(partition, places, largest.point)
-    peaks = _Peaks(loads.place, centre, (largest.largest, place, largest.instant))
-    return peaks, np.column_stack([by_cell, when])
-
-
-def _shared(partition: Partition, places: np.ndarray, point: int) -> np.ndarray:
-    """Return the place of a point that one rank of the arm knows, on all of them."""
-    known = partition.comm.allgather(places[point] if point >= 0 else None)
-    return next(one for one in known if one is not None)
+    return centre, peak(screen(comm, A, a, coarse), places), np.column_stack([by_cell, t[when]])
 
 
 def unjudged(scene: Scene) -> list[str]:

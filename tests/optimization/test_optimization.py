@@ -191,7 +191,7 @@ def test_bounds_out_of_reach_are_told():
     result = do.optimize(small("objective.kind=static", "constraints.tip_deflection=1e-6"))
     assert max(result.evaluation.constraints) > 10.0
     assert not result.converged
-    value = 1e6 * max(result.evaluation.tip_deflections)
+    value = 1e6 * max(result.evaluation.values_of("tip_deflection"))
     assert value > 10.0
     assert "tip deflection of arm1" in result.violated
     assert "at most 1e-06 m required" in result.violated

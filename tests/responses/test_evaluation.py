@@ -57,7 +57,7 @@ def test_a_shared_design_is_two_equal_ones(overrides: list[str]) -> None:
         if field.name not in ("constraints", "smooth_limits", "responses"):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
     assert set(beside_volume(one)) == set(beside_volume(two))
-    assert set(one.tip_deflections) == set(two.tip_deflections)
+    assert set(one.values_of("tip_deflection")) == set(two.values_of("tip_deflection"))
     # Modes' adjoints are iterated to 1e-8, from other right sides here and there; periods go arm
     # by arm, deflections design by design.
     for j, (row, expected) in enumerate(zip(one_rows, two_rows)):
@@ -200,7 +200,7 @@ def test_constraints_say_how_far_a_bound_is_exceeded() -> None:
     built = build("objective.kind=static", *limits)
     evaluation, _ = built.evaluate(built.fields(wave))
     periods, tips = np.array(evaluation.constraints[2:4]), np.array(evaluation.constraints[4:])
-    least = (4.0 / np.array(evaluation.loaded_frequencies)) ** 2
+    least = (4.0 / np.array(evaluation.values_of("eigenfrequency"))) ** 2
     assert (1.0 + periods >= least * (1.0 - 1e-14)).all()  # equal but for rounding, if far apart
     assert (1.0 + periods <= least * 3.0 ** (1.0 / 20.0)).all()
     for k, arm in built.arms.items():
