@@ -154,6 +154,18 @@ def interior_entries(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) ->
     return InteriorEntries(*(x.astype(PETSc.IntType) for x in (rows, table.indices, table.data)))
 
 
+def of_directions(entries: InteriorEntries, block: int) -> InteriorEntries:
+    """Return the entries of a matrix of nodes, the same in all directions.
+
+    Args:
+        entries: of a matrix of blocks over the same nodes.
+        block: b, its directions.
+    """
+    kept = (entries.source // block) % block == entries.source % block
+    source = entries.source[kept] // block**2
+    return InteriorEntries(entries.rows[kept], entries.columns[kept], source)
+
+
 class InteriorMatrix:
     """The interior rows and columns of a local matrix as a PETSc matrix."""
 

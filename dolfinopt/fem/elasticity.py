@@ -22,8 +22,10 @@ from dolfinopt.fem.assembly import (
     AssembledMatrix,
     CellMatrix,
     Cells,
+    InteriorMatrix,
     NodePairs,
     of_cells,
+    of_directions,
 )
 from dolfinopt.fem.interface import (
     Connectivity,
@@ -127,6 +129,13 @@ class Substructure:
         entries = self.T.dim**2 * self._pairs.pattern.nnz
         layout = extended_layout(self.interior.layout, self.T, entries, self._near)
         return LinearSystem(layout, self.profile, min(self.interior.tolerance, STATICS_TOLERANCE))
+
+    @cached_property
+    def interior_mass(self) -> InteriorMatrix:
+        """M_II of the design that asked last."""
+        layout = self.interior.layout
+        entries = of_directions(layout.entries(), self.T.dim)
+        return InteriorMatrix(layout.comm, entries, layout.rows)
 
     @cached_property
     def connectivity(self) -> Connectivity:

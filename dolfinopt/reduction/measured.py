@@ -21,6 +21,9 @@ ITERATIONS_LIMIT = 500  # of conjugate gradients for the adjoints of modes
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 EIGENVALUE_GAP = 1e-6
+# Relative residual with which the next mode beyond the wanted ones is looked for: 8 solves, 18 to
+# nearly all digits.
+ROUGH_TOLERANCE = 1e-2
 # Part of a nearby mode, in M, beyond which the modes that were found do not contain it.
 LOST_MODE_SHARE = 1e-2
 # Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
