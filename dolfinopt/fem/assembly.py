@@ -211,6 +211,20 @@ class InteriorMatrix:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
+    @cached_property
+    def _vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        return self.mat.createVecs()
+
+    def times(self, V: np.ndarray) -> np.ndarray:
+        """Return its product with the owned rows (rows, k) of columns (collective)."""
+        out = np.empty_like(V, order="F")
+        right, left = self._vectors
+        for source, target in zip(V.T, out.T, strict=True):
+            right.array = source
+            self.mat.mult(right, left)
+            target[:] = left.array_r
+        return out
+
 
 def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Return nodal fields (n_nodes, d, k) times coefficients (k, m), as one matrix product."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
-from dolfinopt.parallel import on_root
+from dolfinopt.parallel import on_root, total
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     EXACT_TOLERANCE,
@@ -83,7 +82,7 @@ def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
     if arm.mesh.dim == 3:  # torsion has no mean, bending in z and in y may have the same
         y, z = (arm.points[:, 1:] / arm.mesh.outboard_point[0]).T
         weight += np.stack([0.3 * z, -7.0 * z, 1.3 + 7.0 * y], axis=1)
-    mean = arm.comm.allreduce(np.einsum("ni,nik->k", weight, MV))
+    mean = total(arm.comm, np.einsum("ni,nik->k", weight, MV))
     return np.where(mean < 0.0, -1.0, 1.0)
 
 
@@ -125,12 +124,9 @@ def by_frame_fields(by: np.ndarray) -> np.ndarray:
 def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return left . right (k, l), summed over the ranks, one of them a product with K or M."""
     rows = left.shape[0] * left.shape[1]
-    return total(arm, left.reshape(rows, left.shape[2]).T @ right.reshape(rows, right.shape[2]))
-
-
-def total(arm: ElasticArm, part: Any) -> Any:
-    """Return the sum over the arm's ranks; without the detour through MPI on a single one."""
-    return part if arm.comm.size == 1 else arm.comm.allreduce(part)
+    return np.asarray(
+        total(arm.comm, left.reshape(rows, left.shape[2]).T @ right.reshape(rows, right.shape[2]))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,11 +199,11 @@ def _qr(
     for j, w in enumerate(columns):
         n = len(kept)
         for _ in range(2):
-            h = total(arm, MQ[:n] @ w)
+            h = total(arm.comm, MQ[:n] @ w)
             w -= h @ Q[:n]
             R[:n, j] += h
         Mw = arm.mass_times(w.reshape(n_nodes, dim, 1)).ravel()
-        length = np.sqrt(max(total(arm, w @ Mw), 0.0))
+        length = np.sqrt(max(total(arm.comm, w @ Mw), 0.0))
         if length <= least[j]:
             continue
         Q[n], MQ[n], R[n, j] = w / length, Mw / length, length

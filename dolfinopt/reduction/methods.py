@@ -11,7 +11,7 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm, Rows
-from dolfinopt.parallel import on_root
+from dolfinopt.parallel import on_root, total
 from dolfinopt.reduction.basis import (
     AdjointFields,
     Basis,
@@ -192,7 +192,7 @@ def krylov_adjoint(
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
-    inner = arm.comm.allreduce(interior_rows(arm, basis.V).T @ interior)
+    inner = total(arm.comm, interior_rows(arm, basis.V).T @ interior)
     inner += basis.outboard.T @ outboard
     weighted = arm.restrict(basis.MV)
     interior = (interior - weighted[0] @ inner) @ turn.T
