@@ -11,11 +11,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.fem.measured import (
-    FIELD_CHUNK_ENTRIES,
-    STRESS_CHUNK_CELLS,
-    STRESS_CHUNK_ENTRIES,
-)
+from dolfinopt.fem.measured import KERNEL_CHUNK_ENTRIES, STRESS_CHUNK_CELLS, STRESS_CHUNK_ENTRIES
 from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.profiling import Profile
 
@@ -234,7 +230,7 @@ def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 def runs_of_columns(field: np.ndarray) -> list[slice]:
     """Return runs of the columns of a nodal field (n_nodes, d, k): not all are copied at once."""
-    step = max(1, FIELD_CHUNK_ENTRIES * field.shape[2] // max(1, field.size))
+    step = max(1, KERNEL_CHUNK_ENTRIES * field.shape[2] // max(1, field.size))
     return [slice(k, k + step) for k in range(0, field.shape[2], step)]
 
 

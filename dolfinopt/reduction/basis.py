@@ -14,6 +14,7 @@ from dolfinopt.parallel import on_root, total
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
     EXACT_TOLERANCE,
+    KRYLOV_BLOCKS_LIMIT,
     ROUNDING_LENGTH_SHARE,
 )
 
@@ -224,11 +225,11 @@ class InverseSpace:
         start: (r_0, k) coefficients of the first fields in the first r_0 columns.
     """
 
-    def __init__(self, arm: ElasticArm, first: np.ndarray, deflation: float):
+    def __init__(self, arm: ElasticArm, first: np.ndarray):
         """Begin with the fields `first` (n_nodes, d, k)."""
-        self.arm, self.deflation = arm, deflation
+        self.arm = arm
         none = np.empty((*first.shape[:2], 0))
-        expansion = orthonormalise(arm, first, none, none, deflation)
+        expansion = orthonormalise(arm, first, none, none, EXACT_TOLERANCE)
         self.V, self.MV, self.start = expansion.Q, expansion.MQ, expansion.coefficients
         self.H = np.empty((self.V.shape[2], 0))
 
@@ -238,7 +239,7 @@ class InverseSpace:
         if done == self.V.shape[2]:
             return
         W = self.arm.static_response(*self.arm.restrict(self.MV[:, :, done:]))
-        new = orthonormalise(self.arm, W, self.V, self.MV, self.deflation)
+        new = orthonormalise(self.arm, W, self.V, self.MV, EXACT_TOLERANCE)
         self.V = np.concatenate([self.V, new.Q], axis=2)
         self.MV = np.concatenate([self.MV, new.MQ], axis=2)
         H = np.zeros((self.V.shape[2], done + W.shape[2]))
@@ -300,7 +301,7 @@ def interior_rows(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
     return field[arm.interior_nodes].reshape(arm.num_interior, field.shape[2])
 
 
-def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most: int) -> np.ndarray:
+def solve_at(arm: ElasticArm, omega: float, right: Rows) -> np.ndarray:
     """Solve (T'KT - omega^2 T'MT) z = right for all columns at once; a field (n_nodes, d, k).
 
     Block GMRES preconditioned with the factor of K at hand, in the inner product of M. Above the
@@ -309,12 +310,12 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most:
     takes 5, 6, 8 and 10 solves. A factor LDL' of the interior of K - omega^2 M would be dearer, and
     its constraint modes are infinite at the natural frequencies of the arm held at both ends.
 
+    Residuals are relative, after multiplication by K^-1, in the norm of M.
+
     Args:
         arm: with its design set.
         omega: rad/s; 0 needs one solve.
         right: loads of interior and outboard rows.
-        tolerance: of the residual, relative, after multiplication by K^-1, norm of M.
-        most: steps.
 
     Raises:
         ConvergenceError: omega is too close to a natural frequency.
@@ -322,8 +323,8 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most:
     first = arm.static_response(*right)
     if omega == 0.0:
         return first
-    space = InverseSpace(arm, first, 1e-13)
-    for _ in range(most):
+    space = InverseSpace(arm, first)
+    for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()
         rows, columns = space.H.shape
         operator = np.eye(rows, columns) - omega**2 * space.H
@@ -331,7 +332,7 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most:
         goal[: len(space.start)] = space.start
         y = np.linalg.lstsq(operator, goal, rcond=None)[0]
         residual = np.linalg.norm(operator @ y - goal, axis=0)
-        if (residual <= tolerance * np.linalg.norm(goal, axis=0)).all():
+        if (residual <= EXACT_TOLERANCE * np.linalg.norm(goal, axis=0)).all():
             return combine(space.V[:, :, :columns], y)
         if rows == columns:
             break

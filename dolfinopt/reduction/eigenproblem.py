@@ -12,15 +12,13 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import Columns, ElasticArm, Rows
+from dolfinopt.fem.measured import ENERGY_TOLERANCE, SOLVER_ITERATIONS
 from dolfinopt.parallel import total
 from dolfinopt.reduction.measured import (
     EIGENVALUE_GAP,
     EXACT_TOLERANCE,
-    ITERATIONS_LIMIT,
     LOST_MODE_SHARE,
     RAMP_SHARE,
-    ROUGH_TOLERANCE,
-    VECTOR_TOLERANCE,
     WARM_STEPS,
 )
 from dolfinopt.solver import obeying_options, user_options
@@ -98,7 +96,7 @@ class Pencil:
     @property
     def tolerance(self) -> float:
         """Relative residual of solutions and eigenpairs: nearly all digits, where a factor is."""
-        return VECTOR_TOLERANCE if self.arm.is_iterative else EXACT_TOLERANCE
+        return ENERGY_TOLERANCE if self.arm.is_iterative else EXACT_TOLERANCE
 
     def inverse(self, R: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 R, to the tolerance."""
@@ -159,8 +157,8 @@ def complement_solve(
     R = right.copy(order="F")
     Z = conditioned(R)
     P, energy = Z, lengths(R, Z)
-    goal = VECTOR_TOLERANCE**2 * energy
-    for _ in range(ITERATIONS_LIMIT):
+    goal = ENERGY_TOLERANCE**2 * energy
+    for _ in range(SOLVER_ITERATIONS):
         if not np.isfinite(energy).all():
             break
         more = energy > goal[here]
@@ -463,8 +461,8 @@ def _without_gaps(pencil: Pencil, values: np.ndarray, vectors: np.ndarray) -> Pa
         if pencil.size == len(values):
             break  # all there are
         # Its residual tells how far the next eigenvalue may be off: most lie far above.
-        roughly, _ = _krylov_schur(pencil, 1, first, ROUGH_TOLERANCE, vectors)
-        if len(roughly) and roughly[0] * (1.0 - ROUGH_TOLERANCE) > values[-1]:
+        roughly, _ = _krylov_schur(pencil, 1, first, LOST_MODE_SHARE, vectors)
+        if len(roughly) and roughly[0] * (1.0 - LOST_MODE_SHARE) > values[-1]:
             break
         more, vector = _krylov_schur(pencil, 1, first, pencil.tolerance, vectors)
         if len(more) == 0:
