@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
-from dolfinopt.density.measured import COLUMN_PLACES, LEAST_SIDE_DISTANCE, MIRROR_DISTANCE_LIMIT
+from dolfinopt.density.measured import LEAST_SIDE_DISTANCE, MIRROR_DISTANCE_LIMIT
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
@@ -353,7 +353,9 @@ class Extrusion:
         first = sum(counts[: self.comm.rank])
         places = np.concatenate(self.comm.allgather(mesh.centroid[:, :2]))
         size = np.abs(places).max()
-        _, column = np.unique(np.rint(places / size * COLUMN_PLACES), axis=0, return_inverse=True)
+        _, column = np.unique(
+            np.rint(places / size / FILE_ROUNDING_SHARE), axis=0, return_inverse=True
+        )
         self._column = column.ravel()[first : first + mesh.num_cells]
         self._count = np.bincount(column.ravel())
 

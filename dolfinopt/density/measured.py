@@ -12,7 +12,6 @@ LEAST_SIDE_DISTANCE = 0.05
 # space cubic roots of its volume. Meshes of symmetric geometries that were made without a thought
 # of symmetry: 0.7 to 1.0.
 MIRROR_DISTANCE_LIMIT = 1.25
-COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above one another
 
 # -- members ---------------------------------------------------------------------------------
 

@@ -10,13 +10,9 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
+from dolfinopt.fem.measured import ROUNDING_SHARE
 from dolfinopt.parallel import on_root, total
-from dolfinopt.reduction.measured import (
-    DEFLATION_SHARE,
-    EXACT_TOLERANCE,
-    KRYLOV_BLOCKS_LIMIT,
-    ROUNDING_LENGTH_SHARE,
-)
+from dolfinopt.reduction.measured import DEFLATION_SHARE, KRYLOV_BLOCKS_LIMIT, ROUNDING_LENGTH_SHARE
 
 
 @dataclass(frozen=True)
@@ -181,7 +177,7 @@ def orthonormalise(
         MQ = arm.mass_times(Q)
         overlap = dot(arm, MQ, np.concatenate([V, Q], axis=2))
         goal = np.eye(V.shape[2] + len(kept))[V.shape[2] :]
-        if np.abs(overlap - goal).max(initial=0.0) <= EXACT_TOLERANCE:
+        if np.abs(overlap - goal).max(initial=0.0) <= ROUNDING_SHARE:
             return Expansion(Q, MQ, np.vstack([by_V, R]), kept)
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the vectors of the reduction do not become orthonormal; ask for "
@@ -229,7 +225,7 @@ class InverseSpace:
         """Begin with the fields `first` (n_nodes, d, k)."""
         self.arm = arm
         none = np.empty((*first.shape[:2], 0))
-        expansion = orthonormalise(arm, first, none, none, EXACT_TOLERANCE)
+        expansion = orthonormalise(arm, first, none, none, ROUNDING_SHARE)
         self.V, self.MV, self.start = expansion.Q, expansion.MQ, expansion.coefficients
         self.H = np.empty((self.V.shape[2], 0))
 
@@ -239,7 +235,7 @@ class InverseSpace:
         if done == self.V.shape[2]:
             return
         W = self.arm.static_response(*self.arm.restrict(self.MV[:, :, done:]))
-        new = orthonormalise(self.arm, W, self.V, self.MV, EXACT_TOLERANCE)
+        new = orthonormalise(self.arm, W, self.V, self.MV, ROUNDING_SHARE)
         self.V = np.concatenate([self.V, new.Q], axis=2)
         self.MV = np.concatenate([self.MV, new.MQ], axis=2)
         H = np.zeros((self.V.shape[2], done + W.shape[2]))
@@ -271,7 +267,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > EXACT_TOLERANCE * shares[-1]:  # not a number included
+            if not shares[0] > ROUNDING_SHARE * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:
@@ -332,7 +328,7 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows) -> np.ndarray:
         goal[: len(space.start)] = space.start
         y = np.linalg.lstsq(operator, goal, rcond=None)[0]
         residual = np.linalg.norm(operator @ y - goal, axis=0)
-        if (residual <= EXACT_TOLERANCE * np.linalg.norm(goal, axis=0)).all():
+        if (residual <= ROUNDING_SHARE * np.linalg.norm(goal, axis=0)).all():
             return combine(space.V[:, :, :columns], y)
         if rows == columns:
             break

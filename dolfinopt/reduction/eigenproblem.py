@@ -12,15 +12,9 @@ from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import Columns, ElasticArm, Rows
-from dolfinopt.fem.measured import ENERGY_TOLERANCE, SOLVER_ITERATIONS
+from dolfinopt.fem.measured import ENERGY_TOLERANCE, ROUNDING_SHARE, SOLVER_ITERATIONS
 from dolfinopt.parallel import total
-from dolfinopt.reduction.measured import (
-    EIGENVALUE_GAP,
-    EXACT_TOLERANCE,
-    LOST_MODE_SHARE,
-    RAMP_SHARE,
-    WARM_STEPS,
-)
+from dolfinopt.reduction.measured import EIGENVALUE_GAP, LOST_MODE_SHARE, RAMP_SHARE, WARM_STEPS
 from dolfinopt.solver import obeying_options, user_options
 
 OPTIONS = "dolfinopt_modes_"  # prefix of the eigensolver's SLEPc options
@@ -96,7 +90,7 @@ class Pencil:
     @property
     def tolerance(self) -> float:
         """Relative residual of solutions and eigenpairs: nearly all digits, where a factor is."""
-        return ENERGY_TOLERANCE if self.arm.is_iterative else EXACT_TOLERANCE
+        return ENERGY_TOLERANCE if self.arm.is_iterative else ROUNDING_SHARE
 
     def inverse(self, R: np.ndarray) -> np.ndarray:
         """Return (T'KT)^-1 R, to the tolerance."""

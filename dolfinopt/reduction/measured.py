@@ -3,15 +3,6 @@
 Each stands with its unit, what it rules, and what was measured.
 """
 
-# -- all ---------------------------------------------------------------------------------------
-
-# Relative residual of solutions and eigenpairs that are to be right to nearly all digits. Vectors
-# are then right to about 1e-10, which keeps designs equal to 1e-8 on any number of ranks; each
-# further digit costs a fraction of a step. Two rounds of Gram and Schmidt leave 1e-15 to 1e-14.
-# Part of a length or energy, of the largest, below which what is left of a vector beside others is
-# rounding, too: that leaves 1e-16 of dependent ones, independent ones have 1e-2.
-EXACT_TOLERANCE = 1e-12
-
 # -- eigenproblem --------------------------------------------------------------------------------
 
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance

@@ -217,7 +217,7 @@ def error_of_wave(shape, element, n):
     free = np.repeat(inside, len(size))
     K, u = arm.K.matrix.tocsr()[free], exact.ravel().copy()
     right = arm.mass_times(load[:, :, None]).ravel()[free] - K[:, ~free] @ u[~free]
-    u[free] = spsolve(K[:, free].tocsc(), right)
+    u[free] = spsolve(K[:, free].tocsc(), right, "MMD_AT_PLUS_A")
     off, exact = (u.reshape(exact.shape) - exact)[:, :, None], exact[:, :, None]
     return np.sqrt(np.vdot(off, arm.mass_times(off)) / np.vdot(exact, arm.mass_times(exact)))
 
@@ -307,23 +307,6 @@ def test_clamped_link():
     assert errors[5] == pytest.approx(0.0157, abs=2e-4)
     errors = frequencies("quadratic", "tetrahedron", (25, 2, 2)) / CALCULIX - 1.0
     assert 0.0 < errors.min() and errors[:5].max() < 0.005 and errors[5] < 0.025
-
-
-@pytest.mark.serial
-def test_refinement():
-    """Errors of bending fall by four on halved cells; linear hexahedra, which lock, have 20 times.
-
-    Against quadratic cells as far from the clamp's edges, which are left out so. The coarse cells
-    have torsion before the third bending, the fine ones behind it.
-    """
-    meshes = [(15, 3, 2), (30, 6, 4)]
-    exact = frequencies("quadratic", "hexahedron", (20, 3, 2))[:5]
-    coarse, fine = (frequencies("incompatible", "hexahedron", one) for one in meshes)
-    coarse, fine = coarse[[0, 1, 2, 3, 5]] / exact - 1.0, fine[:5] / exact - 1.0
-    rates = np.log2(coarse / fine)
-    assert rates.min() > 1.7, rates
-    locked = frequencies("linear", "hexahedron", meshes[1])[:2] / exact[:2] - 1.0
-    assert (locked > 20.0 * fine[:2]).all()
 
 
 def torsion_constant(element: str, sides: tuple[float, float], cells: tuple[int, int]) -> float:
