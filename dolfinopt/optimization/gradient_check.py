@@ -105,8 +105,7 @@ def taylor_test(
         return variables.join(by)
 
     x_phys = _physical(variables, patterns, inside)
-    _, first = evaluate(exact, partition, arms, x_phys, profile, simulated=False)
-    start = [] if first is None else [replace(one, held=True) for one in first.solutions]
+    start = held_steps(evaluate(exact, partition, arms, x_phys, profile, simulated=False)[1])
     _, base = evaluate(exact, partition, arms, x_phys, profile, start, simulated=False)
     slope, frozen = slope_of(exact), None
     if needs(scene, "motion"):
@@ -126,6 +125,11 @@ def taylor_test(
         rows.append(TaylorRow(name, along, beside, remainders, rate))
     angle, ratio = (np.nan, np.nan) if frozen is None else compared(slope, frozen)
     return TaylorTest(tuple(rows), angle, ratio)
+
+
+def held_steps(motion: Trajectory | None) -> list[Solution]:
+    """Return what motions begin with that are to have the time steps of this one."""
+    return [] if motion is None else [replace(one, held=True) for one in motion.solutions]
 
 
 def check_exact(scene: Scene) -> None:
