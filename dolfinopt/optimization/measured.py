@@ -87,18 +87,8 @@ CURVED_ASYMPTOTE_DISTANCE = 1.0
 # Of the range: a smaller move counts neither as back nor as forth. With 1e-9 rounding decides, and
 # the kernels of OpenBLAS end in 2 % of the runs with other counts; with 1e-6 in none of 200.
 REST_MOVE_SHARE = 1e-6
-PENALTY_LIMIT = 1e9  # of the elastic price
 # The dual is stepped in units of (multiplier + this), as they span decades; below raa0 they hardly
 # change the design.
 MULTIPLIER_FLOOR = 1e-5
-FIRST_DUAL_RADIUS = 10.0  # of the trust region in these units: about a decade of every multiplier
 DUAL_EVALUATIONS = 300  # at most; 4 to 5 are the rule
-DUAL_ROUNDING = 1e-14  # of its value relative to its terms, and of multipliers
-ACTIVE_MULTIPLIER = 1e-7 * MULTIPLIER_FLOOR  # smaller ones move no variable
-# Of an active constraint relative to its terms; only constraints that nearly repeat each other come
-# near.
-COMPLEMENTARITY_REST = 1e-6
-FLAT_GRADIENT_SHARE = 1e-6  # added to the curvature of a flat dual; vanishes at the maximum
-# Variables at a time, whose temporaries stay in the cache (96 kB): nearly three times as fast at 19
-# 200 variables.
-BLOCK_ENTRIES = 12288
+ROUNDING = 1e-14  # of sums relative to their terms
