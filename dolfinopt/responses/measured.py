@@ -58,10 +58,9 @@ LARGEST_FACTOR = 1e3  # above, nothing buckles: it tells nothing of a machine
 
 # -- linearised_machine ----------------------------------------------------------------------
 
-POLE_ERROR = 0.01  # of a pole, over its size, that an exported machine may have
-# Of it, that the poles may differ from those with twice as many coordinates. Demos: poles that do
-# hold it against four to sixteen times as many; with 1 one of spatial_arm.toml did not.
-POLE_ERROR_SHARE = 0.5
+# Of a pole, over its size, that an exported machine may have. Poles that differ by half of it from
+# those with twice as many coordinates hold it, in all demos, against four to sixteen times as many.
+POLE_ERROR = 0.01
 POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tries
 
 # -- poles -----------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from dolfinopt.responses.measured import (
     TIME_ERROR_SHARE,
     TRIED_COORDINATES_LIMIT,
 )
-from dolfinopt.responses.reductions import RICHER_METHOD, Reductions
+from dolfinopt.responses.reductions import RICHER_METHOD, Reductions, fewest
 from dolfinopt.responses.response import bodies_in, factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
@@ -85,20 +85,17 @@ def choose_coordinates(
     goal = scene.reduction.tolerance / reserve
     most = min(max(TRIED_COORDINATES_LIMIT, least), comparison.reductions.limit)
     tried: dict[int, float] = {}
-    low, high = least - 1, least
-    while not (error := comparison.error(high)) <= goal:  # not a number included
-        tried[high] = error
-        if high >= most:
-            raise _none_found(scene, tried, goal)
-        low, high = high, min(high + max(1, high - least), most)
-    tried[high] = error
-    while high - low > 1:
-        middle = (low + high) // 2
-        tried[middle] = comparison.error(middle)
-        low, high = (low, middle) if tried[middle] <= goal else (middle, high)
+
+    def holds(count: int) -> bool:
+        tried[count] = comparison.error(count)
+        return tried[count] <= goal  # not a number does not
+
+    found = fewest(least, most, holds)
+    if found is None:
+        raise _none_found(scene, tried, goal)
     for arm in arms.values():
-        arm.set_order(high)
-    return OrderSelection(high, tried[high], tuple(sorted(tried.items())))
+        arm.set_order(found)
+    return OrderSelection(found, tried[found], tuple(sorted(tried.items())))
 
 
 def estimated_error(
