@@ -28,10 +28,7 @@ LOAD_CASES_RANK_SHARE = 1e-14  # of the largest direction: less is the rounding 
 
 # -- stress: p-mean and screening ------------------------------------------------------------
 
-# Instants whose largest stress to the power p is below this part of the largest one's are left out
-# of the p-mean.
-NEGLIGIBLE_POWER_SHARE = 1e-2
-P_MEAN_STRIDE = 2  # of the screened instants every second one makes up the p-mean
+P_MEAN_STRIDE = 2  # of the coarse instants every second one makes up the p-mean
 MAP_ERROR_SHARE = 1e-3  # of the largest length, a map's error; with 0 it takes three times as long
 COARSE_INSTANTS = 200  # at most, at which all points are looked at first
 BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
@@ -41,14 +38,8 @@ BLOCK_SIZE = 256  # points, and instants, of one block: it stays in the cache
 
 BUCKLING_PEAKS = 3  # instants of an arm that count in the smooth value, at most
 BUCKLING_PROMINENCE = 0.1  # of the largest value, by which peaks over time stand out
-# Of the largest 1 / factor, below which a peak does not count: to the power 20 it is 1 %.
-BUCKLING_PEAK_SHARE = 0.8
-BUCKLING_PLATEAU = 1e-6  # relative, up to which instants of one peak are the same
 BUCKLING_MODES = 4  # of an instant: of several equal struts all
-BUCKLING_ROUNDS = 4  # of looking for a worse instant by the modes of those before
 BUCKLING_RANK_SHARE = 1e-8  # of energies, below which modes of several instants are the same
-# Derivatives of the smooth value that count, of the largest one.
-BUCKLING_WEIGHT_SHARE = 1e-8
 # Part of solid stiffness at which the stress of a cell stiffens half as much as it would: so light
 # a cell, x = 0.1 with the default law, buckles with a strut beside it, not by itself. Of a gap that
 # closes, void buckles by itself at 2.6 times the load, with x = 0.01 in it at 4.3 times; with this

@@ -17,7 +17,6 @@ from dolfinopt.responses.stress import (
     Screened,
     arm_loads,
     cell_stress,
-    every,
     every_instant,
     maxima,
     screen,
@@ -135,7 +134,7 @@ def _arm_stress(
 
     Collective on the arm's ranks.
     """
-    comm, a, coarse = partition.comm, cells.coefficients(loads), every(len(t))
+    comm, a = partition.comm, cells.coefficients(loads)
 
     def peak(found: Screened, places: np.ndarray) -> Peak:
         known = comm.allgather(places[found.point] if found.point >= 0 else None)
@@ -143,7 +142,7 @@ def _arm_stress(
         return Peak(found.largest, tuple(map(float, place)), float(t[found.instant]))
 
     by_cell, when = maxima(comm, cells.A, a)
-    largest = screen(comm, cells.A, a, coarse)
+    largest = screen(comm, cells.A, a)
     # The map is right to a thousandth: of nearly equal cells the largest is that of the peak.
     by_cell = np.minimum(by_cell, np.nextafter(largest.largest, 0.0))
     if largest.point >= 0:
@@ -155,7 +154,7 @@ def _arm_stress(
     solid = state.solid.modulus * cells.root * (cells.weights > 0.0)
     A *= np.repeat(solid, len(points))[:, None]
     places = places_of(operators, points).reshape(-1, state.mesh.dim)
-    return centre, peak(screen(comm, A, a, coarse), places), np.column_stack([by_cell, t[when]])
+    return centre, peak(screen(comm, A, a), places), np.column_stack([by_cell, t[when]])
 
 
 def unjudged(scene: Scene) -> list[str]:
