@@ -59,5 +59,3 @@ POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tr
 # Of the p-norm of 1 - damping ratio: poles that are damped by 0.0025 more count e times less, and
 # ten equal ones are taken for 0.006 less.
 DAMPING_EXPONENT = 400.0
-# Of the largest derivative by a pole's value, below which a pole's is left out: 1e-12 of the sum.
-NEGLIGIBLE_POLE_SHARE = 1e-12

@@ -88,8 +88,12 @@ class MotionResponse(Response):
         """
         return [("", self)]
 
+    def seen(self, trajectory: Trajectory) -> Trajectory:
+        """Return a motion at the instants of which some make it up; by default its own."""
+        return trajectory
+
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
-        """Return the instants that make it up; by default all."""
+        """Return these of what is `seen`; by default all."""
         return all_instants(trajectory)
 
     @abstractmethod
@@ -130,7 +134,7 @@ class MotionResponse(Response):
     def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> ByMotion:
         """Return the derivatives of `value` at held instants, see `followed`."""
         y = self.quantity(trajectory)[cases.indices]
-        return ByMotion(*self.followed(trajectory, cases, self.gradient(y, cases.weights)))
+        return self.followed(trajectory, cases, self.gradient(y, cases.weights))
 
     def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion.
@@ -138,10 +142,11 @@ class MotionResponse(Response):
         Its own, with the coordinates held, and the trajectory's, whose coordinates follow. The
         choice of instants is held: where two of an interval are equally bad there is a kink.
         """
-        cases = self.load_cases(trajectory)
-        return followed_by(
-            trajectory, trajectory.t[cases.indices], self.derivatives(trajectory, cases)
-        )
+        seen = self.seen(trajectory)
+        cases = self.load_cases(seen)
+        by = self.derivatives(seen, cases)
+        found = trajectory.followed(seen.t[cases.indices], by.unknowns, by.motion)
+        return replace(found, bodies=list(map(add_integrals, found.bodies, by.bodies)))
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
@@ -160,7 +165,8 @@ class MotionResponse(Response):
 
     def of_motion(self, trajectory: Trajectory) -> float:
         """Return the value of one motion, at the instants that it chooses (root only)."""
-        return self.value_at(trajectory, self.load_cases(trajectory))
+        seen = self.seen(trajectory)
+        return self.value_at(seen, self.load_cases(seen))
 
     def combine(self, scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
         """Return the value of all scenarios from their own, and its derivatives by them."""
@@ -280,13 +286,6 @@ def over_motions(
         further = by_owner(scene, nominal.gradient(np.sum(by_coefficients, axis=0)))
         total = {k: by + further[k] for k, by in total.items()}
     return total
-
-
-def followed_by(trajectory: Trajectory, t: np.ndarray, by: ByMotion) -> Followed:
-    """Return how a function of a motion at instants t (n,), s, follows the bodies."""
-    found = trajectory.followed(t, by.unknowns, by.motion)
-    bodies = [add_integrals(a, own) for a, own in zip(found.bodies, by.bodies, strict=True)]
-    return replace(found, bodies=bodies)
 
 
 class ComplianceResponse(MotionResponse):
