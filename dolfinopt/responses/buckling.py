@@ -236,7 +236,7 @@ def _gradient_of_arm(
     """Differentiate by what one design's K0 is made of (collective on the arm's ranks)."""
     counted = [(one, by) for one, by in zip(found, weights, strict=True) if by.any()]
     if not counted:
-        return ArmGradient([], None, Products())
+        return ArmGradient([], None, (Products(),))
     modes = np.concatenate([one.modes.field for one, _ in counted], axis=2)
     mu = np.concatenate([one.modes.inverse for one, _ in counted])
     by_mu = np.concatenate([by for _, by in counted])
@@ -258,7 +258,7 @@ def _gradient_of_arm(
         interfaces=partial(_at_interfaces, one, pair),
         prestress=one,
     )
-    return ArmGradient(by_loads, one.through, beside)
+    return ArmGradient(by_loads, one.through, (beside,))
 
 
 def _at_interfaces(gradient: PrestressGradient, pair: Pair) -> tuple[np.ndarray, np.ndarray]:

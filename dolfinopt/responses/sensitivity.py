@@ -55,7 +55,6 @@ def exact_gradient(
     cotangents: ShapeIntegrals,
     displaced: DisplacementGradient | None = None,
     by: By = by_design,
-    beside: Products | None = None,
 ) -> np.ndarray:
     """Return the derivative by the design of one arm of a function of its floating body.
 
@@ -68,14 +67,12 @@ def exact_gradient(
         cotangents: the function's derivatives by the body's integrals; those by D join K's.
         displaced: its derivatives by displacements, where it depends on these, too.
         by: what it is the derivative by.
-        beside: what the function depends on beside body and displacements, these held.
 
     Returns:
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        found = _body_products(state, cotangents, displaced)
-        return by(state, found if beside is None else found + beside)
+        return by(state, _body_products(state, cotangents, displaced))
 
 
 def _body_products(

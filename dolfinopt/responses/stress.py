@@ -324,12 +324,11 @@ class Stress(Response):
                 state = analysis.designs[k]
                 by_u, beside = _by_displacements(one, state)
                 if self.options.gradient == "esl":
-                    beside += _frozen_loads(one, state, by_u)
-                    parts[k] = ArmGradient([], None, beside)
+                    parts[k] = ArmGradient([], None, (beside, _frozen_loads(one, state, by_u)))
                 else:
                     with analysis.profile.phase("gradient"):
                         displaced = one.points.fields.gradient(summed(one.loads), by_u)
-                    parts[k] = ArmGradient(one.by_loads(displaced.by_a), displaced, beside)
+                    parts[k] = ArmGradient(one.by_loads(displaced.by_a), displaced, (beside,))
         return [through_motions(analysis, parts)]
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> PointStress:
@@ -482,12 +481,12 @@ class ArmGradient:
     Attributes:
         by_loads: of every arm that has the design, along every motion; none where no load counts.
         displaced: by displacements, whose coefficients these loads are; None where none counts.
-        beside: by the design itself.
+        beside: by the design itself, the sum of what these carry.
     """
 
     by_loads: Sequence[ByLoads]
     displaced: DisplacementGradient | None
-    beside: Products
+    beside: tuple[Products, ...]
 
 
 def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> CellGradient:
@@ -508,11 +507,10 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
     row = {}
     with together(partition.world):
         for k, one in mine.items():
+            by = [analysis.by(designs[k], each) for each in one.beside]
             if k in by_body:
-                by = by_body[k], one.displaced, analysis.by, one.beside
-                row[k] = exact_gradient(designs[k], *by)
-            else:
-                row[k] = analysis.by(designs[k], one.beside)
+                by.append(exact_gradient(designs[k], by_body[k], one.displaced, analysis.by))
+            row[k] = np.sum(by, axis=0)
     return row
 
 
