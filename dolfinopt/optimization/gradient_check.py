@@ -192,7 +192,7 @@ def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float
     for one, own in zip(motions_of(trajectory), motions_of(base), strict=True):
         seen = part.seen(own)
         values.append(part.value_at(one.at(seen.t), part.load_cases(seen)))
-    return part.combine(trajectory.scene, values)[0] if trajectory.scenarios else values[0]
+    return part.combine(trajectory.scene, values)[0]
 
 
 def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:

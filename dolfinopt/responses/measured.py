@@ -22,10 +22,6 @@ RICHER_RATIO = 2
 TRIED_COORDINATES_LIMIT = 48  # of an arm
 TIME_ERROR_SHARE = 0.03  # of the tolerance, that time steps may add to a motion
 
-# -- sensitivity: directions of loads --------------------------------------------------------
-
-LOAD_CASES_RANK_SHARE = 1e-14  # of the largest direction: less is the rounding of its sums
-
 # -- stress: p-mean and screening ------------------------------------------------------------
 
 P_MEAN_STRIDE = 2  # of the coarse instants every second one makes up the p-mean

@@ -176,17 +176,17 @@ class MotionResponse(Response):
 
     def of_trajectory(self, trajectory: Trajectory) -> tuple[float, float]:
         """Return true and smooth value of a motion, or of its scenarios together (root only)."""
-        scenarios = trajectory.scenarios
-        if not scenarios:
-            return self.extreme(trajectory), self.of_motion(trajectory)
-        smooth = self.combine(trajectory.scene, [self.of_motion(one) for one in scenarios])[0]
-        true = [self.extreme(one) for one in scenarios]
+        scene, motions = trajectory.scene, motions_of(trajectory)
+        smooth = self.combine(scene, [self.of_motion(one) for one in motions])[0]
+        true = [self.extreme(one) for one in motions]
+        if not self.limited and scene.objective.scenarios == "sum":
+            return combined(scene, true)[0], smooth
+        lower = self.turned
         if self.limited:
-            return min(true) if self.declared.lower else max(true), smooth
-        if trajectory.scene.objective.scenarios == "sum":
-            return combined(trajectory.scene, true)[0], smooth
-        weighted = [s.weight * f for s, f in zip(trajectory.scene.scenarios, true, strict=True)]
-        return min(weighted) if self.turned else max(weighted), smooth
+            lower = self.declared.lower
+        else:
+            true = [s.weight * f for s, f in zip(scene.scenarios, true, strict=False)] or true
+        return min(true) if lower else max(true), smooth
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the values of the analysis's motion (collective)."""
@@ -220,10 +220,8 @@ class MotionResponse(Response):
 
     def _weights_of_scenarios(self, trajectory: Trajectory) -> list[float]:
         """Return the derivatives of the value by those of `motions_of`."""
-        others = trajectory.scenarios
-        if not others:
-            return [1.0]
-        return self.combine(trajectory.scene, [self.of_motion(one) for one in others])[1]
+        values = [self.of_motion(one) for one in motions_of(trajectory)]
+        return self.combine(trajectory.scene, values)[1]
 
     def _frozen_moments(self, trajectory: Trajectory) -> dict[int, np.ndarray]:
         """Return `load_case_moments` of every design, of all scenarios together."""

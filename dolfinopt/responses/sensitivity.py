@@ -20,7 +20,6 @@ from dolfinopt.fem.geometric_stiffness import GeometricGradient
 from dolfinopt.fem.stress import DisplacementGradient
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, by_modal_loads, mass_partners
 from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
-from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
 from dolfinopt.responses.products import By, Pair, Products, by_design
 
 
@@ -28,7 +27,7 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
     """Return the derivative by the design of one arm with the equivalent static loads frozen.
 
     dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
-    coordinates at most, however many load cases. For the compliance lambda_j = q_j.
+    coordinates, however many load cases. For the compliance lambda_j = q_j.
     Source: Seifried, Moghadasi & Held (2015), eq. (11), doi:10.1016/j.piutam.2015.01.018.
 
     Args:
@@ -40,12 +39,8 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        # By the energy of every coordinate: what is small does not depend on their units.
-        unit = 1.0 / np.sqrt(np.diag(state.basis.stiffness))
-        left, values, right = np.linalg.svd(A / np.outer(unit, unit))
-        keep = values > LOAD_CASES_RANK_SHARE * values[0]
-        V = state.basis.V * unit
-        pair = combine(V, left[:, keep] * -values[keep]), combine(V, right[keep].T)
+        V = state.basis.V
+        pair = combine(V, -A), V
         interfaces = partial(pairs_at_interfaces, state.elastic, (pair,))
         return by(state, Products(stiffness=(pair,), interfaces=interfaces))
 

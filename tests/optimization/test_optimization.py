@@ -145,7 +145,7 @@ def test_a_step_without_a_motion_is_made_shorter(monkeypatch):
         if self.solutions:
             lengths.append(x)
             if len(lengths) <= fails[0]:
-                self.initial_solutions = self.solutions
+                self.start = self.solutions, {}
                 raise ConvergenceError("too weak")
         return tried(self, x)
 
