@@ -171,34 +171,28 @@ def _bar(arm: Arm, fraction: float) -> np.ndarray:
     """Return the densities (n_cells,) of a bar that fills this fraction of an arm's volume."""
     from scipy.optimize import brentq
 
+    away = np.abs(across(arm)).max(axis=1)
+
     def lack(size: float) -> float:
-        return fraction - float(arm.volume_fraction(drawn(arm, "bar", size)))
+        return fraction - float(arm.volume_fraction(filled(arm, size - away)))
 
     size = 0.0 if lack(0.0) <= 0.0 else 1.0 if lack(1.0) >= 0.0 else brentq(lack, 0.0, 1.0)
-    return drawn(arm, "bar", size)
+    return filled(arm, size - away)
 
 
-def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
-    """Return the densities (n_cells,) of a straight member within an arm's box of cells.
+def across(arm: Arm) -> np.ndarray:
+    """Return how far cells are off the axis (n_cells, d - 1), in half sides of an arm's box."""
+    one = arm.scene.arms[arm.places[0]]
+    return (
+        2.0 * arm.mesh.centroid[:, 1:] / np.array([one.height, one.thickness][: arm.mesh.dim - 1])
+    )
+
+
+def filled(arm: Arm, depth: np.ndarray) -> np.ndarray:
+    """Return the densities of cells whose centres lie so deep in material, in half sides.
 
     Cells that its surface cuts are filled in part.
-
-    Args:
-        arm: of cells along, over the height, and of solids over the thickness.
-        kind: "bar": the arm's section times `size`; "tube": walls of `size` half heights, in the
-            plane flanges; "truss": such flanges, and as thick diagonals of 45 degrees between them.
-        size: from 0 to 1, solid.
     """
-    mesh, one = arm.mesh, arm.scene.arms[arm.places[0]]
-    assert one.cells is not None
-    sides = np.array([one.height, one.thickness][: mesh.dim - 1])
-    across = 2.0 * mesh.centroid[:, 1:] / sides
-    away = np.abs(across).max(axis=1)  # of the axis, 1 at the surface
-    inside = size - away if kind == "bar" else size - (1.0 - away)
-    if kind == "truss":
-        phase = np.mod(mesh.centroid[:, 0] / one.height, 2.0)
-        diagonal = 1.0 - 2.0 * np.abs(phase - 1.0)
-        flanges = size - (1.0 - np.abs(across[:, 0]))
-        inside = np.maximum(flanges, 0.5 * size - np.abs(across[:, 0] - diagonal) / np.sqrt(2.0))
-    cell = 2.0 / min(one.cells[1:])  # in half heights
-    return mesh.keep(np.clip(0.5 + inside / cell, arm.scene.design.minimum, 1.0))
+    cells = arm.scene.arms[arm.places[0]].cells
+    assert cells is not None
+    return arm.mesh.keep(np.clip(0.5 + 0.5 * depth * min(cells[1:]), arm.scene.design.minimum, 1.0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -433,7 +434,10 @@ class DriveResponse(MotionResponse):
 
     Attributes:
         drives: numbers of those of the scene's drives that count; None: all.
+        weighs_limits: whether a limit, too, is of the weighted forces.
     """
+
+    weighs_limits: ClassVar[bool] = True
 
     def __init__(
         self, options: Objective, limited: bool = False, drives: tuple[int, ...] | None = None
@@ -444,13 +448,16 @@ class DriveResponse(MotionResponse):
 
     def quantity(self, trajectory: Trajectory) -> np.ndarray:
         """Return the forces of the drives that count, N and N m, times their weights."""
-        scene = trajectory.scene
-        return trajectory.joint_forces[:, self._columns(scene)] * self._weights(scene)
+        columns, weights = self._counted(trajectory.scene)
+        return trajectory.joint_forces[:, columns] * weights
 
     def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
-        by, scene = np.zeros_like(trajectory.joint_forces), trajectory.scene
-        by[np.ix_(cases.indices, self._columns(scene))] = by_y * self._weights(scene)
+        by, (columns, weights) = (
+            np.zeros_like(trajectory.joint_forces),
+            self._counted(trajectory.scene),
+        )
+        by[np.ix_(cases.indices, columns)] = by_y * weights
         by_rates, by_motion, bodies = trajectory.drive_forces.gradient(by)
         own = [integrals_of(one) for one in bodies]
         return ByMotion(by_rates[:, cases.indices], own, by_motion[:, cases.indices])
@@ -459,17 +466,16 @@ class DriveResponse(MotionResponse):
         """Return the numbers of the drives that count."""
         return tuple(range(len(scene.driven))) if self.drives is None else self.drives
 
-    def _columns(self, scene: Scene) -> np.ndarray:
-        """Return their columns among all rigid coordinates."""
-        every = np.arange(len(scene.rigid_units))[scene.driven_columns]
-        return every[list(self.counted(scene))]
+    def _counted(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        """Return their columns among all rigid coordinates, and weights, 1/N and 1/(N m).
 
-    def _weights(self, scene: Scene) -> np.ndarray:
-        """Return their weights, 1/N and 1/(N m): 1 of each by default."""
-        given = self.options.effort_weights
-        if given is None:
-            return np.ones(len(self.counted(scene)))
-        return np.array(given)[list(self.counted(scene))]
+        These are 1 by default.
+        """
+        drives, given = list(self.counted(scene)), self.options.effort_weights
+        columns = np.arange(len(scene.rigid_units))[scene.driven_columns][drives]
+        if given is None or (self.limited and not self.weighs_limits):
+            return columns, np.ones(len(drives))
+        return columns, np.array(given)[drives]
 
 
 @response("effort")
@@ -498,6 +504,8 @@ class PeakForce(DriveResponse):
     What drives must be able to give. As objective the sum over the drives, each times its weight of
     `objective.effort_weights`.
     """
+
+    weighs_limits = False
 
     def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of those drives that have a limit, and these limits."""
@@ -530,7 +538,3 @@ class PeakForce(DriveResponse):
         sizes = np.abs(y[:, 0])
         _, by = p_norm(sizes, self.options.exponent, weights / weights.sum())
         return np.sign(y) * by[:, None]
-
-    def _weights(self, scene: Scene) -> np.ndarray:
-        """Return the weights of an objective; a limit is of the forces themselves."""
-        return np.ones(len(self.counted(scene))) if self.limited else super()._weights(scene)

@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
-from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
-from dolfinopt.responses.evaluation import decide_stiffening
+from dolfinopt.responses.evaluation import decide_stiffening, moved
 from dolfinopt.responses.measured import (
     RICHER_COORDINATES,
     RICHER_RATIO,
@@ -29,7 +27,7 @@ from dolfinopt.responses.measured import (
     TRIED_COORDINATES_LIMIT,
 )
 from dolfinopt.responses.reductions import RICHER_METHOD, Reductions, fewest
-from dolfinopt.responses.response import bodies_in, factors
+from dolfinopt.responses.response import factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
@@ -178,13 +176,11 @@ class _Comparison:
 
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
-        owned = self.reductions.bodies(bases)
-        (scene, *others), kept = self.scenes, list[Trajectory]()
+        owned, kept = self.reductions.bodies(bases), list[Trajectory]()
 
         def move() -> None:
-            kept.append(simulate(scene, chain_of(scene, owned), self.profile))
-            for one in others:
-                kept.append(simulate(one, bodies_in(scene, one, owned), self.profile))
+            first = moved(self.scenes, owned, self.profile)
+            kept.extend([first, *first.scenarios])
 
         on_root(self.partition.world, move)
         return kept
