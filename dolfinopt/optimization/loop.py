@@ -26,7 +26,7 @@ from dolfinopt.optimization.measured import (
     COMPARED_ITERATIONS,
     COORDINATE_RESERVE_FACTOR,
     FROZEN_GAIN,
-    FROZEN_WINDOW,
+    WINDOW,
 )
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
@@ -196,7 +196,7 @@ class _Run:
         self.finished = stop_code(
             self.scene, one.iteration, last, one.progress, one.best, one.stuck
         )
-        late = self._begins_with_frozen_loads and one.progress.gain(FROZEN_WINDOW) <= FROZEN_GAIN
+        late = self._begins_with_frozen_loads and one.progress.gain(WINDOW // 2) <= FROZEN_GAIN
         return late or self.finished is not None
 
     @property

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.optimization.measured import (
-    FREE_SET_ROUNDS,
     ROOM_SHARE,
     TRIAL_STEP_SHARE,
 )
@@ -81,7 +80,7 @@ def kkt_residual(
     g0 = g0 / scale
     slack = np.maximum(-f, 0.0)
     best, inside = Residual(np.inf, np.zeros(f.size)), roomy
-    for _ in range(FREE_SET_ROUNDS):
+    while True:
         count = max(1, np.count_nonzero(inside | roomy))
         found = _multipliers(g0, g, inside, slack / np.sqrt(count))
         L = g0 + found @ g
@@ -96,11 +95,9 @@ def kkt_residual(
         moved = np.where(movable, g0, 0.0)
         rms = float(np.sqrt(own / (moved @ moved))) if moved.any() else np.inf
         if rms < best.rms:
-            best = Residual(rms, found, scale)
-        if f.size == 0 or (moving == inside).all():
-            break
-        inside = moving
-    return best
+            best, inside = Residual(rms, found, scale), moving
+        else:
+            return best
 
 
 def _multipliers(

@@ -40,9 +40,7 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
     """
     with state.elastic.profile.phase("gradient"):
         V = state.basis.V
-        pair = combine(V, -A), V
-        interfaces = partial(pairs_at_interfaces, state.elastic, (pair,))
-        return by(state, Products(stiffness=(pair,), interfaces=interfaces))
+        return by(state, of_pairs(state.elastic, ((combine(V, -A), V),)))
 
 
 def exact_gradient(
@@ -175,6 +173,17 @@ def pairs_at_interfaces(
     return rigid, np.zeros_like(elastic.points)
 
 
+def of_pairs(
+    elastic: ElasticArm,
+    stiffness: tuple[Pair, ...],
+    mass: tuple[Pair, ...] = (),
+    direct: tuple[Pair, ...] = (),
+) -> Products:
+    """Return what pairs of fields that T makes carry, see `pairs_at_interfaces`."""
+    interfaces = partial(pairs_at_interfaces, elastic, stiffness, mass, direct)
+    return Products(stiffness, mass, interfaces=interfaces)
+
+
 def tip_gradient(
     state: DesignState, left: np.ndarray, right: np.ndarray, by: By = by_design
 ) -> np.ndarray:
@@ -191,9 +200,7 @@ def tip_gradient(
     fields = state.elastic.static_fields(np.hstack([right, left]))
     with state.elastic.profile.phase("gradient"):
         of_left, of_right = (combine(fields.field, fields.amplitudes(f)) for f in (-left, right))
-        pairs = ((of_left, of_right),)
-        interfaces = partial(pairs_at_interfaces, state.elastic, pairs)
-        return by(state, Products(stiffness=pairs, interfaces=interfaces))
+        return by(state, of_pairs(state.elastic, ((of_left, of_right),)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +227,7 @@ def period_gradient(
     with state.elastic.profile.phase("gradient"):
         weighted = modes.field * by_values
         pairs = ((weighted, modes.field),), ((weighted * -modes.values, modes.field),)
-        interfaces = partial(pairs_at_interfaces, state.elastic, *pairs)
-        own = by(state, Products(*pairs, interfaces=interfaces))
+        own = by(state, of_pairs(state.elastic, *pairs))
         carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
         return PeriodGradient(own, carried)
 

@@ -23,7 +23,7 @@ from dolfinopt.responses.measured import (
     BOUND_BATCH_INSTANTS,
     COARSE_INSTANTS,
     MAP_ERROR_SHARE,
-    P_MEAN_STRIDE,
+    NEGLIGIBLE_POWER_SHARE,
 )
 from dolfinopt.responses.motion import motions_of, over_motions
 from dolfinopt.responses.products import Products, StressProduct
@@ -35,7 +35,7 @@ from dolfinopt.responses.response import (
     factors,
     response,
 )
-from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
+from dolfinopt.responses.sensitivity import exact_gradient, of_pairs
 from dolfinopt.scene.load import Scene
 
 # -- von Mises stress at the element centres of one design, relaxed for intermediate density -----
@@ -191,17 +191,19 @@ class ArmLoads:
         motion: number among `motions_of`.
         coefficients: (n, q + 7 + 2 q) of modes and loads, see `LoadFields.split`.
         stiffer: Young's modulus in the motion's scene over the nominal one.
+        instants: (n,) of the motion.
     """
 
     place: int
     motion: int
     coefficients: np.ndarray
     stiffer: float
+    instants: np.ndarray
 
-    @property
-    def summed(self) -> np.ndarray:
-        """Evenly spaced instants (k,) that make up the p-mean."""
-        return every(len(self.coefficients))[::P_MEAN_STRIDE]
+    def at(self, chosen: np.ndarray) -> ArmLoads:
+        """Return those at some of the instants."""
+        own = self.coefficients[chosen], self.instants[chosen]
+        return replace(self, coefficients=own[0], instants=own[1])
 
 
 def every_instant(loads: Sequence[ArmLoads]) -> np.ndarray:
@@ -217,7 +219,7 @@ def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[Arm
             if owner is not None:
                 stiffer = motion.scene.material_of(owner).modulus / scene.material_of(owner).modulus
                 a = _coefficients(scene, motion, place)
-                found[owner].append(ArmLoads(place, number, a, stiffer))
+                found[owner].append(ArmLoads(place, number, a, stiffer, np.arange(len(a))))
     return found
 
 
@@ -323,11 +325,13 @@ class Stress(Response):
             for k, one in found.items():
                 state = analysis.designs[k]
                 by_u, beside = _by_displacements(one, state)
-                if self.options.gradient == "esl":
+                if not len(every_instant(one.loads)):
+                    parts[k] = ArmGradient([], None, (replace(beside, stress=None),))
+                elif self.options.gradient == "esl":
                     parts[k] = ArmGradient([], None, (beside, _frozen_loads(one, state, by_u)))
                 else:
                     with analysis.profile.phase("gradient"):
-                        displaced = one.points.fields.gradient(summed(one.loads), by_u)
+                        displaced = one.points.fields.gradient(every_instant(one.loads), by_u)
                     parts[k] = ArmGradient(one.by_loads(displaced.by_a), displaced, (beside,))
         return [through_motions(analysis, parts)]
 
@@ -355,30 +359,33 @@ class Stress(Response):
 
         by_owner: dict[int, list[ArmLoads]] = on_root(world, loads)
         points: dict[int, PointStress] = {}
-        largest = 0.0
+        screened: dict[int, list[Screened]] = {}
         with together(world):
             for k, state in analysis.designs.items():
                 fields = state.load_fields_of(every_instant(by_owner[k]))
-                points[k] = self.points_of(k, state, fields)
+                points[k] = own = self.points_of(k, state, fields)
                 with analysis.profile.phase("stress"):
-                    for one in by_owner[k]:
-                        a = points[k].coefficients(one)
-                        largest = max(largest, screen(partition.comm, points[k].A, a).largest)
-        largest = world.allreduce(largest, MPI.MAX)
-        sums = {}
+                    screened[k] = [
+                        screen(partition.comm, own.A, own.coefficients(one)) for one in by_owner[k]
+                    ]
+        each = [one for own in screened.values() for one in own]
+        largest = world.allreduce(max((one.largest for one in each), default=0.0), MPI.MAX)
+        # The largest of all may lie between the instants that are summed.
+        summed = world.allreduce(max((one.summed.max() for one in each), default=0.0), MPI.MAX)
+        cut, sums = NEGLIGIBLE_POWER_SHARE ** (1.0 / p) * summed, {}
+        counts = {k: sum(len(one.summed) for one in own) for k, own in screened.items()}
         with together(world), analysis.profile.phase("stress"):
             for k, one in points.items():
-                a = summed(by_owner[k]) @ one.fields.to_columns
+                pairs = zip(by_owner[k], screened[k], strict=True)
+                by_owner[k] = [
+                    loads.at(found.counted[found.summed >= cut]) for loads, found in pairs
+                ]
+                a = every_instant(by_owner[k]) @ one.fields.to_columns
                 total = one.power_sum(a, largest, p) if largest else 0.0
-                sums[k] = np.array([total, one.weights.sum() * len(a)])
+                sums[k] = np.array([total, one.weights.sum() * counts[k]])
         total, weight = sum_over_arms(partition, sums)
         found = PowerSum(largest, float(total), float(weight), p)
-        return {k: StressedDesign(one, by_owner[k], found) for k, one in points.items()}
-
-
-def summed(loads: Sequence[ArmLoads]) -> np.ndarray:
-    """Return the coefficients (k, m) of the instants of all motions that make up the p-mean."""
-    return np.concatenate([one.coefficients[one.summed] for one in loads])
+        return {k: StressedDesign(one, by_owner[k], counts[k], found) for k, one in points.items()}
 
 
 @dataclass(frozen=True)
@@ -406,24 +413,32 @@ class PowerSum:
 
 @dataclass(frozen=True, eq=False)
 class StressedDesign:
-    """What is known of one design: stress at its points, its loads, sums of all designs."""
+    """What is known of one design: stress at its points, and what is summed.
+
+    Attributes:
+        points: of the design.
+        loads: of the instants that count, of how many.
+        sums: of all designs.
+    """
 
     points: PointStress
     loads: Sequence[ArmLoads]
+    count: int
     sums: PowerSum
 
     def by_loads(self, by_a: np.ndarray) -> list[ByLoads]:
-        """Return derivatives by `summed` (k, m), dealt out to the motions."""
-        ends = np.cumsum([len(one.summed) for one in self.loads])[:-1]
+        """Return derivatives by all coefficients (k, m), dealt out to the motions."""
+        ends = np.cumsum([len(one.instants) for one in self.loads])[:-1]
         return [
-            ByLoads(one.motion, one.place, one.summed, by)
+            ByLoads(one.motion, one.place, one.instants, by)
             for one, by in zip(self.loads, np.split(by_a, ends), strict=True)
+            if len(by)
         ]
 
 
 def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.ndarray, Products]:
     """Differentiate by displacements of one arm, and by what else its stress is made of."""
-    points, sums, a = found.points, found.sums, summed(found.loads)
+    points, sums, a = found.points, found.sums, every_instant(found.loads)
     by, by_logs = np.zeros((*points.A.shape[:2], len(a))), np.zeros(len(points.weights))
     by_weights = np.zeros_like(by_logs)
     with state.elastic.profile.phase("stress"):
@@ -437,7 +452,7 @@ def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.nda
             # Of total / weight, to the power 1 / p: a point's part in either is its weight
             # times a sum.
             np.divide(by_logs, points.weights, out=by_weights, where=counts)
-            by_weights -= sums.smooth / sums.weight * len(a)
+            by_weights -= sums.smooth / sums.weight * found.count
             by_weights *= counts / p
         by_u, beside = points.through(state, a, by, by_logs, by_weights)
     return by_u, beside
@@ -448,10 +463,9 @@ def _frozen_loads(found: StressedDesign, state: DesignState, by_u: np.ndarray) -
     # With K u_n = f_n held, dJ = -sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n.
     arm = state.elastic
     with arm.profile.phase("gradient"):
-        u = found.points.fields.displacements(summed(found.loads))
+        u = found.points.fields.displacements(every_instant(found.loads))
         pairs = ((-arm.static_response(*arm.restrict(by_u)), u),)
-        interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((by_u, u),))
-        return Products(stiffness=pairs, interfaces=interfaces)
+        return of_pairs(arm, pairs, direct=((by_u, u),))
 
 
 # -- gradients of functions of the loads of arms along motions -----------------------------------
@@ -529,11 +543,16 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
 
 @dataclass(frozen=True)
 class Screened:
-    """The largest |A_e a_n| of all, its instant n, and point e on this rank, -1 on others."""
+    """The largest |A_e a_n| of all, its instant n, and point e on this rank, -1 on others.
+
+    And the largest at every second one of the evenly spaced instants, which may be summed.
+    """
 
     largest: float
     instant: int
     point: int
+    counted: np.ndarray
+    summed: np.ndarray
 
 
 def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> Screened:
@@ -555,7 +574,8 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> Screened:
             break
         values[batch] = _largest_by_instant(comm, A, a[batch])
     instant = int(values.argmax())
-    return Screened(float(values[instant]), instant, _point_of(comm, A, a[instant]))
+    point, counted = _point_of(comm, A, a[instant]), coarse[::2]
+    return Screened(float(values[instant]), instant, point, counted, values[counted])
 
 
 def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,10 +24,10 @@ from dolfinopt.responses.stress import (
     CellStress,
     arm_loads,
     cell_stress,
+    every_instant,
     maxima,
     motions_of,
     screen,
-    summed,
 )
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.load import scene_from_dict
@@ -300,7 +300,7 @@ def test_gradient_with_frozen_loads() -> None:
         # K u of every instant.
         loads[k] = [
             state.elastic.restrict(state.elastic.stiffness_times((fields @ a)[:, :, None]))
-            for a in summed(each.loads)
+            for a in every_instant(each.loads)
         ]
         assert part is not None
 
