@@ -31,7 +31,6 @@ from dolfinopt.responses.stress import (
     PointStress,
     Stress,
     arm_loads,
-    every,
     every_instant,
     maxima,
     motions_of,
@@ -134,7 +133,7 @@ class CornerStress(PointStress):
 
     def peak(self, a: np.ndarray, t: np.ndarray, chosen: np.ndarray) -> Peak:
         """Return the largest stress of the chosen points, instants t (n,) and coefficients a."""
-        largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
+        largest = screen(MPI.COMM_SELF, self.A[:, chosen], a)
         place = tuple(map(float, self.places[chosen][largest.point]))
         return Peak(largest.largest, place, float(t[largest.instant]))
 
