@@ -345,7 +345,7 @@ def _stated(
     found, shapes = np.zeros(len(centroid), dtype=bool), []
     for one in arm.regions:
         if one.kind == kind and one.depth is None:
-            for mirror in (1.0, -1.0) if arm.symmetric else (1.0,):
+            for mirror in (1.0, -1.0) if arm.symmetric_about[0] else (1.0,):
                 found |= one.covers(centroid[:, 0], mirror * centroid[:, 1])
                 shapes.append(Region([_shape(one, mirror)]))
     if kind == "solid" and arm.cells is None and arm.solid_ends > 0.0:
@@ -530,7 +530,7 @@ def domain_of(
         grid=None if entry.cells is None else entry.cells[:2],
         length=entry.length,
         thickness=entry.thickness,
-        symmetric=like.symmetric,
+        symmetric=like.symmetric_about[0],
         minimum_member=scene.part.minimum_member or scene.design.minimum_member,
     )
 

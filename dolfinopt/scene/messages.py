@@ -25,7 +25,8 @@ from dolfinopt.scene.tables.base import (
     without_none,
 )
 from dolfinopt.scene.tables.closures import as_written
-from dolfinopt.scene.tables.material import Material, check_material
+from dolfinopt.scene.tables.joints import DRIVE_KEYS
+from dolfinopt.scene.tables.material import Material, check_material, material_keys
 from dolfinopt.scene.tables.responses import need_of
 
 _COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
@@ -256,12 +257,21 @@ def arm_name(tree: dict[str, Any], index: Any, table: str = "arms") -> str | Non
 
 
 class KeyInfo(NamedTuple):
-    """One key of a scene as documentation lists it; `default` is "" where there is none."""
+    """One key of a scene as documentation lists it.
+
+    Attributes:
+        key: dotted.
+        allowed: in words.
+        default: "" where there is none.
+        description: meaning and unit.
+        also: other tables that take the key with the same meaning.
+    """
 
     key: str
     allowed: str
     default: str
     description: str
+    also: tuple[str, ...] = ()
 
 
 def describe_keys() -> list[KeyInfo]:
@@ -271,13 +281,30 @@ def describe_keys() -> list[KeyInfo]:
 
 def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
     for key, field in model.model_fields.items():
-        below = table_in(field.annotation)
+        below, path = table_in(field.annotation), f"{prefix}{key}"
         if below is not None:
-            yield from _describe(below, f"{prefix}{key}.")
-            continue
-        default = "" if field.is_required() else shown(field.default)
-        default = "none" if default == "None" else default
-        yield KeyInfo(f"{prefix}{key}", allowed_words(field), default, str(field.description))
+            yield from _describe(below, f"{path}.")
+        elif not is_explained_elsewhere(path):
+            default = "" if field.is_required() else shown(field.default)
+            default = "none" if default == "None" else default
+            also = tuple(one for one in ("arms", "joints") if _explains(path, f"{one}.{key}"))
+            told = allowed_words(field), default, str(field.description)
+            yield KeyInfo(path, *told, also)
+
+
+def is_explained_elsewhere(path: str) -> bool:
+    """Return whether a key means what that of another table means, where it is explained.
+
+    Arms state their own material, and [[joints]] the drives that arms state in the plane.
+    """
+    table, _, key = path.rpartition(".")
+    return (table == "arms" and key in material_keys()) or (table == "joints" and key in DRIVE_KEYS)
+
+
+def _explains(path: str, other: str) -> bool:
+    """Return whether what one key means is told at another one."""
+    place = {"arms": "material", "joints": "arms"}[other.partition(".")[0]]
+    return path.rpartition(".")[0] == place and is_explained_elsewhere(other)
 
 
 # -- what is possible in a scene, but hardly meant: a sentence each, told before the run ---------
@@ -309,17 +336,11 @@ def implausible(scene: Scene) -> list[str]:
 
 
 def _old_words(scene: Scene) -> list[str]:
-    """Tell words that are translated, and keys that are read without effect."""
-    keys = sorted({"integrator", "rho_inf"} & scene.simulation.model_fields_set)
-    return [
-        *scene.old_words,
-        *(
-            f"simulation.{key} is read without effect: every motion is integrated by Radau IIA, "
-            "see simulation.tolerance"
-            for key in keys
-            if key == "rho_inf" or scene.simulation.integrator != "radau"
-        ),
-    ]
+    """Tell older words, in one line."""
+    if not scene.old_words:
+        return []
+    rewrite = f"dolfinopt keys --upgrade {scene.source} rewrites the scene"
+    return [f"older words: {'; '.join(scene.old_words)}; {rewrite}"]
 
 
 def _materials(scene: Scene) -> list[str]:

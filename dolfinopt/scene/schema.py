@@ -21,10 +21,10 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
-from dolfinopt.scene.tables.closures import Closures, closing_site
+from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
-from dolfinopt.scene.tables.joints import interface_number
+from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
 from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
@@ -226,23 +226,16 @@ class Scene(Table):
     @property
     def end_effector(self) -> tuple[int, int]:
         """Return the arm that carries the payload and the number of its interface, 0 outboard."""
-        names = [arm.name for arm in self.arms]
-        arm = len(names) - 1 if self.payload.arm is None else names.index(self.payload.arm)
-        return arm, interface_number(self.arms[arm], self.payload.interface) or 0
+        return place_of(self, self.payload.arm or self.arms[-1].name) or (len(self.arms) - 1, 0)
 
     @property
     def used_interfaces(self) -> frozenset[tuple[int, int]]:
         """Return the interfaces, as of `end_effector`, of joints, forces and the payload."""
-        index = {arm.name: i for i, arm in enumerate(self.arms)}
-        found = {self.end_effector}
-        for force in self.forces:
-            if (k := index.get(force.arm)) is not None:
-                found.add((k, interface_number(self.arms[k], force.interface) or 0))
-        for joint in self.joints:
-            if (k := index.get(joint.parent)) is not None:
-                found.add((k, interface_number(self.arms[k], joint.parent_interface) or 0))
-        ends = [closing_site(self, one, which) for one in self.closures for which in (0, 1)]
-        return frozenset(found).union(end for end in ends if end is not None)
+        sites = [force.arm for force in self.forces]
+        sites += [joint.parent for joint in self.joints]
+        sites += [end for one in self.closures for end in one.between]
+        places = {place_of(self, site) for site in sites}
+        return frozenset({self.end_effector, *(place for place in places if place is not None)})
 
     @property
     def dependent_joints(self) -> int:
@@ -380,6 +373,11 @@ FILE_KEYS = tuple(
 )
 
 
+def file_in(key: str, value: str) -> bool:
+    """Return whether the value of one of `FILE_KEYS` is a file, not a word as "tube" is."""
+    return key != "section" or Path(value).suffix != ""
+
+
 # -- the keys of a scene as JSON schema, from which editors complete and check scene files -------
 
 SCHEMA_FILE = "dolfinopt.schema.json"
@@ -448,7 +446,8 @@ def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], 
         node = data.get(table)
         rows = node if isinstance(node, list) else [node]
         for k, row in enumerate(rows):
-            if isinstance(row, dict) and isinstance(row.get(key), str):
+            value = row.get(key) if isinstance(row, dict) else None
+            if isinstance(value, str) and file_in(key, value):
                 name = f"{table}.{k}.{key}" if isinstance(node, list) else f"{table}.{key}"
                 yield name, row, key
 

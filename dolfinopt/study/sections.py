@@ -154,7 +154,7 @@ class Members:
             ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive", "pattern",
              "interface_offset")
         )  # fmt: skip
-        row |= {"symmetric": False, "symmetric_z": False, "extruded": False, "regions": []}
+        row |= {"symmetric": False, "extruded": False, "regions": []}
         row |= {"hollow": False, **dict.fromkeys(WALL_KEYS)}
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
@@ -423,7 +423,7 @@ def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
                 f"{scene.source}: arms.{arm.name}.angle: sections: expected 0 in space, found "
                 f"{scene.material_of(index).angle:.4g} rad; the fibres of a member are along it"
             )
-        if arm.flexible and arm.interfaces:
+        if arm.flexible and arm.further_interfaces:
             raise InputError(
                 f"{scene.source}: arms.{arm.name}.interfaces: sections: expected one outboard "
                 "interface, found more; a straight member has one end"

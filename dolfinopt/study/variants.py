@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
+from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.messages import model_at
+from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.tables.responses import DECLARED, unused_options
 
 # Label; kind, and the settings that make it.
@@ -75,10 +77,11 @@ class Vary:
 
 
 def axis_of(key: str) -> str:
-    """Return a key with its unit, "[-]" where it has none."""
-    name = re.sub(r"^(arms)\.[^.]+\.(?=[^.]+$)", r"\1.", key)
-    texts = {info.key: info.description for info in describe_keys()}
-    unit = re.search(r"\[([^\]]*)\]$", texts.get(name, ""))
+    """Return a key with its unit, "[-]" where it has none; "key*" is a factor."""
+    table, *_, name = in_new_words(key).split(".")
+    model = model_at((table,))
+    field = model.model_fields.get(name) if model else None
+    unit = re.search(r"\[([^\]]*)\]$", str(field.description) if field else "")
     return f"{key} [{unit[1] if unit else '-'}]"
 
 
@@ -114,12 +117,16 @@ def changed(scene: Scene, *overrides: str) -> Scene:
 
     InputError where there is no such key, or it does not allow the value.
     """
+    return checked(scene_from_dict(scene.to_tree(), scene.source, overrides))
+
+
+def checked(scene: Scene) -> Scene:
+    """Return the scene, unless its motion or its forces are none."""
     from dolfinopt.dynamics.build import check_forces, check_motion
 
-    other = scene_from_dict(scene.to_tree(), scene.source, overrides)
-    check_motion(other)
-    check_forces(other)
-    return other
+    check_motion(scene)
+    check_forces(scene)
+    return scene
 
 
 @contextmanager
@@ -200,12 +207,11 @@ def reduced(scene: Scene, method: str, coordinates: int) -> Scene:
 
     InputError where the arms have fewer degrees of freedom, or the method needs more coordinates.
     """
-    options = Reduction.model_fields
-    settings = []
-    if scene.reduction.method != method:
-        settings = [f"reduction.{key}={list(options[key].default)}" for key in ("shifts", "band")]
-    settings.append(f"reduction.tolerance={options['tolerance'].default!r}")  # of "auto" alone
-    return changed(scene, f"reduction.method={method}", f"{COORDINATES}={coordinates}", *settings)
+    tree = scene.to_tree()
+    same = scene.reduction.method == method
+    kept = {"frequencies": scene.reduction.frequencies} if same else {}
+    tree["reduction"] = kept | {"method": method, "coordinates": coordinates}
+    return checked(scene_from_dict(tree, scene.source))
 
 
 def reference_scene(scene: Scene) -> Scene:
