@@ -49,7 +49,6 @@ from dolfinopt.output.design import (
     read_design,
 )
 from dolfinopt.output.folders import check_unused, working_alone
-from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
@@ -490,6 +489,8 @@ class Model:
                 neither `resume` nor `overwrite` is set; another run works there.
             ConvergenceError: a simulation failed.
         """
+        from dolfinopt.output.run_folder import optimize, write_result  # with the optimiser
+
         begun, place = time.perf_counter(), None if folder is None else Path(folder)
         partition, arms = self._arms()
         first = None if x0 is None else self._prepared(x0)[2]
@@ -518,6 +519,8 @@ class Model:
         self, result: SimulationResult, folder: str | Path, *, overwrite: bool = False
     ) -> None:
         """Write a result of this scene, see `SimulationResult.save` (collective)."""
+        from dolfinopt.output.run_folder import write_result  # with the optimiser
+
         begun, place = time.perf_counter(), Path(folder)
         check = None if overwrite else partial(check_unused, place)
         partition, arms, x_phys = self._prepared(result)

@@ -45,7 +45,7 @@ class Scene(Table):
         description="title of the scene; default: the file's name without extension [-]"
     )
     material: Material = Field(description="the solid material")
-    interpolation: Interpolation = Field(default=Interpolation(), description="material law")
+    interpolation: Interpolation = Field(default_factory=Interpolation, description="material law")
     arms: tuple[Arm, ...] = Field(description="arms from the cart outwards")
     joints: tuple[Joint, ...] = Field(
         default=(),
@@ -62,7 +62,8 @@ class Scene(Table):
         "motion exactly",
     )
     feed_forward: FeedForward = Field(
-        default=FeedForward(), description="corrections of joints that keep the tip on its path"
+        default_factory=FeedForward,
+        description="corrections of joints that keep the tip on its path",
     )
     closures: tuple[Closures, ...] = Field(
         default=(),
@@ -76,14 +77,16 @@ class Scene(Table):
     forces: tuple[Force, ...] = Field(
         default=(), description="given forces on interfaces of arms; none without this table"
     )
-    damping: Damping = Field(default=Damping(), description="structural damping")
-    reduction: Reduction = Field(default=Reduction(), description="model reduction")
-    simulation: Simulation = Field(default=Simulation(), description="time integration")
-    objective: Objective = Field(default=Objective(), description="what is minimised")
-    constraints: Constraints = Field(default=Constraints(), description="limits besides the volume")
-    design: Design = Field(default=Design(), description="design variables")
-    optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
-    part: Part = Field(default=Part(), description="parts for the workshop")
+    damping: Damping = Field(default_factory=Damping, description="structural damping")
+    reduction: Reduction = Field(default_factory=Reduction, description="model reduction")
+    simulation: Simulation = Field(default_factory=Simulation, description="time integration")
+    objective: Objective = Field(default_factory=Objective, description="what is minimised")
+    constraints: Constraints = Field(
+        default_factory=Constraints, description="limits besides the volume"
+    )
+    design: Design = Field(default_factory=Design, description="design variables")
+    optimizer: Optimizer = Field(default_factory=Optimizer, description="optimiser")
+    part: Part = Field(default_factory=Part, description="parts for the workshop")
     scenarios: tuple[Scenario, ...] = Field(
         default=(), description="scenarios that the objective combines; none: the scene itself"
     )

@@ -847,7 +847,6 @@ def _add_material_keys() -> None:
 
 
 _add_material_keys()
-Arm.model_rebuild(force=True)
 
 
 def declare_law(one: LawDeclaration, words: Mapping[str, str]) -> None:

@@ -44,7 +44,10 @@ class Refusal(ValueError):
 class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    # Validators are built at first use, once for the whole scene, not when a table is imported.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True
+    )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Check what this table at `at` and other tables of `scene` must agree on.
