@@ -129,7 +129,7 @@ def part(
     given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip
-    asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
+    asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})
     if asked.optimize and asked.curves == "arcs":  # at once: outlines and meshes take a while
         raise InputError("--optimize: expected splines, not --curves arcs")
     if resume and not asked.optimize:

@@ -56,22 +56,18 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
 
     A process alone finds a wrong key before MPI and the solvers are loaded.
     """
-    from dolfinopt.scene.load import load_scene
+    from dolfinopt.scene.load import read_scene
 
     if alone():
-        load_scene(path, overrides)
+        read_scene(path, overrides)
     world = start()
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
-        from dolfinopt.dynamics.build import check_forces, check_motion
-        from dolfinopt.scene.messages import implausible
+        from dolfinopt.loading import doubts, load_scene
 
         scene = load_scene(path, overrides)
-        check_motion(scene)
-        check_forces(scene)
-        warn(doubts_of_files(scene))
-        warn(implausible(scene))
+        warn(doubts(scene))
         if path.name == "part.toml" and (stale := stale_parts(path.parent)):
             warn([stale])
         return scene
@@ -81,33 +77,6 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     scene = on_root(world, load)
     check_budget(world, scene)
     return world, scene
-
-
-def doubts_of_files(scene: Scene) -> list[str]:
-    """Return what a body from a file lacks that its scene may need, a sentence each.
-
-    Raises:
-        InputError: a file holds no such body.
-    """
-    found = []
-    for index, arm in enumerate(scene.arms):
-        if arm.sid is None:
-            continue
-        from dolfinopt.arms.arm import fixed_body  # not of scenes without files
-
-        body = fixed_body(scene, index)
-        if scene.simulation.stiffening is True and not body.is_stiffened:
-            found.append(
-                f"{arm.sid} holds no geometric stiffness, which simulation.stiffening = true asks "
-                f"for: arm {arm.name!r} is linear"
-            )
-        out_of_plane = body.outboard[2:-1]  # no rows of plane bodies
-        if len(out_of_plane) and not out_of_plane.any():
-            found.append(
-                f"{arm.sid}: its outboard node moves in x and y and turns about z alone; out of "
-                f"that plane arm {arm.name!r} is rigid"
-            )
-    return found
 
 
 def claim(

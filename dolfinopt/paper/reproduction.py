@@ -25,10 +25,10 @@ import pandas as pd
 
 from dolfinopt.data import paper_scene
 from dolfinopt.disk import write_text
-from dolfinopt.dynamics.build import check_motion
+from dolfinopt.loading import load_scene
 from dolfinopt.output.folders import prepare_folder
 from dolfinopt.parallel import on_root, together
-from dolfinopt.scene.load import Scene, load_scene, tomllib
+from dolfinopt.scene.load import Scene, tomllib
 from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
@@ -68,9 +68,7 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
 
     InputError where there is no such key, or it does not allow the value.
     """
-    scene = load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
-    check_motion(scene)
-    return scene
+    return load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
 
 
 def cell_sizes(scene: Scene) -> dict[int, float]:

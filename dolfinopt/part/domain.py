@@ -724,7 +724,7 @@ def _flat_domain(
     if np.ptp(values, axis=1).max() > ROUNDING:
         return None
     plate = box_arm(MPI.COMM_SELF, arm.name, (arm.length, arm.height), arm.cells[:2])
-    thin = arm.model_copy(update={"cells": (*arm.cells[:2], 1)})
+    thin = arm.unchecked_copy({"cells": (*arm.cells[:2], 1)})
     points = np.column_stack([plate.centroid, np.zeros(plate.num_cells)])
     x, smooth, passive, void = values.mean(axis=1)[_grid_places(thin, points)].T
     plate = replace(plate, passive=passive > 0.5, void=void > 0.5)

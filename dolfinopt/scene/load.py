@@ -1,6 +1,6 @@
 """From a TOML file, or plain data, and overrides to a scene.
 
-`load_scene` reads a file, `scene_from_dict` plain data; both return a `Scene` or raise one
+`read_scene` reads a file, `scene_from_dict` plain data; both return a `Scene` or raise one
 `InputError` of one line that names file, key, value and remedy. The keys themselves stand in
 `schema.py` and `tables/`.
 """
@@ -75,8 +75,8 @@ __all__ = [
     "Scene",
     "WorstBy",
     "describe_keys",
-    "load_scene",
     "pose_scenarios",
+    "read_scene",
     "resolve_file",
     "scene_from_dict",
 ]
@@ -96,7 +96,7 @@ NAMED: dict[str, type[Table]] = {
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
-def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
+def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
     """Read, complete and validate the scene file `path` (TOML, UTF-8).
 
     `overrides` are strings "key.path=value" as given to --set. The value is read as TOML, or else
@@ -116,7 +116,7 @@ def scene_from_dict(
 ) -> Scene:
     """Complete and validate a scene given as nested dictionaries and lists, left unchanged.
 
-    `source` stands for the file in messages; `overrides` as in `load_scene`.
+    `source` stands for the file in messages; `overrides` as in `read_scene`.
 
     Raises:
         InputError: one line that names source, key, value and what is allowed.

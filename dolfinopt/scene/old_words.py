@@ -130,7 +130,10 @@ OLD_KEYS = {word.old for word in OLD_WORDS}
 
 def in_new_words(key: str) -> str:
     """Return a dotted key in the words of now, as --set takes it; one of now as it is."""
-    table, *which, name = closures.in_new_words(key).split(".")
+    key = closures.in_new_words(key)
+    if "." not in key:
+        return key
+    table, *which, name = key.split(".")
     word = next((one for one in OLD_WORDS if one.old == f"{table}.{name}"), None)
     if word is not None and (found := re.fullmatch(r"[a-z]+\.([a-z_]+)( times it)?", word.new)):
         name = found[1] + ("*" if found[2] else "")

@@ -318,7 +318,7 @@ class Scene(Table):
         elif own["kind"] not in (None, solid.kind):
             solid = Material.model_construct(**dict.fromkeys(own))
         given = {key: value for key, value in own.items() if value is not None}
-        return solid.model_copy(update=given)
+        return solid.unchecked_copy(given)
 
     @property
     def without_strength(self) -> dict[str, str]:

@@ -540,7 +540,7 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
 
 def _unnamed(case: Case) -> Scene:
     """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
-    return case.scene.model_copy(update={"name": case.key})
+    return case.scene.unchecked_copy({"name": case.key})
 
 
 def _read(case: Case, place: _Place) -> Outcome:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.loading import load_scene
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.messages import model_at
 from dolfinopt.scene.old_words import in_new_words
@@ -117,16 +118,7 @@ def changed(scene: Scene, *overrides: str) -> Scene:
 
     InputError where there is no such key, or it does not allow the value.
     """
-    return checked(scene_from_dict(scene.to_tree(), scene.source, overrides))
-
-
-def checked(scene: Scene) -> Scene:
-    """Return the scene, unless its motion or its forces are none."""
-    from dolfinopt.dynamics.build import check_forces, check_motion
-
-    check_motion(scene)
-    check_forces(scene)
-    return scene
+    return load_scene(scene, overrides)
 
 
 @contextmanager
@@ -211,7 +203,7 @@ def reduced(scene: Scene, method: str, coordinates: int) -> Scene:
     same = scene.reduction.method == method
     kept = {"frequencies": scene.reduction.frequencies} if same else {}
     tree["reduction"] = kept | {"method": method, "coordinates": coordinates}
-    return checked(scene_from_dict(tree, scene.source))
+    return scene_from_dict(tree, scene.source)
 
 
 def reference_scene(scene: Scene) -> Scene:

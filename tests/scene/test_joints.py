@@ -10,7 +10,7 @@ from scenes import put_at
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.machine import build_mechanism, rigid_link
-from dolfinopt.scene.load import load_scene, scene_from_dict
+from dolfinopt.scene.load import read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
 
@@ -214,7 +214,7 @@ def test_plane_scenes_have_no_keys_of_space():
     """A tensor, a centre, a length of zero; gravity and the payload's keys: see test_scene."""
     side = "arms.arm1.interfaces=[{name='side', point=[0.5, 0.03, 0], radius=0.01}]"
     for change in ("payload.inertia=[1,1,1,0,0,0]", "payload.offset=[0,0,0.1]", side):
-        refusal(lambda: load_scene(TWO_ARM, [change]), "without [[joints]]")  # noqa: B023
+        refusal(lambda: read_scene(TWO_ARM, [change]), "without [[joints]]")  # noqa: B023
     data = copy.deepcopy(ROBOT)
     del data["joints"]
     data["motion"], data["payload"] = {"path": "arc"}, {"mass": 2.0}
@@ -226,13 +226,13 @@ def test_plane_scenes_have_no_keys_of_space():
 
 def test_coordinates_follow_from_the_interfaces(tmp_path):
     """Six of every outboard interface of a solid arm; in the plane four."""
-    assert load_scene(TWO_ARM).reduction.coordinates == 4
+    assert read_scene(TWO_ARM).reduction.coordinates == 4
     space = TWO_ARM.with_name("spatial_arm.toml")
     text = space.read_text().replace("coordinates = 6 ", "# ")
     path = tmp_path / "arm.toml"  # the demo without its number of coordinates
     path.write_text(text.replace('"spatial_arm.csv"', f'"{space.with_suffix(".csv")}"'))
-    assert "coordinates" not in load_scene(path).to_tree()["reduction"]
+    assert "coordinates" not in read_scene(path).to_tree()["reduction"]
     fork = 'arms.link2.interfaces=[{name="side", point=[0.2, 0.02, 0.0], radius=0.02}]'
     cases = ((6,), (12, fork, "payload.interface=side"), (7, "reduction.coordinates=7"))
     for number, *changes in (*cases, (4, "reduction.method=modal")):
-        assert load_scene(path, changes).reduction.coordinates == number
+        assert read_scene(path, changes).reduction.coordinates == number

@@ -12,7 +12,7 @@ from runs import TWO_ARM
 import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene.load import describe_keys, load_scene, scene_from_dict
+from dolfinopt.scene.load import describe_keys, read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # a hundred small runs
 
@@ -95,7 +95,7 @@ def tree_at(key, value):
     elif table == "closures":
         data["closure"][{"axis": "direction"}.get(name, name)] = [value, value]
     elif name == "cart_mass":
-        base = load_scene(TWO_ARM, ["arms.cells=[8,2]", "simulation.tolerance=0.01"]).to_tree()
+        base = read_scene(TWO_ARM, ["arms.cells=[8,2]", "simulation.tolerance=0.01"]).to_tree()
         data = base | {"control": GAINS, "motion": base["motion"] | {name: value}}
     else:
         data[table][name] = value
@@ -104,7 +104,7 @@ def tree_at(key, value):
 
 def run(overrides):
     """Evaluate a scene's initial design with its gradient and make one design step."""
-    scene = load_scene(TWO_ARM, [*QUICK, *overrides])
+    scene = read_scene(TWO_ARM, [*QUICK, *overrides])
     result = do.optimize(scene, world=MPI.COMM_SELF)
     assert np.isfinite(result.evaluation.objective)
     assert all(np.isfinite(x).all() for x in result.x_phys.values())

@@ -16,7 +16,7 @@ from scenes import put_at
 
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
 from dolfinopt.motion.machine import loops_of
-from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
+from dolfinopt.scene.load import pose_scenarios, read_scene, scene_from_dict
 from dolfinopt.scene.messages import implausible
 
 pytestmark = pytest.mark.serial
@@ -132,8 +132,7 @@ def test_loops_that_cannot_be(kind, tables, words):
 def test_tables_of_forces_that_cannot_be_read(tmp_path, text, words):
     file = tmp_path / "drive.csv"
     file.write_text(text)
-    scene = controlled(f"control.forces={file}")
-    refusal(lambda: check_forces(scene), str(file), *words)
+    refusal(lambda: controlled(f"control.forces={file}"), str(file), *words)
 
 
 def test_a_table_of_forces_adds_to_the_drives_until_it_ends(tmp_path):
@@ -220,7 +219,7 @@ def test_tables_of_applied_forces_need_time_and_columns(tmp_path):
 
 def test_a_wrong_interface_of_a_force_is_told_before_that_the_right_one_is_idle():
     with refused("forces.0.interface", "nose", "lug"):
-        load_scene(ROOT / "demos" / "lifting_arm.toml", ('forces.0.interface="nose"',))
+        read_scene(ROOT / "demos" / "lifting_arm.toml", ('forces.0.interface="nose"',))
 
 
 # -- [[closures]]: what they state, and what is refused  ------------------------------------------
@@ -401,7 +400,7 @@ def test_refused_with_others(tmp_path):
     one = four_bar()["closures"][0] | cross
     with refused("closures.0.cross_axis", "across"):
         closed(tmp_path, TURN, with_keys(four_bar(), {"closures": [one]}))
-    tree = load_scene(TWO_ARM).to_tree()
+    tree = read_scene(TWO_ARM).to_tree()
     end = {"name": "end", "kind": "ball", "between": ["arm2", "ground"]}
     with refused("closures.0.kind", "one pin or slider", "[[joints]]"):
         scene_from_dict(tree | {"closures": [end]})

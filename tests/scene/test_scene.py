@@ -16,8 +16,8 @@ from dolfinopt.scene.load import (
     Arm,
     Scene,
     describe_keys,
-    load_scene,
     pose_scenarios,
+    read_scene,
     scene_from_dict,
 )
 from dolfinopt.scene.messages import implausible
@@ -30,7 +30,7 @@ JOINTS = {"path": "joints", "file": str(TWO_ARM)}
 
 
 def test_demo_holds_the_defaults():
-    demo = load_scene(TWO_ARM)
+    demo = read_scene(TWO_ARM)
     ends = ["arms.passive=0.0", "simulation.stiffening=false"]  # as in the paper
     assert scene_from_dict(minimal(name="two-arm manipulator"), overrides=ends) == demo
     assert demo.source == str(TWO_ARM)
@@ -51,19 +51,19 @@ def test_arm_takes_missing_keys_from_the_arm_before():
 def test_name_defaults_to_the_file_and_windows_files_are_read(tmp_path):
     path = tmp_path / "crane.v2.toml"
     path.write_text(TWO_ARM.read_text().partition("\n")[2])
-    assert load_scene(path).name == "crane.v2"
+    assert read_scene(path).name == "crane.v2"
     assert scene_from_dict(minimal()).name == "scene"
     path.write_bytes(b"\xef\xbb\xbf" + TWO_ARM.read_bytes().replace(b"\n", b"\r\n"))
-    assert load_scene(path) == load_scene(TWO_ARM)
+    assert read_scene(path) == read_scene(TWO_ARM)
 
 
 def test_scene_is_frozen_hashable_and_picklable():
-    scene = load_scene(TWO_ARM)
+    scene = read_scene(TWO_ARM)
     for table, key in ((scene.payload, "mass"), (scene, "name")):
         with pytest.raises(ValidationError, match="frozen"):
             setattr(table, key, 3.0)
-    other = load_scene(TWO_ARM, ["payload.mass=3"])
-    assert len({scene, load_scene(TWO_ARM), other}) == 2
+    other = read_scene(TWO_ARM, ["payload.mass=3"])
+    assert len({scene, read_scene(TWO_ARM), other}) == 2
     restored = pickle.loads(pickle.dumps(scene))
     assert restored == scene and restored.source == scene.source
     one, two = (scene_from_dict(minimal(name="x"), source) for source in ("a.toml", "b.toml"))
@@ -188,10 +188,10 @@ def test_override(override, read, value):
 
 
 def test_later_override_wins():
-    scene = load_scene(TWO_ARM, ["arms.length=0.5", "arms.arm1.length=0.7", "payload.mass=1"])
+    scene = read_scene(TWO_ARM, ["arms.length=0.5", "arms.arm1.length=0.7", "payload.mass=1"])
     assert [arm.length for arm in scene.arms] == [0.7, 0.5]
     assert scene.payload.mass == 1.0
-    scene = load_scene(TWO_ARM, ["arms.1.name=fore arm", "arms.fore arm.length=0.6"])
+    scene = read_scene(TWO_ARM, ["arms.1.name=fore arm", "arms.fore arm.length=0.6"])
     assert scene.arms[1].length == 0.6  # found by its new name
 
 
@@ -465,6 +465,18 @@ def test_value_that_is_shown_otherwise(path, value, shown, allowed):
     assert "more)" not in message
 
 
+def test_a_copy_is_checked_as_a_file_is():
+    scene = read_scene(TWO_ARM)
+    assert scene.model_copy(update={"name": "other"}).source == scene.source
+    for table, values, words in (
+        (scene.payload, {"mass": -1.0}, ["payload: mass = -1.0"]),
+        (scene.payload, {"mas": 1.0}, ["payload: mas"]),
+        (scene.motion, {"horizon": 1.0}, ["motion: horizon", "motion.duration"]),
+        (scene, {"arms": (scene.arms[0],) * 2}, ["arms.1.name", "no other arm"]),
+    ):
+        refusal(lambda: table.model_copy(update=values), *words)  # noqa: B023
+
+
 def test_every_key_refuses_something():
     paths = [*(path for paths, *_ in BAD_VALUES for path in paths.split()), *(s[0] for s in SHOWN)]
     tried = {path.replace("arms.0.", "arms.") for path in paths}
@@ -481,6 +493,9 @@ KRYLOV, BALANCED = {"reduction.method": "krylov"}, {"reduction.method": "balance
 LINE = {"motion.path": "line"}
 SHARED = {"arms.1.design": "arm1"}
 CONTRADICTIONS = [
+    (2, {"arms.0.gear_ratio": 9.0}, "arms.0.gear_ratio", "used only with rotor_inertia"),
+    (2, {"optimizer.exact_iterations": 3, "objective.gradient": "exact"},
+     "optimizer.exact_iterations", "used only with objective.gradient"),
     # changes, the key that is shown, what is allowed
     (2, LINE | {"motion.radius": 2.0}, "motion.radius = 2.0", "1.0, the default, with motion.path"),
     (2, LINE | {"motion.flattening": 0}, "motion.flattening = 0", "1.0, the default"),
@@ -785,8 +800,8 @@ OTHERS = {
 def test_options_that_nothing_uses_are_refused(key):
     value, used = UNUSED[key]
     setting = f"{key}={value}"
-    assert load_scene(TWO_ARM, [*used, setting])
-    text = refusal(lambda: load_scene(TWO_ARM, [*OTHERS.get(key, []), setting]))
+    assert read_scene(TWO_ARM, [*used, setting])
+    text = refusal(lambda: read_scene(TWO_ARM, [*OTHERS.get(key, []), setting]))
     assert (f"{key} = " in text and "default" in text) or "expected none" in text
 
 
@@ -797,8 +812,8 @@ def test_every_option_of_a_response_is_used_by_one():
         assert {*one.options, *one.limit_options} <= tables
     # No volume is shared where none is limited.
     lightest, shared = TWO_ARM.with_name("lightest_two_arm.toml"), "design.shared_volume=true"
-    assert load_scene(lightest, ["design.volume_fraction=0.4", shared]).design.shared_volume
-    refusal(lambda: load_scene(lightest, [shared]), "design.shared_volume = true", "false")
+    assert read_scene(lightest, ["design.volume_fraction=0.4", shared]).design.shared_volume
+    refusal(lambda: read_scene(lightest, [shared]), "design.shared_volume = true", "false")
 
 
 @pytest.mark.parametrize(
@@ -810,5 +825,5 @@ def test_every_option_of_a_response_is_used_by_one():
     ],
 )
 def test_older_words_are_told_in_one_line(change, told):
-    sentences = [one for one in implausible(load_scene(TWO_ARM, change)) if "older" in one]
+    sentences = [one for one in implausible(read_scene(TWO_ARM, change)) if "older" in one]
     assert len(sentences) == bool(told) and all(word in sentences[0] for word in told)

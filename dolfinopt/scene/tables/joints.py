@@ -408,6 +408,13 @@ def check_motor(scene: Scene, index: int) -> None:
             (*at, "rotor_inertia"),
             (*at, "gear_ratio"),
         )
+    rotors = [one.rotor_inertia for one in scene.arms] + [j.rotor_inertia for j in scene.joints]
+    if stated_at(arm, "gear_ratio") and not any(rotors):
+        raise Refusal(
+            "expected none: used only with rotor_inertia, whose turns it counts",
+            ("arms", index, "gear_ratio"),
+            ("arms", index, "rotor_inertia"),
+        )
     if held:
         _check_in_space(arm, at, *held[0])
 
