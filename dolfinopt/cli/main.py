@@ -175,9 +175,8 @@ def _in_units(value: float | tuple[float, ...] | None, unit: float) -> str:
 
 def _explained(info: KeyInfo) -> str:
     """Return a key, its unit and what is allowed, and below what it means."""
-    meaning, unit = info.description, ""
-    if match := re.fullmatch(r"(.*) \[([^\]]*)\]", info.description):
-        meaning, unit = match[1], "" if match[2] == "-" else f" [{match[2]}]"
+    meaning, _, unit = info.description.removesuffix("]").rpartition(" [")
+    unit = "" if unit == "-" else f" [{unit}]"
     default = "required" if not info.default else f"default {info.default}"
     if info.also:
         meaning += "; also of " + " and ".join(f"[[{table}]]" for table in info.also)

@@ -27,6 +27,7 @@ from dolfinopt.cli.shared import (
     set_option,
     start,
     tell,
+    tell_assumed,
     verbose_option,
 )
 from dolfinopt.errors import ConvergenceError, InputError
@@ -67,6 +68,7 @@ def optimize(
         raise InputError("--resume, --overwrite: expected only one of them")
     world, loaded = load(scene, overrides)
     loaded.check_designed()
+    tell_assumed(world, loaded)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
     from dolfinopt.output.folders import working_alone
@@ -142,6 +144,7 @@ def simulate(
     Writes the trajectory, and prints compliance and deviation.
     """
     world, loaded = load(scene, overrides)
+    tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.optimization.result import simulation_result
     from dolfinopt.output.design import arms_with_design

@@ -194,6 +194,14 @@ def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
         click.echo(chosen(choice.coordinates, choice.error))
 
 
+def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
+    """Print in one line what the scene does not state and its results depend on."""
+    from dolfinopt.scene.messages import assumed
+
+    if world.rank == 0 and (line := assumed(scene)):
+        click.echo(line)
+
+
 def chosen(coordinates: int, error: float) -> str:
     return (
         f'reduction.coordinates = "auto": {coordinates} coordinates an arm, estimated error '

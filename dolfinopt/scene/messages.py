@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import UnionType
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
+from dolfinopt.progress import with_unit
 from dolfinopt.scene.schema import Scene
 from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import (
@@ -175,6 +177,12 @@ def _meaning(field: FieldInfo) -> str:
     return str(field.description).removesuffix(" [-]")
 
 
+def unit_of(field: FieldInfo) -> str:
+    """Return the unit at the end of a field's description, "-" where it has none."""
+    found = re.search(r" \[([^\]]*)\]$", str(field.description))
+    return found[1] if found else "-"
+
+
 def allowed_words(field: FieldInfo) -> str:
     """Return in words what `field` accepts."""
     return _allowed_type(field.annotation, field.metadata)
@@ -305,6 +313,34 @@ def _explains(path: str, other: str) -> bool:
     """Return whether what one key means is told at another one."""
     place = {"arms": "material", "joints": "arms"}[other.partition(".")[0]]
     return path.rpartition(".")[0] == place and is_explained_elsewhere(other)
+
+
+# -- what a scene does not state and its results depend on --------------------------------------
+
+# Defaults that an engineer would want to know of.
+PHYSICAL = (("motion", "gravity"), ("damping", "stiffness_proportional"), ("motion", "horizon"),
+            ("design", "volume_fraction"))  # fmt: skip
+
+
+def assumed(scene: Scene) -> str:
+    """Return in one line what is not stated: lengths by the arms, times, gravity, damping."""
+    physical = [loc for loc in PHYSICAL if loc[1] not in getattr(scene, loc[0]).model_fields_set]
+    found = [_with_value(scene, loc) for loc in dict.fromkeys((*scene.derived, *physical))]
+    ends = {
+        f"arms.{arm.name}.passive = {arm.solid_ends:.4g} m"
+        for arm in scene.arms
+        if arm.designed and arm.passive is None and arm.solid_ends > 0.0
+    }
+    told = [one for one in (*found, *sorted(ends)) if one]
+    return f"assumed: {', '.join(told)}" if told else ""
+
+
+def _with_value(scene: Scene, loc: tuple[str, str]) -> str:
+    value, unit = getattr(getattr(scene, loc[0]), loc[1]), unit_of(field_at(loc))
+    if value is None or loc == ("objective", "gradient"):
+        return ""
+    text = f"{value:.4g}" if isinstance(value, float) else shown(value)
+    return with_unit(f"{loc[0]}.{loc[1]} = {text}", unit)
 
 
 # -- what is possible in a scene, but hardly meant: a sentence each, told before the run ---------

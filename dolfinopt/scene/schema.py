@@ -101,6 +101,11 @@ class Scene(Table):
         return self._source
 
     @property
+    def derived(self) -> tuple[tuple[str, str], ...]:
+        """Return table and key of what is not stated and follows from other values."""
+        return self._derived
+
+    @property
     def old_words(self) -> tuple[str, ...]:
         """Sentences on older words of the scene's data, and what they are read as."""
         return self._old_words

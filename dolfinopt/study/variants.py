@@ -14,7 +14,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.loading import load_scene
 from dolfinopt.scene.load import Scene, scene_from_dict
-from dolfinopt.scene.messages import model_at
+from dolfinopt.scene.messages import model_at, unit_of
 from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.tables.responses import DECLARED, unused_options
 
@@ -82,8 +82,7 @@ def axis_of(key: str) -> str:
     table, *_, name = in_new_words(key).split(".")
     model = model_at((table,))
     field = model.model_fields.get(name) if model else None
-    unit = re.search(r"\[([^\]]*)\]$", str(field.description) if field else "")
-    return f"{key} [{unit[1] if unit else '-'}]"
+    return f"{key} [{unit_of(field) if field and not name.endswith('*') else '-'}]"
 
 
 def parse_vary(text: str) -> Vary:
