@@ -265,8 +265,12 @@ class _Commands(click.Group):
     no_args_is_help=False,
 )
 @click.version_option(__version__, prog_name="dolfinopt")
+@click.option("--plots/--no-plots", default=True, help="draw pictures, of every command that does")
+@click.option(
+    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
+)
 @click.pass_context
-def commands(ctx: click.Context) -> None:
+def commands(ctx: click.Context, plots: bool, verbose: bool) -> None:
     """Stiffen the flexible arms of a moving machine by topology optimisation.
 
     Every command also runs under mpirun, with the same result.

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 @overwrite_option
 @set_option
 @plots_option
-@animation_option
+@click.option("--animation", is_flag=True, hidden=True)  # dolfinopt plot DIR --animation
 @verbose_option
 def optimize(
     scene: Path,
@@ -127,7 +127,7 @@ def _conclude(
 @overwrite_option
 @set_option
 @plots_option
-@animation_option
+@click.option("--animation", is_flag=True, hidden=True)
 @verbose_option
 def simulate(
     scene: Path,

@@ -117,7 +117,7 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
     on_root(world, prepare_folder, folder)
 
 
-def scene_of(folder: Path) -> Scene:
+def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
     """Return the scene of a run, with what "auto" came to: coordinates and stiffening."""
     from dolfinopt.scene.load import scene_from_dict
     from dolfinopt.scene.schema import found_again
@@ -136,7 +136,7 @@ def scene_of(folder: Path) -> Scene:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}); {_instead(folder)}"
         ) from None
-    return scene_from_dict(data, source=str(path))
+    return scene_from_dict(data, str(path), overrides)
 
 
 def _instead(folder: Path) -> str:
@@ -269,16 +269,27 @@ set_option = click.option(
 design_option = click.option("--design", type=PATH, help="design.npz; default: the initial design")
 
 
-plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
+def _given_before(name: str, usual: bool) -> Callable[[], bool]:
+    """Return what an option before the command says, `dolfinopt --no-plots optimize SCENE`."""
+
+    def value() -> bool:
+        before = click.get_current_context().find_root().params
+        return bool(before.get(name, usual))
+
+    return value
+
+
+# They stand before the command, and are read behind it, too.
+plots_option = click.option("--plots/--no-plots", default=_given_before("plots", True), hidden=True)
+
+
+verbose_option = click.option(
+    "--verbose", is_flag=True, default=_given_before("verbose", False), hidden=True
+)
 
 
 animation_option = click.option(
     "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
-)
-
-
-verbose_option = click.option(
-    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
 )
 
 
