@@ -317,7 +317,7 @@ class Scene(Table):
         An arm of another kind states all values itself.
         """
         arm, solid = self.arms[index], self.material
-        own = {key: getattr(arm, key) for key in material_keys()}
+        own = {key: getattr(arm, key, None) for key in material_keys()}  # a law may be newer
         if arm.material is not None:
             solid = Material(name=arm.material, **CATALOGUE[arm.material].values)
         elif own["kind"] not in (None, solid.kind):
