@@ -42,14 +42,15 @@ def write_link(path: Path, version: float, binary: bool, quadrilaterals: bool = 
         gmsh.finalize()
 
 
-@pytest.mark.parametrize("version", [2.2, 4.0, 4.1])
-@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize(
+    ("version", "binary"), [(2.2, False), (2.2, True), (4.0, False), (4.1, False), (4.1, True)]
+)
 def test_every_format_of_gmsh_is_read(tmp_path, version, binary):
     file = tmp_path / "link.msh"
     write_link(file, version, binary, quadrilaterals=binary)
     mesh = arm_mesh(MPI.COMM_SELF, Arm(mesh=str(file), **SIZE))
     assert mesh.area.sum() == pytest.approx(AREA, rel=5e-3)
-    assert mesh.centroid.min(axis=0) > pytest.approx([-0.02, -0.02])
+    assert (mesh.centroid > -0.02).all()
     assert len(mesh.inboard_facets) == len(mesh.outboard_facets) > 4
 
 
