@@ -79,6 +79,8 @@ def optimize(
         on_root(world, checkpoint.check, folder, loaded)
     else:
         claim(world, folder, overwrite, resume=checkpoint.NAME, scene=loaded)
+    if loaded.is_spatial and not resume:
+        _tell_ahead(world, loaded)
     with working_alone(world, folder):  # until all files of the run are written
         try:
             with progress(world, loaded) as report:
@@ -97,6 +99,20 @@ def optimize(
         _conclude(folder, result, plots, animation, verbose)
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
+
+
+def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
+    """Print what straight tubes and bars reach in place of solid links (collective)."""
+    from tempfile import TemporaryDirectory
+
+    from dolfinopt.parallel import together
+    from dolfinopt.study.sections import ahead
+
+    with TemporaryDirectory() as own:
+        lines = ahead(scene, Path(world.bcast(own, root=0)), world)
+        with together(world):  # until all ranks are done with the folder
+            for line in lines:
+                click.echo(line)
 
 
 def _conclude(

@@ -20,6 +20,7 @@ from dolfinopt.study.sections import (
     WORTH,
     Members,
     Row,
+    ahead,
     lightest,
     sections_of,
     study_sections,
@@ -205,6 +206,9 @@ def test_tubes_in_space(tmp_path, capsys):
     deviation = dict(zip(kinds, column(rows, "maximal deviation [mm]"), strict=True))
     assert deviation["rectangular tube"] < 0.5 * deviation["solid bar"]
     assert "the rectangular tube wins" in capsys.readouterr().out
+    bar, tube, *_, walls = ahead(do.load_scene(SPATIAL, scene[1::2]), tmp_path / "a", MPI.COMM_SELF)
+    value = [float(line.split("load cases ")[1].split()[0]) for line in (bar, tube)]
+    assert value[1] < 0.5 * value[0] and "hollow" in walls
     assert (tmp_path / "sections_deviation.png").exists()
 
 
@@ -235,6 +239,7 @@ def test_arms_that_no_member_replaces(shared_tmp_path):
     ):
         changed = scene.unchecked_copy({"arms": arms})
         refusal(lambda: study_sections(changed, (), shared_tmp_path / "o", WORLD), *words)  # noqa: B023
+        assert ahead(changed, shared_tmp_path / "o", WORLD) == []
     assert not (shared_tmp_path / "o").exists()
 
 
