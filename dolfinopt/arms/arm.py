@@ -519,7 +519,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     arm = scene.arms[index]
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
-        interfaces = tuple((one.name, one.point) for one in arm.interfaces)
+        interfaces = tuple((one.name, one.point) for one in arm.further_interfaces)
         body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body

@@ -315,9 +315,9 @@ class AxisSymmetry:
         worst = int(np.argmax(off))
         if off[worst] > MIRROR_DISTANCE_LIMIT:
             place = ", ".join(f"{x:.4g}" for x in everywhere[worst])
-            key, name = ("symmetric", "y") if axis == 1 else ("symmetric_z", "z")
+            name = "y" if axis == 1 else "z"
             raise InputError(
-                f"arm {mesh.name!r}: {key} = true, but the mesh is not symmetric about {name} = 0: "
+                f"arm {mesh.name!r}: symmetric, but the mesh is not symmetric about {name} = 0: "
                 f"the cell at ({place}) m has no mirror image: that of its middle is farther than "
                 f"{MIRROR_DISTANCE_LIMIT:g} cell sizes from all others; correct the geometry, or "
                 "mesh one half and mirror it"
@@ -372,9 +372,9 @@ class Extrusion:
 def averages_of(mesh: ArmMesh, arm: Arm) -> list[AxisSymmetry | Extrusion]:
     """Return the averages that an arm's keys ask for (collective on the arm)."""
     found: list[AxisSymmetry | Extrusion] = []
-    if arm.symmetric:
+    if arm.symmetric_about[0]:
         found.append(AxisSymmetry(mesh))
-    if arm.symmetric_z:
+    if arm.symmetric_about[1]:
         found.append(AxisSymmetry(mesh, axis=2))
     if arm.extruded:
         found.append(Extrusion(mesh))

@@ -155,7 +155,7 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
             ends = like.passive_columns * arm.length / arm.cells[0]
         size = (arm.length, arm.height, arm.thickness)[: len(arm.cells)]
         mesh = box_arm(comm, arm.name, size, arm.cells, ends)
-        if arm.interfaces:
+        if arm.further_interfaces:
             mesh = with_interfaces(mesh, arm, ends)
     return with_regions(mesh, like, scales)
 
@@ -183,7 +183,7 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         mesh, tags = _arm_mesh(comm, arm.name, arm.length, *parts), parts[2]
         further = tuple(
             InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(point))
-            for k, (one, point) in enumerate(zip(arm.interfaces, arm.interface_points[1:]))
+            for k, (one, point) in enumerate(zip(arm.further_interfaces, arm.interface_points[1:]))
         )
         mesh.passive[:] |= _distance(mesh.centroid, facets) < arm.solid_ends
     return replace(mesh, notes=notes, further=further)
@@ -365,7 +365,7 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
     middles, outer = sides.mean(axis=2), _outer(mesh, sides.mean(axis=2), arm)
     taken = np.isin(facets, np.concatenate([mesh.inboard_facets, mesh.outboard_facets]))
     found, solid = [], mesh.passive.copy()
-    for one in arm.interfaces:
+    for one in arm.further_interfaces:
         point = np.array(one.point)
         assert one.radius is not None
         distance = np.linalg.norm(middles - point, axis=2)

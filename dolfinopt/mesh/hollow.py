@@ -478,7 +478,7 @@ def read_hull(gmsh: Any, arm: Arm) -> Hull:
         InputError: the file cannot be the arm, or one of its sections be told by rays from the
             axis; one line that names file and remedy.
     """
-    points, cells, ends = read_cells(gmsh, arm.model_copy(update={"mesh": arm.hull}))
+    points, cells, ends = read_cells(gmsh, arm.unchecked_copy({"mesh": arm.hull}))
     gmsh.clear()
     assert arm.cells is not None
     first, last = float(ends[0][:, 0].max()), float(ends[1][:, 0].min())

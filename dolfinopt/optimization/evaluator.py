@@ -102,8 +102,8 @@ class Evaluator:
 
     def use_gradient(self, kind: str) -> None:
         """Use another gradient from the next evaluation on."""
-        objective = self.scene.objective.model_copy(update={"gradient": kind})
-        self.scene = self.scene.model_copy(update={"objective": objective})
+        objective = self.scene.objective.unchecked_copy({"gradient": kind})
+        self.scene = self.scene.unchecked_copy({"objective": objective})
 
     def with_gradient(self, kind: str) -> Evaluator:
         """Return an evaluator of the same arms with another gradient.

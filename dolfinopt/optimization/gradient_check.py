@@ -147,8 +147,8 @@ def check_exact(scene: Scene) -> None:
 
 def _with(scene: Scene, gradient: str) -> Scene:
     """Return the scene with another gradient."""
-    objective = scene.objective.model_copy(update={"gradient": gradient})
-    return scene.model_copy(update={"objective": objective})
+    objective = scene.objective.unchecked_copy({"gradient": gradient})
+    return scene.unchecked_copy({"objective": objective})
 
 
 def _physical(variables: Variables, patterns: Patterns, x: np.ndarray) -> dict[int, np.ndarray]:

@@ -637,7 +637,7 @@ class Problem:
         one = simulated
         given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
         p = max(one.scene.objective.stress_exponent, STRESS_EXPONENT)
-        options = one.scene.objective.model_copy(update={"stress_exponent": p})
+        options = one.scene.objective.unchecked_copy({"stress_exponent": p})
         return OutlineStress(options, parts), analysis_of(*given)
 
     def _volumes(

@@ -335,5 +335,5 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows) -> np.ndarray:
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the response at {omega / (2.0 * np.pi):g} Hz does not "
         "converge: too close to a natural frequency, or too far above the first ones; move or "
-        "lower reduction.shifts"
+        "lower reduction.frequencies"
     )

@@ -190,8 +190,8 @@ def _timed(scene: Scene) -> Scene:
     """Return the scene simulated so well that time steps do not matter to the comparison."""
     tolerance = min(scene.simulation.tolerance, TIME_ERROR_SHARE * scene.reduction.tolerance)
     update = {"tolerance": tolerance}
-    simulation = scene.simulation.model_copy(update=update)
-    return scene.model_copy(update={"simulation": simulation})
+    simulation = scene.simulation.unchecked_copy(update)
+    return scene.unchecked_copy({"simulation": simulation})
 
 
 def _distance(

@@ -318,7 +318,9 @@ def test_widths_of_solid_arms_are_measured_where_they_are_asked_for(extruded):
     told = {"cells": (20, 12, 2), "height": 0.06, "thickness": 0.01, "extruded": extruded}
     scene = solid_scene(**told)
     width = {"projection": "robust", "minimum_member": 0.015}
-    asked = scene.model_copy(update={"design": scene.design.model_copy(update=width)})
+    asked = scene.unchecked_copy(
+        {"design": scene.design.model_copy(update=width | {"filter_radius": 0.0075})}
+    )
     for one in (scene, asked):
         arm = do.Arm(one, 0, MPI.COMM_SELF, do.Profile())
         partition = do.partition_arms(MPI.COMM_SELF, {0: 480})

@@ -320,7 +320,7 @@ def hull_arm(tmp_path, mesh: Member, **keys):
     path = tmp_path / "hull.msh"
     path.write_bytes(msh_bytes(mesh))
     size = {"height": 0.06, "thickness": 0.04, "cells": (10, 4, 4)}
-    told = {"hollow": True, "hull": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
+    told = {"hollow": True, "section": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
     return solid_arm(MPI.COMM_SELF, **(size | told | keys))
 
 

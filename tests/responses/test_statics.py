@@ -92,9 +92,7 @@ def static_link(
 ) -> Arm:
     """Return a solid link of whose designs nothing is asked but what static loads do."""
     scene = solid_scene(**{"cells": (12, 4, 3), **told})  # type: ignore[arg-type]
-    scene = scene.model_copy(
-        update={"objective": scene.objective.model_copy(update={"kind": "static"})}
-    )
+    scene = scene.unchecked_copy({"objective": scene.objective.unchecked_copy({"kind": "static"})})
     arm = Arm(scene, 0, comm, do.Profile())
     for system in (arm.substructure.interior, arm.substructure.extended):
         if system is not None:
