@@ -288,19 +288,7 @@ class DesignState:
     def load_fields(self) -> LoadFields:
         """The static fields of all loads, those of the elastic motion's inertia included."""
         with self.elastic.profile.phase("stress"):
-            return load_fields(self.elastic, self.basis.V, self.basis.MV, self.unit_loads)
-
-    def load_fields_of(self, moving: np.ndarray) -> LoadFields:
-        """Return those that take part in a motion, or all where these are known (collective).
-
-        Args:
-            moving: coefficients of its instants, see `fem.stress.load_fields`.
-        """
-        if "load_fields" in self.__dict__:
-            return self.load_fields
-        known = self.unit_loads if self.stiffened else None
-        with self.elastic.profile.phase("stress"):
-            return load_fields(self.elastic, self.basis.V, self.basis.MV, known, moving)
+            return load_fields(self.unit_loads, self.basis.V, self.basis.MV)
 
     @cached_property
     def first_frequency(self) -> float:

@@ -25,12 +25,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.fem.assembly import StiffenedModes, combine, of_cells
+from dolfinopt.fem.frames import (
+    NUM_INERTIAL,
+    SECOND_TURNS,
+    TURNS,
+    accelerations,
+    by_inertia,
+    by_rigid_motions,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
-
-# Loads by the arm's own inertia, which come first, by the number of directions.
-NUM_INERTIAL = {2: 4, 3: 12}
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,21 +265,6 @@ def _fold(
     return np.tensordot(psi, outboard, ((0, 1), (0, 1)))
 
 
-def by_inertia(adjoint: np.ndarray) -> np.ndarray:
-    """Return what the inertial loads' adjoints multiply dM 1_x and dM X by (n_nodes, d, 2)."""
-    # M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
-    out = np.zeros((*adjoint.shape[:2], 2))
-    if adjoint.shape[1] == 3:
-        for a in range(3):
-            out[:, 0, 0] += adjoint[:, a, a]
-            out[:, :, 1] += adjoint[:, a, 3 + 3 * a : 6 + 3 * a]
-        return out
-    out[:, 0, 0] = adjoint[:, 0, 0] + adjoint[:, 1, 1]
-    out[:, 0, 1] = adjoint[:, 0, 3] + adjoint[:, 1, 2]
-    out[:, 1, 1] = adjoint[:, 1, 3] - adjoint[:, 0, 2]
-    return out
-
-
 def unit_loads(arm: ElasticArm) -> UnitLoads:
     """Return the static fields of the unit loads: four solves with the factor at hand.
 
@@ -292,33 +282,15 @@ def interface_fields(arm: ElasticArm) -> np.ndarray:
     return combine(modes.field, np.linalg.inv(modes.stiffness))
 
 
-def accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them."""
-    # 1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
-    # space. Of 1 and X (n_nodes, d), or M times these: M knows no direction. M (-y, x) is (-(M
-    # X)_y, (M X)_x), as M treats the components alike.
-    dim = ones.shape[1]
-    fields = np.zeros((*ones.shape, NUM_INERTIAL[dim]))
-    if dim == 3:
-        for a in range(3):
-            fields[:, a, a] = ones[:, a]
-            fields[:, a, 3 + 3 * a : 6 + 3 * a] = places
-        return fields
-    fields[:, 0, 0], fields[:, 1, 1] = ones.T
-    fields[:, 0, 2], fields[:, 1, 2] = -places[:, 1], places[:, 0]
-    fields[:, :, 3] = places
-    return fields
-
-
 # -- what the rotation of second order of a rigid interface adds to the geometric stiffness ------
 #
 # A node of the outboard interface, r from its point of reference, moves by u + (exp(theta~) - 1) r,
 # theta being the rotation vector. The linear modes hold u + theta x r of it; the reaction R_p of
 # the interface's nodes to a unit load does work along the rest, theta x (theta x r) / 2:
 #
-#     K0_p[i, j] gains theta_i' D_p theta_j,   D_p = S_p - tr(S_p) 1,   S_p = sym(sum R_p r').
+#     K0_p[i, j] gains theta_i' D_p theta_j,   D_kl = S : S_k S_l,   S = sym(sum R_p r'),
 #
-# In the plane theta has one component and D_p is -tr(S_p).
+# with the rotations S_k of `frames`: S - tr(S) 1 in space, -tr(S) in the plane.
 #
 # Without it a rotation of the interface would strain the cells beside it, whose stress across the
 # arm is large, and a moment M at the interface would act on nodes that keep the directions of their
@@ -377,7 +349,7 @@ class FaceRotation:
         """
         forces, levers = self._reactions(fields, accelerations), self._levers[:, self._nodes]
         S = self.arm.comm.allreduce(np.einsum("enap,ienb->ipab", forces, levers))
-        return _deviated(0.5 * (S + S.swapaxes(2, 3)))
+        return np.einsum("klab,ipab->ipkl", SECOND_TURNS[S.shape[3]], 0.5 * (S + S.swapaxes(2, 3)))
 
     def _reactions(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Return K u_p - f_p of the cells beside the interfaces (cells, n, d, p)."""
@@ -420,7 +392,8 @@ class FaceRotation:
         dim, c = V.shape[1], theta.shape[1]
         by_theta = np.zeros((len(theta), dim + c, V.shape[2]))
         by_theta[:, dim:] = 2.0 * np.einsum("mpab,mbj,pij->mai", D, theta, symmetric)
-        by_S = _by_moments(theta[:, None] @ symmetric @ theta[:, None].swapaxes(2, 3))
+        by_D = theta[:, None] @ symmetric @ theta[:, None].swapaxes(2, 3)
+        by_S = np.einsum("klab,mpkl->mpab", SECOND_TURNS[dim], by_D)
         y = np.einsum("mpab,mnb->nap", by_S, self._levers)
         forces = np.zeros_like(y)
         np.add.at(forces, self._nodes, self._stiffness_times(y[self._nodes]))
@@ -447,20 +420,7 @@ class FaceRotation:
 
 def _levers(rigid: np.ndarray) -> np.ndarray:
     """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere."""
-    # Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
-    if rigid.shape[1] == 2:
-        about_z = rigid[:, :, 2::3]
-        return np.stack([about_z[:, 1], -about_z[:, 0]], axis=-1).swapaxes(0, 1)
-    about_x, about_y = rigid[:, :, 3::6], rigid[:, :, 4::6]
-    return np.stack([-about_y[:, 2], about_x[:, 2], -about_x[:, 1]], axis=-1).swapaxes(0, 1)
-
-
-def _deviated(S: np.ndarray) -> np.ndarray:
-    """Return S - tr(S) 1 of symmetric tensors (..., 3, 3); -tr(S) (..., 1, 1) in the plane."""
-    trace = np.trace(S, axis1=-2, axis2=-1)[..., None, None]
-    return -trace if S.shape[-1] == 2 else S - trace * np.eye(3)
-
-
-def _by_moments(by_D: np.ndarray) -> np.ndarray:
-    """Return the transpose of `_deviated`: derivatives by S, given those by D (symmetric)."""
-    return -by_D * np.eye(2) if by_D.shape[-1] == 1 else _deviated(by_D)
+    # Of its rotations S_k r, sum_k S_k' S_k = (d - 1) 1.
+    d = rigid.shape[1]
+    ends = np.split(rigid, rigid.shape[2] // (d + len(TURNS[d])), axis=2)
+    return np.stack([by_rigid_motions(end) for end in ends]) / (d - 1)

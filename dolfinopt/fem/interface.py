@@ -18,6 +18,7 @@ from mpi4py import MPI
 from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
 from dolfinopt.fem.measured import (
     ENERGY_TOLERANCE,
     HARMLESS_CONTRAST,
@@ -249,34 +250,6 @@ class InterfaceTransformation:
             compat.scatter_reverse_add(self._ghosted)
             out[:, :, k] = self._ghosted.x.array.reshape(-1, self.dim)
         return out
-
-
-def rigid_motions(points: np.ndarray) -> np.ndarray:
-    """Return rigid motions (n, d, b) of points (n, d): translations, then unit rotations.
-
-    In the plane about z; in space about x, y, z: e_k x X. About the origin, m and m/rad.
-    """
-    dim = points.shape[1]
-    motions = np.zeros((len(points), dim, 3 if dim == 2 else 6))
-    motions[:, range(dim), range(dim)] = 1.0
-    if dim == 2:
-        motions[:, 0, 2], motions[:, 1, 2] = -points[:, 1], points[:, 0]
-    else:
-        for k in range(3):
-            after, before = (k + 1) % 3, (k + 2) % 3
-            motions[:, before, 3 + k], motions[:, after, 3 + k] = (
-                points[:, after],
-                -points[:, before],
-            )
-    return motions
-
-
-def by_rigid_motions(by: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n, d) by the points, given those by their `rigid_motions`."""
-    if by.shape[1] == 2:
-        return np.stack([by[:, 1, 2], -by[:, 0, 2]], axis=1)
-    # e_k x X . b = X . (b x e_k)
-    return np.sum([np.cross(by[:, :, 3 + k], np.eye(3)[k]) for k in range(3)], axis=0)
 
 
 def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:

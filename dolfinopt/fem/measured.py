@@ -30,15 +30,11 @@ ROUNDING_ITERATIONS = 6  # of that estimate; four give two digits
 # off by at most a few 1e-7, from rounding.
 HARMLESS_CONTRAST = 1e6
 
-# -- stress: directions of a motion's loads ----------------------------------------------------
+# -- stress ----------------------------------------------------------------------------------
 
-# Of the largest one, by the length of the accelerations, below which a direction in which the loads
-# vary along a motion is none. Stress of spatial_arm.toml is then right to 4e-12 of the largest, by
-# 34 to 40 solves an arm in place of 54 or 66.
-MOTION_RANK_SHARE = 1e-9
-SUMS_RANK_SHARE = 1e-11  # the same of displacements whose adjoints are summed
-# Part of the loads up to which so many directions are solved for in their place.
-FEWER_DIRECTIONS = 0.9
+# Of the largest singular value of the loads' coefficients, by the lengths of their fields, below
+# which a direction of them is none.
+SUMS_RANK_SHARE = 1e-11
 
 # -- interior: the choice of a solver --------------------------------------------------------
 

@@ -24,7 +24,8 @@ import scipy.sparse as sp
 from mpi4py import MPI
 
 from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
-from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
+from dolfinopt.fem.frames import rigid_motions
+from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.measured import (
     BOX_CHUNK_COLUMNS,
     COARSEST_BAND_WORK,

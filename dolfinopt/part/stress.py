@@ -32,7 +32,6 @@ from dolfinopt.responses.stress import (
     Stress,
     arm_loads,
     every,
-    every_instant,
     maxima,
     motions_of,
     screen,
@@ -92,10 +91,10 @@ def stress_of_parts(
         if not arms[k].solid.law.has_strength:
             continue
         state = arms[k].current
-        points = parts[k].stress(state, state.load_fields_of(every_instant(loads)))
+        points = parts[k].stress(state, state.load_fields)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
         for one in loads:
-            a, t = points.coefficients(one), motions[one.motion].t
+            a, t = one.coefficients, motions[one.motion].t
             best = points.peak(a, t, np.flatnonzero(counts))
             known = found.get(one.place)
             if known is not None and known.peak.value >= best.value:
@@ -152,7 +151,7 @@ class CornerStress(PointStress):
         by_weights: np.ndarray,
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to nodes, see `PointStress`; which count is held."""
-        at, columns = self.corners.ravel(), self.fields.to_columns.T @ a.T
+        at, columns = self.corners.ravel(), a.T
         by_own = by[:, at] * self.shares.ravel()[:, None]
         apart = np.einsum("cim,cim->i", by_own, self.own @ columns - (self.A @ columns)[:, at])
         by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area

@@ -62,10 +62,6 @@ class PointStress(ABC):
     A: np.ndarray
     weights: np.ndarray
 
-    def coefficients(self, loads: ArmLoads) -> np.ndarray:
-        """Return those (n, m) of `LoadFields.columns`."""
-        return np.asarray(loads.coefficients @ self.fields.to_columns)
-
     def power_sum(self, a: np.ndarray, unit: float, exponent: float) -> float:
         """Return sum_n sum_e weight_e (s_en / unit)^p over this rank's cells; a is (n, m)."""
         return sum(
@@ -196,11 +192,6 @@ class ArmLoads:
     place: int
     motion: int
     coefficients: np.ndarray
-
-
-def every_instant(loads: Sequence[ArmLoads]) -> np.ndarray:
-    """Return the coefficients (n, m) of all instants of all motions."""
-    return np.concatenate([one.coefficients for one in loads])
 
 
 def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[ArmLoads]]:
@@ -356,9 +347,7 @@ class Stress(Response):
         largest = largest_summed = 0.0
         with together(world):
             for k, state in analysis.designs.items():
-                points[k] = self.points_of(
-                    k, state, state.load_fields_of(every_instant(by_owner[k]))
-                )
+                points[k] = self.points_of(k, state, state.load_fields)
                 with analysis.profile.phase("stress"):
                     chosen[k], own = _screened(partition, points[k], by_owner[k])
                 largest = max(largest, own)
@@ -383,7 +372,7 @@ def _screened(
     found, largest = [], 0.0
     for one in loads:
         coarse = every(len(one.coefficients))
-        screened = screen(partition.comm, points.A, points.coefficients(one), coarse)
+        screened = screen(partition.comm, points.A, one.coefficients, coarse)
         largest = max(largest, screened.largest)
         instants, values = coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]
         found.append(ChosenInstants(one, instants, values, len(instants)))
@@ -396,7 +385,7 @@ def _power_sum(
     """Return sum weight (s / unit)^p of chosen instants, and sum weight of all; of this rank."""
     count, total = sum(one.count for one in chosen), 0.0
     if unit:
-        columns = np.concatenate([one.a for one in chosen]) @ points.fields.to_columns
+        columns = np.concatenate([one.a for one in chosen])
         total = points.power_sum(columns, unit, p)
     return np.array([total, points.weights.sum() * count])
 
@@ -488,7 +477,7 @@ def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.nda
         if sums.total:
             p, counts = sums.exponent, points.weights > 0.0
             factor = sums.total ** (1.0 / p - 1.0) * sums.weight ** (-1.0 / p)
-            columns = a @ points.fields.to_columns
+            columns = a
             by, by_logs = points.power_sum_gradient(columns, sums.largest, p)
             by *= factor
             by_logs *= factor

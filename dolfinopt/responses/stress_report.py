@@ -18,7 +18,6 @@ from dolfinopt.responses.stress import (
     arm_loads,
     cell_stress,
     every,
-    every_instant,
     maxima,
     screen,
 )
@@ -111,7 +110,7 @@ def stress_report(
             if not arm.solid.law.has_strength:
                 continue
             state = arm.current
-            fields = state.load_fields_of(every_instant(by_owner[k]))
+            fields = state.load_fields
             stress = cell_stress(state, fields, arm.scene.objective.stress_margin)
             found = [_arm_stress(partition, state, stress, one, t) for one in by_owner[k]]
             peaks[k] = [
@@ -135,7 +134,7 @@ def _arm_stress(
 
     Collective on the arm's ranks.
     """
-    comm, a, coarse = partition.comm, cells.coefficients(loads), every(len(t))
+    comm, a, coarse = partition.comm, loads.coefficients, every(len(t))
 
     def peak(found: Screened, places: np.ndarray) -> Peak:
         known = comm.allgather(places[found.point] if found.point >= 0 else None)
