@@ -274,15 +274,6 @@ class Cells:
             shape=(len(operators.points), count),
         )
 
-    def values(self, field: np.ndarray) -> np.ndarray:
-        """Return the cells' nodal values (n, d, k, n_cells) of a field (n_nodes, d, k)."""
-        nodes, columns = self._corners, field.shape[1] * field.shape[2]
-        flat = np.ascontiguousarray(field.reshape(len(field), columns).T)
-        out = np.empty((len(nodes), columns, nodes.shape[1]))
-        for corner, found in zip(nodes, out, strict=True):
-            np.take(flat, corner, axis=1, out=found, mode="clip")
-        return out.reshape(len(nodes), *field.shape[1:], nodes.shape[1])
-
     def sum_at_nodes(self, forces: np.ndarray) -> np.ndarray:
         """Return the nodal field (n_nodes, d, k) of the cells' forces (n, d, k, n_cells)."""
         n, *shape, count = forces.shape
@@ -363,13 +354,13 @@ class Cells:
         rows, others = self.by_component(left), self.by_component(right)
         out = np.empty(self.count)
         for cells in self._runs(len(rows)):
-            corners = self._corners[:, cells]
-            values, more = (
-                np.stack([each.take(corner, axis=1, mode="clip") for corner in corners])
-                for each in (rows, others)
-            )
+            values, more = self._values(rows, cells), self._values(others, cells)
             out[cells] = _sum_of_products(values, times(of_cells(self.mass, cells), more))
         return out
+
+    def _values(self, rows: np.ndarray, cells: slice) -> np.ndarray:
+        """Return the values (n, d k, cells) of some cells' nodes, see `by_component`."""
+        return np.stack([rows.take(at, axis=1, mode="clip") for at in self._corners[:, cells]])
 
     def _runs(self, columns: int) -> list[slice]:
         """Return runs of so many cells that values of so many columns stay in the cache."""
@@ -377,26 +368,32 @@ class Cells:
         step = max(entries, STRESS_CHUNK_CELLS)
         return [slice(k, min(k + step, self.count)) for k in range(0, self.count, step)]
 
-    def stiffness_times(self, values: np.ndarray) -> np.ndarray:
-        """Return k_e times nodal values (n, d, k, n_cells), see `values`."""
-        flat = values.reshape(-1, *values.shape[2:])
-        return times(self.stiffness, flat).reshape(values.shape)
-
     def energy_matrix(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Return field' K field (k, k) of this rank's cells."""
-        values = self.centred(field)
-        products = self.stiffness_times(values) * young
-        flat = (-1, field.shape[2], len(young))
-        return np.matmul(values.reshape(flat), products.reshape(flat).swapaxes(1, 2)).sum(axis=0)
+        rows, out = self.by_component(field), np.zeros(2 * (field.shape[2],))
+        for cells in self._runs(len(rows)):
+            values, forces = self._strained(rows, young, cells)
+            out += np.matmul(values, forces.swapaxes(1, 2)).sum(axis=0)
+        return out
 
-    def centred(self, field: np.ndarray) -> np.ndarray:
-        """Return `values` less their mean, which has no energy.
+    def forces(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
+        """Return K field (n_nodes, d, k) of this rank's cells, without translations' rounding."""
+        n, d, k = self.num_nodes, *field.shape[1:]
+        _, forces = self._strained(self.by_component(field), young, slice(None))
+        return self.sum_at_nodes(forces.reshape(n, d, k, -1))
 
-        Rounding is then relative to the differences within a cell, not to its displacement.
+    def _strained(
+        self, rows: np.ndarray, young: np.ndarray, cells: slice
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return values (d n, k, cells) less their mean, and E k_e times them.
+
+        The mean has no energy: rounding is relative to what strains a cell.
         """
-        values = self.values(field)
+        values = self._values(rows, cells)
         values -= values.mean(axis=0)
-        return values
+        stiffness = of_cells(self.stiffness, cells)
+        values = values.reshape(stiffness.shape[1], -1, values.shape[2])
+        return values, times(stiffness, values) * young[cells]
 
 
 def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
