@@ -182,7 +182,8 @@ def test_widths_of_solids():
         if asked < 2.0:  # gaps are looked for up to one and a half times that
             assert gap is None
             continue
-        assert gap.size == pytest.approx(4.0 * CELL, abs=CELL / 4.0)
+        # A ball that is a little wider reaches through it from both sides.
+        assert gap.size == pytest.approx(4.0 * CELL, abs=CELL / 3.0)
         assert gap.place[1] / CELL == pytest.approx(5.0, abs=0.5)
     assert thinnest(boxes, np.zeros(len(boxes), dtype=bool), CELL) == (None, None)
     whole, none = thinnest(boxes, np.ones(len(boxes), dtype=bool), CELL)
