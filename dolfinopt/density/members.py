@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from dolfinopt.density.measured import CELL_SAMPLES, CORNER_LENGTH_RATIO, SAMPLES_LIMIT
-from dolfinopt.mesh.checks import cell_sizes, facet_areas, facet_corners
+from dolfinopt.mesh.checks import cell_sizes, facet_corners, inward_normal
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 
 THIN = 0.7  # of a ball's diameter in space: members have more, edges at most 0.6
@@ -108,7 +108,7 @@ def _samples(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float)
     first = np.floor((corners.min(axis=1) - low) / h - 0.5).astype(int)
     last = np.ceil((corners.max(axis=1) - low) / h - 0.5).astype(int)
     d = corners.shape[2]
-    sides = [_inwards(corners, side) for side in facet_corners(d, corners.shape[1])]
+    sides = [inward_normal(corners, side) for side in facet_corners(d, corners.shape[1])]
     for step in np.ndindex(*((last - first).max(axis=0) + 1)):
         place = first + step
         point = low + (place + 0.5) * h
@@ -118,14 +118,6 @@ def _samples(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float)
             inside &= height >= -GRID_ROUNDING_SHARE * h**d
         found[tuple(place[inside].T)] = True
     return found
-
-
-def _inwards(corners: np.ndarray, side: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point (n, d) of each cell's side, and a vector normal to it into the cell."""
-    # Three corners tell a side of a hexahedron.
-    origin, normal = corners[:, side[0]], facet_areas(corners[:, side[:3]])
-    height = np.einsum("ni,ni->n", normal, corners.mean(axis=1) - origin)
-    return origin, normal * np.sign(height)[:, None]
 
 
 Place = tuple[int, ...]  # of a sample
