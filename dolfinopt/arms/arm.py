@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
+from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, options, same_basis
 from dolfinopt.arms.modes import LoadedModes
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
@@ -121,7 +121,7 @@ class Arm:
             radius = scene.filter_radius(index) if pattern is None else 0.0
             # A member along an edge would be half as thin if the filter mirrored it there.
             self.filter = HelmholtzFilter(self.mesh, radius, scene.design.controls_widths)
-        self.kind = kind_of(self.substructure, self.solid, scene.interpolation)
+        self.kind = Kind(self.substructure, self.solid, scene.interpolation)
         self.coordinates = scene.reduction.count or None
         # Of a mesh file known only now.
         if self.coordinates is not None and self.coordinates > self.substructure.T.num_dofs:

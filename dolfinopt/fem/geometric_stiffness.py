@@ -76,7 +76,7 @@ class UnitLoads:
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (p, q, q) in modes V (n_nodes, d, q) (collective on the arm's ranks)."""
         arm = self.arm
-        own = self._stiffened(V).stiffness()
+        own = self.stiffened(V).stiffness()
         K0 = own if arm.comm.size == 1 else arm.comm.allreduce(own)
         return K0 + self._face.stiffness(self._face_tensors, V)
 
@@ -104,7 +104,7 @@ class UnitLoads:
     def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
         return {}
 
-    def _stiffened(self, V: np.ndarray) -> StiffenedModes:
+    def stiffened(self, V: np.ndarray) -> StiffenedModes:
         """Return what is known of these modes; for the last ones the same."""
         known = self._last.get("modes")
         if known is None or known[0] is not V:
@@ -130,7 +130,7 @@ class UnitLoads:
         arm, inertial = self.arm, self.num_inertial
         modes = arm.constraint_modes()
         compliance = np.linalg.inv(modes.stiffness)
-        known = self._stiffened(V)
+        known = self.stiffened(V)
         by_V, forces, direct, work = known.gradient(by_K0, compliance if static else None)
         by_stiffness = np.zeros_like(compliance)
         face = self._face.gradient(self._face_tensors, V, by_K0)
@@ -147,23 +147,6 @@ class UnitLoads:
         if self.modes is None:
             return found
         return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
-
-    def stiffness_products(
-        self, left: np.ndarray, V: np.ndarray, adjoint: np.ndarray
-    ) -> np.ndarray:
-        """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,).
-
-        Args:
-            left, V: (n_nodes, d, q).
-            adjoint: (n_nodes, d, k) of the first fields.
-        """
-        known, arm = self._last.get("modes"), self.arm
-        if known is not None and known[0] is V:
-            arm.profile.counts.energy_fields += left.shape[2] + adjoint.shape[2]
-            return known[1].stiffness_products(left, adjoint)
-        fields = self.fields[:, :, : adjoint.shape[2]]
-        products = arm.cell_stiffness_products(left, V)
-        return products - arm.cell_stiffness_products(adjoint, fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,20 +175,15 @@ class GeometricGradient:
     by_stiffness: np.ndarray
     face: FaceGradient
 
-    def by_young_beside(self, left: np.ndarray, V: np.ndarray) -> np.ndarray:
-        """Return `by_young` plus sum_k left_k' k_e V_k (n_cells,), in one product.
+    def by_young(self, left: np.ndarray) -> np.ndarray:
+        """Return the derivative by Young's modulus, plus sum_k left_k' k_e V_k (n_cells,).
 
         Args:
-            left: (n_nodes, d, q).
-            V: the modes.
+            left: (n_nodes, d, q), by which the modes V follow it.
         """
-        return self.direct + self.loads.stiffness_products(left, V, self.adjoint)
-
-    @property
-    def by_young(self) -> np.ndarray:
-        """By Young's modulus (n_cells,), modes held."""
-        fields = self.loads.fields[:, :, : self.adjoint.shape[2]]
-        return self.direct - self.loads.arm.cell_stiffness_products(self.adjoint, fields)
+        self.loads.arm.profile.counts.energy_fields += left.shape[2] + self.adjoint.shape[2]
+        known = self.loads.stiffened(self.modes)
+        return self.direct + known.stiffness_products(left, self.adjoint)
 
     @property
     def stiffness(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -243,18 +221,6 @@ class GeometricGradient:
     def by_modal_inertia(self) -> np.ndarray:
         """Fields whose products with d(M V) are the modal loads' part (n_nodes, d, q)."""
         return self._by_loads[:, :, self.loads.num_frame :]
-
-    @property
-    def by_density(self) -> np.ndarray:
-        """By mass density (n_cells,), modes held."""
-        arm = self.loads.arm
-        unit = np.zeros_like(arm.points)
-        unit[:, 0] = 1.0
-        left, right = [self.by_inertia], [np.stack([unit, arm.points], axis=2)]
-        if self.loads.modes is not None:
-            left.append(self.by_modal_inertia)
-            right.append(self.loads.modes)
-        return arm.cell_mass_products(np.concatenate(left, axis=2), np.concatenate(right, axis=2))
 
 
 def _fold(
