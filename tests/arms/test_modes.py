@@ -98,7 +98,9 @@ def test_dense_eigenproblem(carried: np.ndarray) -> None:
     arm.set_design(design_of(arm))
     modes = loaded_modes(arm.elastic, carried, 5, None)
     young, density = arm.solid.young_modulus, arm.solid.density
-    K, M = dense_matrices(arm.elastic, young * arm.material.stiffness, density * arm.material.mass)
+    K, M = dense_matrices(
+        arm.elastic, young * arm.current.material.stiffness, density * arm.current.material.mass
+    )
     M[-3:, -3:] += carried
     expected = scipy.linalg.eigh(K, M, eigvals_only=True)[:5]
     # LAPACK is right to 1e-16 of the largest eigenvalue, some 1e6 times the lowest.
