@@ -15,7 +15,6 @@ from mpi4py import MPI
 from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, options, same_basis
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
-    MIDDLE_THRESHOLD,
     HelmholtzFilter,
     Projected,
     average_of,
@@ -194,7 +193,7 @@ class Arm:
         kind = self.scene.design.projection
         if not kind:
             return (filtered,)
-        thresholds: Sequence[float] = (MIDDLE_THRESHOLD,)
+        thresholds: Sequence[float] = (0.5,)
         if kind == "robust":
             eroded, nominal, dilated = robust_thresholds(*self.scene.design.erosions)
             thresholds = (eroded, dilated, nominal)

@@ -368,9 +368,6 @@ def extruded(mesh: ArmMesh) -> sp.csr_matrix:
 # -- Heaviside projection of filtered designs: crisp at a threshold, with its exact derivative -
 
 
-MIDDLE_THRESHOLD = 0.5  # of the nominal design
-
-
 @dataclass(frozen=True, eq=False)
 class Projected:
     """A design projected at a fixed threshold; arrays (n_cells,), dimensionless.
@@ -420,4 +417,4 @@ def robust_thresholds(erosion: float, dilation: float) -> tuple[float, float, fl
 
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
     """
-    return MIDDLE_THRESHOLD + erosion, MIDDLE_THRESHOLD, MIDDLE_THRESHOLD - dilation
+    return 0.5 + erosion, 0.5, 0.5 - dilation

@@ -25,12 +25,6 @@ ROUNDING_ERROR_LIMIT = 0.4
 # off by at most 1e-6, from rounding.
 HARMLESS_CONTRAST = 1e7
 
-# -- stress ----------------------------------------------------------------------------------
-
-# Of the largest singular value of the loads' coefficients, by the lengths of their fields, below
-# which a direction of them is none.
-SUMS_RANK_SHARE = 1e-11
-
 # -- interior: the choice of a solver --------------------------------------------------------
 
 # Rows times bandwidth squared up to which a band is factorised as such: an arm of 1600 x 96 cells

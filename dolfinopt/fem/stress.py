@@ -31,7 +31,7 @@ from dolfinopt.fem.frames import (
 )
 from dolfinopt.fem.geometric_stiffness import FaceRotation, UnitLoads
 from dolfinopt.fem.laws import VON_MISES
-from dolfinopt.fem.measured import SUMS_RANK_SHARE
+from dolfinopt.fem.measured import ROUNDING_SHARE
 from dolfinopt.fem.tensors import ElementTensors, corner_functions
 from dolfinopt.parallel import on_root
 
@@ -221,7 +221,7 @@ def _factors(c: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Return A (n, r) and B (r, k) with c = A B, columns weighed by lengths (k,)."""
     lengths = np.where(lengths > 0.0, lengths, 1.0)
     left, sizes, right = np.linalg.svd(c * lengths, full_matrices=False)
-    kept = sizes > SUMS_RANK_SHARE * sizes[0]
+    kept = sizes > ROUNDING_SHARE * sizes[0]
     return left[:, kept] * sizes[kept], right[kept] / lengths
 
 

@@ -20,13 +20,10 @@ from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
 from dolfinopt.mesh.measured import (
     CORNER_CELL_RATIO,
     FILE_ROUNDING_SHARE,
-    RAY_SHIFT_SHARE,
     ROUND_CELLS,
-    SECTION_ALONG_SHARE,
     SECTION_CELLS,
     SECTION_END_CELLS,
     SECTION_LEAST_ALONG,
-    SHORT_CELL_SHARE,
 )
 from dolfinopt.mesh.solid_cells import ENDS, boundary, elements_of, points_by_tag
 
@@ -103,7 +100,7 @@ def member(section: Section, length: float, sides: tuple[float, float], share: f
     assert section.plane is not None
     layers = 1 + int(share * SECTION_CELLS)
     flat, quads = section.plane(*sides, share * section.largest(*sides), layers)
-    along = max(SECTION_LEAST_ALONG, round(length / (SECTION_ALONG_SHARE * max(sides))))
+    along = max(SECTION_LEAST_ALONG, round(2.0 * length / max(sides)))
     places = stations(length, along)
     points = np.concatenate([np.column_stack([np.full(len(flat), x), flat]) for x in places])
     first = np.concatenate([quads, quads + len(flat)], axis=1)
@@ -345,7 +342,7 @@ def box_hull(
 
 def _has_short(side: float, short: float) -> bool:
     """Return whether cells of this side, m, are long enough for short ones at the corners."""
-    return SHORT_CELL_SHARE * side > short
+    return side - short > 0.5 * short
 
 
 def _side(size: float, count: int, short: float) -> np.ndarray:
@@ -479,7 +476,7 @@ def read_hull(gmsh: Any, arm: Arm) -> Hull:
     facets = boundary(cells)
     halves = [facets[:, [0, k, k + 1]] for k in range(1, facets.shape[1] - 1)]
     triangles = points[np.concatenate(halves)]
-    shift = RAY_SHIFT_SHARE * (last - first)
+    shift = FILE_ROUNDING_SHARE * (last - first)
     outer = np.empty((len(x), len(rays), 3))
     outer[:, :, 0] = x[:, None]
     for i, at in enumerate(x):
