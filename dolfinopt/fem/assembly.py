@@ -317,12 +317,8 @@ class Cells:
             found -= origin
         return out
 
-    def cell_rows(self, columns: int) -> np.ndarray:
-        """Return room for derivatives by `differences`, (n - 1, n_cells, columns)."""
-        return np.empty((self.num_nodes - 1, self.count, columns))
-
     def sum_of_differences(self, rows: np.ndarray) -> np.ndarray:
-        """Return nodal derivatives (n_nodes, columns) of those by `differences`, `cell_rows`."""
+        """Return nodal derivatives (n_nodes, columns) of those (n - 1, n_cells, columns)."""
         return self._sum_differences @ rows.reshape(-1, rows.shape[2])
 
     @cached_property
@@ -378,9 +374,9 @@ class Cells:
 
     def forces(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Return K field (n_nodes, d, k) of this rank's cells, without translations' rounding."""
-        n, d, k = self.num_nodes, *field.shape[1:]
+        _, d, k = field.shape
         _, forces = self._strained(self.by_component(field), young, slice(None))
-        return self.sum_at_nodes(forces.reshape(n, d, k, -1))
+        return self.sum_at_nodes(forces.reshape(self.num_nodes, d, k, -1))
 
     def _strained(
         self, rows: np.ndarray, young: np.ndarray, cells: slice
@@ -488,7 +484,10 @@ class StiffenedModes:
         weighted = twice[:, None, None] * symmetric.T
         b = 0 if compliance is None else len(compliance)
         dim, columns = cells.operators.points.shape[1], q + loads - b
-        rows, by_young = cells.cell_rows(dim * columns), np.empty(cells.count)
+        rows, by_young = (
+            np.empty((cells.num_nodes - 1, cells.count, dim * columns)),
+            np.empty(cells.count),
+        )
         work = np.zeros((b, b))
         for run, products in self._products():
             count = len(run.young)

@@ -282,10 +282,6 @@ class ElasticArm:
         """M_II."""
         return self.substructure.interior_mass(self.M)
 
-    def interior_mass_times(self, V: np.ndarray) -> np.ndarray:
-        """Return M_II V of owned interior rows (num_interior, k)."""
-        return self.interior_mass.times(V)
-
     @cached_property
     def rigid_inertia(self) -> np.ndarray:
         """M [1, X] (n_nodes, d, 2), component by component, of this rank's cells; kg, kg m."""

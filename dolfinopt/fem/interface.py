@@ -6,9 +6,11 @@ There are b = 3 outboard coordinates in the plane, in space 6 of every outboard 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,13 +77,14 @@ class InterfaceTransformation:
         self.points = operators.points
         self.dim = self.points.shape[1]
         self._ghosted = fem.Function(operators.space)
-        self.inboard = self._nodes_of(mesh, mesh.inboard_facets, "inboard")
-        self.outboard = self._nodes_of(mesh, mesh.outboard_facets, "outboard")
-        self.ends = [self.outboard]
+        sides = {"inboard": mesh.inboard_facets, "outboard": mesh.outboard_facets}
+        sides |= {one.name: one.facets for one in mesh.further}
+        masks = {name: self._nodes_of(mesh, facets, name) for name, facets in sides.items()}
+        self._check_apart(mesh, masks)
+        self.inboard, *self.ends = masks.values()
+        self.outboard = np.any(self.ends, axis=0)
         self.places = np.array([mesh.outboard_point, *mesh.further_points])
-        self.rigid = self._rigid_field(self.outboard, mesh.outboard_point)
-        if mesh.further:
-            self._add_further(mesh)
+        self.rigid = self._rigid_field()
         self.num_coordinates = self.rigid.shape[2]
         self._number_interior(graph)
 
@@ -91,34 +94,25 @@ class InterfaceTransformation:
         for name in ("_fit", "_rigid"):
             other.__dict__.pop(name, None)
         other.points = points
-        fields = [other._rigid_field(at, x) for at, x in zip(self.ends, self.places, strict=True)]
-        other.rigid = np.concatenate(fields, axis=2)
+        other.rigid = other._rigid_field()
         return other
 
-    def _rigid_field(self, at: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Return the rigid motions (n_nodes, d, 3 or 6) about a point of the nodes `at`."""
-        nodes = np.flatnonzero(at)
-        motions = rigid_motions(self.points[nodes] - point)
-        field = np.zeros((len(self.points), *motions.shape[1:]))
-        field[nodes] = motions
-        return field
+    def _rigid_field(self) -> np.ndarray:
+        """Return the rigid motions (n_nodes, d, b) of each interface about its point."""
+        parts = [
+            rigid_motions(self.points - x) * at[:, None, None]
+            for at, x in zip(self.ends, self.places, strict=True)
+        ]
+        return np.concatenate(parts, axis=2)
 
-    def _add_further(self, mesh: ArmMesh) -> None:
-        """Add the further outboard interfaces; two that share a node, rigid both, are refused."""
-        for one in mesh.further:
-            self.ends.append(self._nodes_of(mesh, one.facets, one.name))
-        names = ["inboard", "outboard", *(one.name for one in mesh.further)]
-        masks = [self.inboard, *self.ends]
-        for k, mask in enumerate(masks):
-            for j in range(k):
-                if self.comm.allreduce(int((mask & masks[j]).sum())):
-                    raise InputError(
-                        f"arm {mesh.name!r}: interfaces {names[j]!r} and {names[k]!r} share nodes; "
-                        "each is rigid: leave a cell between them"
-                    )
-        fields = [self._rigid_field(at, x) for at, x in zip(self.ends, self.places, strict=True)]
-        self.rigid = np.concatenate(fields, axis=2)
-        self.outboard = np.any(self.ends, axis=0)
+    def _check_apart(self, mesh: ArmMesh, masks: Mapping[str, np.ndarray]) -> None:
+        """Raise InputError where two interfaces, rigid both, share a node."""
+        for one, other in combinations(masks, 2):
+            if self.comm.allreduce(int((masks[one] & masks[other]).sum())):
+                raise InputError(
+                    f"arm {mesh.name!r}: interfaces {one!r} and {other!r} share nodes; "
+                    "each is rigid: leave a cell between them"
+                )
 
     def _nodes_of(self, mesh: ArmMesh, facets: np.ndarray, side: str) -> np.ndarray:
         """Return (n_nodes,) True for the nodes of the interface `side`."""
@@ -161,7 +155,7 @@ class InterfaceTransformation:
         work = self._ghosted.x.array
         for k in range(values.shape[1]):
             work[0 :: self.dim] = values[:, k]
-            compat.scatter_forward(self._ghosted)
+            self._ghosted.x.scatter_forward()
             out[:, k] = work[0 :: self.dim]
         return out
 
