@@ -462,51 +462,33 @@ class StiffenedModes:
         K0 = half.reshape(loads, q, q)
         return 0.5 * (K0 + K0.swapaxes(1, 2))
 
-    def gradient(
-        self, by_K0: np.ndarray, compliance: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    def gradient(self, by_K0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Differentiate a function of K0, given its derivative by K0 (loads, q, q), any symmetry.
 
-        Args:
-            by_K0: the derivative.
-            compliance: C (b, b), where the last b fields are u_F = Psi C with the first b modes
-                Psi: their derivatives are then among those by the modes.
-
         Returns:
-            Its derivatives by the modes (n_nodes, d, q) and by the fields, or those but the last
-            b, (n_nodes, d, loads), contributions of this rank's cells; by Young's modulus
-            (n_cells,), both held; and Psi' times the derivatives by u_F (b, b), or None.
+            Its derivatives by the modes (n_nodes, d, q) and by the fields (n_nodes, d, loads),
+            contributions of this rank's cells; by Young's modulus (n_cells,), both held.
         """
         (q, loads), cells, T = self._shape, self._cells, self._cells.operators.geometric
         symmetric = (0.5 * (by_K0 + by_K0.swapaxes(1, 2))).reshape(loads, -1)
         # Of b = c both factors are the same.
         twice = np.array([2.0 if b == c else 1.0 for b, c in self._pairs])
         weighted = twice[:, None, None] * symmetric.T
-        b = 0 if compliance is None else len(compliance)
-        dim, columns = cells.operators.points.shape[1], q + loads - b
-        rows, by_young = (
-            np.empty((cells.num_nodes - 1, cells.count, dim * columns)),
-            np.empty(cells.count),
-        )
-        work = np.zeros((b, b))
+        dim = cells.operators.points.shape[1]
+        rows = np.empty((cells.num_nodes - 1, cells.count, dim * (q + loads)))
+        by_young = np.empty(cells.count)
         for run, products in self._products():
             count = len(run.young)
-            by = np.empty((*run.u.shape[:2], columns, count))
             transposed = of_cells(T, run.cells).swapaxes(1, 2)
             by_u = times(transposed, np.matmul(symmetric, products)).reshape(run.u.shape)
-            by[:, :, q:] = by_u[:, :, : loads - b]
             by_a = self._by_modes(run.a, np.matmul(weighted, run.force))
             # Of second degree in a: a times the derivative by it is twice the value.
             energy = np.einsum("ie,ie->e", run.a.reshape(-1, count), by_a.reshape(-1, count))
             by_young[run.cells] = 0.5 * energy
-            np.multiply(by_a, run.young, out=by[:, :, :q])
-            if compliance is not None:
-                outboard = by_u[:, :, loads - b :]
-                by[:, :, :b] += np.matmul(compliance.T, outboard)
-                work += np.matmul(run.a[:, :, :b], outboard.swapaxes(2, 3)).sum(axis=(0, 1))
+            by = np.concatenate([by_a * run.young, by_u], axis=2)
             rows[:, run.cells] = by.reshape(len(by), -1, count).swapaxes(1, 2)
-        nodal = cells.sum_of_differences(rows).reshape(-1, dim, columns)
-        return nodal[:, :, :q], nodal[:, :, q:], by_young, work if b else None
+        nodal = cells.sum_of_differences(rows).reshape(-1, dim, q + loads)
+        return nodal[:, :, :q], nodal[:, :, q:], by_young
 
     def stiffness_products(self, left: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,) of the first fields.

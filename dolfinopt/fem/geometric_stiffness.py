@@ -112,38 +112,23 @@ class UnitLoads:
             known = self._last["modes"] = V, StiffenedModes(cells, self.fields, self.arm.young, V)
         return known[1]
 
-    def gradient(
-        self, V: np.ndarray, by_K0: np.ndarray, *, static: bool = False
-    ) -> GeometricGradient:
+    def gradient(self, V: np.ndarray, by_K0: np.ndarray) -> GeometricGradient:
         """Differentiate a function of K0 by modes and material (collective on the arm's ranks).
 
-        The stresses' part goes through one static solve a load, the adjoint of u_p. Those of the
-        interface's loads are not needed where the constraint modes Psi have an adjoint anyway:
-        u_F = Psi S^-1 with S = Psi'K Psi.
+        The stresses' part goes through one static solve a load, the adjoint of u_p.
 
         Args:
             V: (n_nodes, d, q) as given to `geometric_stiffness`, and to `with_modes` if that was.
             by_K0: (p, q, q) derivatives.
-            static: whether V begins with the constraint modes, by which `by_modes` then
-                differentiates u_F, too, and `by_stiffness` by S.
         """
-        arm, inertial = self.arm, self.num_inertial
-        modes = arm.constraint_modes()
-        compliance = np.linalg.inv(modes.stiffness)
-        known = self.stiffened(V)
-        by_V, forces, direct, work = known.gradient(by_K0, compliance if static else None)
-        by_stiffness = np.zeros_like(compliance)
+        arm = self.arm
+        by_V, forces, direct = self.stiffened(V).gradient(by_K0)
         face = self._face.gradient(self._face_tensors, V, by_K0)
-        by_V = by_V + face.by_modes
         direct = direct + self._face.stiffness_products(face.y, self.fields)
-        forces = forces + face.by_fields[:, :, : forces.shape[2]]
-        if static:  # those of the interface's loads are folded already
-            assert work is not None
-            outboard = face.by_fields[:, :, inertial:]
-            work = work + _fold(outboard, by_V, modes.field, compliance)
-            by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
+        forces = forces + face.by_fields
         adjoint = arm.static_response(*arm.restrict(forces))
-        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face)
+        by_V = by_V + face.by_modes
+        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, face)
         if self.modes is None:
             return found
         return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
@@ -158,10 +143,8 @@ class GeometricGradient:
         modes, by_K0: (n_nodes, d, q) and (p, q, q), as given.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         direct: (n_cells,) by Young's modulus, modes and fields held.
-        by_fields: (n_nodes, d, k) by the fields of the first k loads, contributions of this
-            rank's cells; those of the others are among those by modes and S.
-        adjoint: (n_nodes, d, k) of these fields.
-        by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
+        by_fields: (n_nodes, d, p) by the fields of the loads, contributions of this rank's cells.
+        adjoint: (n_nodes, d, p) of these fields.
         face: of the interfaces' rotations.
     """
 
@@ -172,7 +155,6 @@ class GeometricGradient:
     direct: np.ndarray
     by_fields: np.ndarray
     adjoint: np.ndarray
-    by_stiffness: np.ndarray
     face: FaceGradient
 
     def by_young(self, left: np.ndarray) -> np.ndarray:
@@ -188,8 +170,7 @@ class GeometricGradient:
     @property
     def stiffness(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Fields l and r of l . dK r, modes held, but for what stiffens the cells themselves."""
-        every = self.loads.fields
-        return [(-self.adjoint, every[:, :, : self.adjoint.shape[2]]), (self.face.y, every)]
+        return [(self.face.y - self.adjoint, self.loads.fields)]
 
     def at_interfaces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives by the outboard interfaces' shape, modes held (collective).
@@ -197,20 +178,19 @@ class GeometricGradient:
         By `InterfaceTransformation.rigid` (n_nodes, d, b), in which the fields and their adjoints
         move the interfaces' nodes; and by the nodes' places as lever arms (n_nodes, d).
         """
-        loads, arm, k = self.loads, self.loads.arm, self.adjoint.shape[2]
-        T, fields, accelerations = arm.substructure.T, loads.fields[:, :, :k], loads.accelerations
-        residual = arm.stiffness_times(fields)
-        count = min(k, accelerations.shape[2])
-        residual[:, :, :count] -= arm.mass_times(accelerations[:, :, :count])
+        loads, arm = self.loads, self.loads.arm
+        T, accelerations = arm.substructure.T, loads.accelerations
+        residual = arm.stiffness_times(loads.fields)
+        residual[:, :, : loads.num_inertial] -= arm.mass_times(accelerations)
         by_fields = self.by_fields - arm.stiffness_times(self.adjoint)
-        rigid = by_fields @ T.coordinates(fields).T - residual @ T.coordinates(self.adjoint).T
+        rigid = by_fields @ T.coordinates(loads.fields).T
+        rigid -= residual @ T.coordinates(self.adjoint).T
         return rigid, loads.by_levers(self.face)
 
     @cached_property
     def _by_loads(self) -> np.ndarray:
         """By the loads f_p that are inertia (n_nodes, d, k)."""
-        adjoint = self.adjoint[:, :, : self.loads.num_inertial]
-        return np.asarray(adjoint - self.face.y[:, :, : adjoint.shape[2]])
+        return np.asarray((self.adjoint - self.face.y)[:, :, : self.loads.num_inertial])
 
     @property
     def by_inertia(self) -> np.ndarray:
@@ -221,14 +201,6 @@ class GeometricGradient:
     def by_modal_inertia(self) -> np.ndarray:
         """Fields whose products with d(M V) are the modal loads' part (n_nodes, d, q)."""
         return self._by_loads[:, :, self.loads.num_frame :]
-
-
-def _fold(
-    outboard: np.ndarray, by_V: np.ndarray, psi: np.ndarray, compliance: np.ndarray
-) -> np.ndarray:
-    """Add derivatives by u_F = Psi C (n_nodes, d, b) to those by Psi; return Psi' times them."""
-    by_V[:, :, : len(compliance)] += combine(outboard, compliance)
-    return np.tensordot(psi, outboard, ((0, 1), (0, 1)))
 
 
 def unit_loads(arm: ElasticArm) -> UnitLoads:

@@ -309,7 +309,7 @@ class Prestress:
             by_K0: (p, q, q).
         """
         arm, fields = self.arm, self.fields
-        by_modes, by_u, direct, _ = self._stiffened(V).gradient(by_K0)
+        by_modes, by_u, direct = self._stiffened(V).gradient(by_K0)
         face = self._face.gradient(self.rotation, V, by_K0)
         by_u = by_u + face.by_fields
         through = fields.gradient(self.a, by_u)
