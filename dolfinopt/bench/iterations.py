@@ -173,7 +173,7 @@ class PlainStatics:
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the compliance and its derivative (n_cells,) by x; in space energies of cells."""
         self.x.x.array[: self.count] = x if self.in_plane else self.modulus * (FLOOR + x**PENALTY)
-        compat.scatter_forward(self.x)
+        self.x.x.scatter_forward()
         self.K.zeroEntries()
         petsc.assemble_matrix(self.K, self._stiffness, bcs=[self._clamp])
         self.K.assemble()
@@ -186,7 +186,7 @@ class PlainStatics:
         self._ksp.setOperators(self.K)
         self._ksp.solve(self.load, self._solution)
         self.u.x.array[: len(self._solution.array)] = self._solution.array
-        compat.scatter_forward(self.u)
+        self.u.x.scatter_forward()
         gradient = petsc.assemble_vector(self._gradient).array_r.copy()
         return float(self.load.dot(self._solution)), gradient
 

@@ -49,8 +49,13 @@ STRAIGHT = {  # by dimension and number of corners
     (3, 4): TETRAHEDRON,
     (3, 8): HEXAHEDRON,
 }
-# From Gmsh's order of a hexahedron's corners to that of a tensor product.
-TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+# From Gmsh's order of corners to that of a tensor product, DOLFINx's.
+TENSOR = {
+    (2, 3): [0, 1, 2],
+    (2, 4): [0, 1, 3, 2],
+    (3, 4): [0, 1, 2, 3],
+    (3, 8): [0, 1, 3, 2, 4, 5, 7, 6],
+}
 # Sides of cells in Gmsh's order of corners, around them, by the number of corners.
 SIDES = {
     4: [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],

@@ -31,7 +31,6 @@ from dolfinopt.responses.stress import (
     PointStress,
     Stress,
     arm_loads,
-    every_instant,
     maxima,
     motions_of,
     screen,
@@ -91,10 +90,10 @@ def stress_of_parts(
         if not arms[k].solid.law.has_strength:
             continue
         state = arms[k].current
-        points = parts[k].stress(state, state.load_fields_of(every_instant(loads)))
+        points = parts[k].stress(state, state.load_fields)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
         for one in loads:
-            a, t = points.coefficients(one), motions[one.motion].t
+            a, t = one.coefficients, motions[one.motion].t
             best = points.peak(a, t, np.flatnonzero(counts))
             known = found.get(one.place)
             if known is not None and known.peak.value >= best.value:
@@ -151,7 +150,7 @@ class CornerStress(PointStress):
         by_weights: np.ndarray,
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to nodes, see `PointStress`; which count is held."""
-        at, columns = self.corners.ravel(), self.fields.to_columns.T @ a.T
+        at, columns = self.corners.ravel(), a.T
         by_own = by[:, at] * self.shares.ravel()[:, None]
         apart = np.einsum("cim,cim->i", by_own, self.own @ columns - (self.A @ columns)[:, at])
         by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area

@@ -97,8 +97,8 @@ def by_densities(state: DesignState, products: Products) -> np.ndarray:
     elastic, pairs = state.elastic, products.stiffness
     energies, masses = np.zeros((2, len(state.x_phys)))
     if products.geometric is not None:
-        (left, V), *pairs = pairs
-        energies += products.geometric.by_young_beside(left, V)
+        (left, _), *pairs = pairs
+        energies += products.geometric.by_young(left)
     for left, right in pairs:
         energies += elastic.cell_stiffness_products(left, right)
     for left, right in products.mass:

@@ -86,13 +86,9 @@ def _body_products(
         by_V += displaced.by_modes
     geometric = None
     if cotangents.is_stiffened:
-        static = state.scene.reduction.method == "craig-bampton"
         by_K0 = np.concatenate([cotangents.K0, by_modes, cotangents.K0_outboard])
-        geometric = state.stiffening_loads.gradient(V, by_K0, static=static)
+        geometric = state.stiffening_loads.gradient(V, by_K0)
         by_V += geometric.by_modes
-        if static:  # K's first block is S; the constraint modes' interior is in equilibrium
-            b = len(geometric.by_stiffness)
-            by_K[:b, :b] += geometric.by_stiffness
     interior, outboard = elastic.restrict(by_V)
     method = METHODS[state.scene.reduction.method]
     assert method.adjoint is not None  # the scene refuses the others
@@ -132,9 +128,6 @@ def _at_interfaces(
     T, V = elastic.substructure.T, basis.V
     by_V = by_V - elastic.stiffness_times(fields.stiffness) + elastic.mass_times(fields.mass)
     if geometric is not None:
-        by_S = geometric.by_stiffness + geometric.by_stiffness.T  # see `_body_products`
-        b = len(by_S)
-        by_V[:, :, :b] += elastic.stiffness_times(combine(V[:, :, :b], by_S))
         by_V -= geometric.face.by_modes  # the rotations are coordinates, whatever T
     rigid = by_V @ basis.outboard.T
     rigid -= elastic.stiffness_times(V) @ T.coordinates(fields.stiffness).T

@@ -61,10 +61,6 @@ class PointStress(ABC):
     A: np.ndarray
     weights: np.ndarray
 
-    def coefficients(self, loads: ArmLoads) -> np.ndarray:
-        """Return those (n, m) of `LoadFields.columns`."""
-        return np.asarray(loads.coefficients @ self.fields.to_columns)
-
     def power_sum(self, a: np.ndarray, unit: float, exponent: float) -> float:
         """Return sum_n sum_e weight_e (s_en / unit)^p over this rank's cells; a is (n, m)."""
         return sum(
@@ -362,11 +358,11 @@ class Stress(Response):
         screened: dict[int, list[Screened]] = {}
         with together(world):
             for k, state in analysis.designs.items():
-                fields = state.load_fields_of(every_instant(by_owner[k]))
+                fields = state.load_fields
                 points[k] = own = self.points_of(k, state, fields)
                 with analysis.profile.phase("stress"):
                     screened[k] = [
-                        screen(partition.comm, own.A, own.coefficients(one)) for one in by_owner[k]
+                        screen(partition.comm, own.A, one.coefficients) for one in by_owner[k]
                     ]
         each = [one for own in screened.values() for one in own]
         largest = world.allreduce(max((one.largest for one in each), default=0.0), MPI.MAX)
@@ -380,7 +376,7 @@ class Stress(Response):
                 by_owner[k] = [
                     loads.at(found.counted[found.summed >= cut]) for loads, found in pairs
                 ]
-                a = every_instant(by_owner[k]) @ one.fields.to_columns
+                a = every_instant(by_owner[k])
                 total = one.power_sum(a, largest, p) if largest else 0.0
                 sums[k] = np.array([total, one.weights.sum() * counts[k]])
         total, weight = sum_over_arms(partition, sums)
@@ -445,8 +441,7 @@ def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.nda
         if sums.total:
             p, counts = sums.exponent, points.weights > 0.0
             factor = sums.total ** (1.0 / p - 1.0) * sums.weight ** (-1.0 / p)
-            columns = a @ points.fields.to_columns
-            by, by_logs = points.power_sum_gradient(columns, sums.largest, p)
+            by, by_logs = points.power_sum_gradient(a, sums.largest, p)
             by *= factor
             by_logs *= factor
             # Of total / weight, to the power 1 / p: a point's part in either is its weight

@@ -16,7 +16,6 @@ from dolfinopt.responses.stress import (
     Screened,
     arm_loads,
     cell_stress,
-    every_instant,
     maxima,
     screen,
 )
@@ -125,7 +124,7 @@ def _of_design(
     (n_cells, arms, 2).
     """
     comm, state = partition.comm, arm.current
-    fields = state.load_fields_of(every_instant(every))
+    fields = state.load_fields
     stress = cell_stress(state, fields, arm.scene.objective.stress_margin)
     operators = state.elastic.operators
     points = stress_points(operators.cell)
@@ -141,7 +140,7 @@ def _of_design(
         return Peak(found.largest, tuple(map(float, place)), float(t[found.instant]))
 
     for one in every:
-        a = stress.coefficients(one)
+        a = one.coefficients
         by_cell, when = maxima(comm, stress.A, a)
         largest = screen(comm, stress.A, a)
         if largest.point >= 0:  # the map is right to a thousandth
