@@ -27,11 +27,7 @@ from dolfinopt.multibody.shape_integrals import (
     rigid_body,
     rigid_spatial_body,
 )
-from dolfinopt.multibody.tree import (
-    GROUND,
-    Joint,
-    Mechanism,
-)
+from dolfinopt.multibody.tree import GROUND, Joint, Mechanism
 
 # -- the flexible slider-crank `crank.f` of the IVP test set, through bodies of its matrices
 #
@@ -49,58 +45,31 @@ PI = np.pi
 STEPS, STAGES = 3200, 5  # fewer leave axial vibrations of the undamped rod in the multipliers
 
 
-def plane_body(
-    mass: float,
-    moment: np.ndarray,
-    inertia: float,
-    C: np.ndarray,
-    j: np.ndarray,
-    r: np.ndarray,
-    M: np.ndarray,
-    G: np.ndarray,
-    K: np.ndarray,
-    D: np.ndarray,
-    outboard: np.ndarray,
-    outboard_point: np.ndarray,
-    K0: np.ndarray | None = None,
-) -> ShapeIntegrals:
-    """Return a plane body from its integrals by name, see `ShapeIntegrals`.
-
-    K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
-    """
-    none = np.zeros((0, *K.shape))
-    W = np.array(
-        [np.block([[inertia, j], [j[:, None], M]]), np.block([[0.0, 0.0 - r], [r[:, None], G]])]
-    )
-    w, K0 = np.column_stack([moment, C]), none if K0 is None else K0
-    further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
-    return ShapeIntegrals(
-        float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:], further, none
-    )
-
-
 def rod() -> ShapeIntegrals:
     """Return the rod; its axial mass is the file's, which is 15 times that of the element."""
     area, mass = HEIGHT**2, DENSITY * HEIGHT**2 * ROD
-    M, K, G = np.zeros((3, 4, 4))
+    M, K, G, none = np.zeros((4, 4, 4))
     M[0, 0] = M[1, 1] = 0.5
     M[2:, 2:] = [[8.0, 1.0], [1.0, 2.0]]
     K[0, 0], K[1, 1] = np.array([1.0 / 24.0, 2.0 / 3.0]) * PI**4 * (HEIGHT / ROD) ** 2
     K[2:, 2:] = np.array([[16.0, -8.0], [-8.0, 7.0]]) / 3.0
     G[0, 2], G[0, 3], G[1, 3] = 16.0 / PI**3, 1.0 / PI - 8.0 / PI**3, -0.5 / PI
-    return plane_body(
+    C = mass * np.array([[0.0, 0.0, 2.0 / 3.0, 1.0 / 6.0], [2.0 / PI, 0.0, 0.0, 0.0]])
+    j = mass * ROD * np.array([[0.0, 0.0, 1.0 / 3.0, 1.0 / 6.0]])
+    r = mass * ROD * np.array([[1.0 / PI, -0.5 / PI, 0.0, 0.0]])
+    second = np.block([[np.full((1, 1), ROD_INERTIA), j], [j.T, mass * M]])
+    turning = np.block([[np.zeros((1, 1)), 0.0 - r], [r.T, mass * (G - G.T)]])
+    return ShapeIntegrals(
         mass=ROD_MASS,
-        moment=np.array([0.5 * ROD_MASS * ROD, 0.0]),
-        inertia=ROD_INERTIA,
-        C=mass * np.array([[0.0, 0.0, 2.0 / 3.0, 1.0 / 6.0], [2.0 / PI, 0.0, 0.0, 0.0]]),
-        j=mass * ROD * np.array([0.0, 0.0, 1.0 / 3.0, 1.0 / 6.0]),
-        r=mass * ROD * np.array([1.0 / PI, -0.5 / PI, 0.0, 0.0]),
-        M=mass * M,
-        G=mass * (G - G.T),
+        w=np.column_stack([[0.5 * ROD_MASS * ROD, 0.0], C]),
+        W=np.array([second, turning]),
         K=YOUNG * area / ROD * K,
-        D=np.zeros((4, 4)),
+        D=none,
         outboard=np.array([[0.0, 0.0, 0.0, 1.0], np.zeros(4), [-PI / ROD, 2.0 * PI / ROD, 0, 0]]),
         outboard_point=np.array([ROD, 0.0]),
+        K0=np.zeros((0, 4, 4)),
+        K0_outboard=np.zeros((0, 4, 4)),
+        further_points=np.zeros((0, 2)),
     )
 
 
@@ -184,8 +153,7 @@ def crank_values(steps: int = STEPS) -> dict[str, float]:
     state = system.at(np.array([END])).state(y, yd, ydd)
     motion = state.motion
     place = end_effector(system.mechanism, motion, y[:, 1:5])[0]
-    t = np.linspace(0.0, END, 4001)
-    bending = np.abs(solution.sample(t)[:, 1])
+    bending = np.abs(solution.sample(np.linspace(0.0, END, 4001))[:, 1])
     return {
         "angle of the rod": float(motion.q[0, 1:].sum()),
         "slider": float(place[0]),
@@ -193,7 +161,6 @@ def crank_values(steps: int = STEPS) -> dict[str, float]:
         "force across the line": float(-ydd[0, 5]),
         "moment of the crank": float(-state.forces()[0, 1]),
         "largest bending": float(bending.max()),
-        "its instant": float(t[bending.argmax()]),
     }
 
 
@@ -218,25 +185,11 @@ COLUMNS = 19  # t, then six angles, speeds and currents
 TINY = 1e-10  # singular values, over the largest, of parameters that have no effect
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
-    """What was measured.
+def read_record(file: Path, first: int, last: int) -> tuple[RigidMotion, np.ndarray, np.ndarray]:
+    """Return motion of the joints and torques (n, 6), N m, measured and filtered, of some rows.
 
-    Attributes:
-        motion: of the joints at n instants; speeds filtered, accelerations their differences.
-        torque, smooth: (n, 6) of the motors' currents, as measured and filtered, N m.
-    """
-
-    motion: RigidMotion
-    torque: np.ndarray
-    smooth: np.ndarray
-
-
-def read_record(file: Path, first: int, last: int) -> Record:
-    """Return rows of a record: t, six angles, speeds and currents, and what is not used here.
-
-    Raises:
-        InputError: there is no such file, or it is another one.
+    Speeds are filtered, accelerations their differences. InputError: there is no such file, or it
+    is another one.
     """
     try:
         table = np.loadtxt(file, delimiter=",", skiprows=first - 1, max_rows=last - first + 1)
@@ -255,27 +208,27 @@ def read_record(file: Path, first: int, last: int) -> Record:
     qd, qdd = smooth(qd, CUTOFF), np.zeros_like(q)
     qdd[1:-1] = (qd[2:] - qd[:-2]) / (t[2:] - t[:-2])
     motion = RigidMotion(q, qd, smooth(qdd, CUTOFF))
-    return Record(motion, GAINS * current, GAINS * smooth(current, CURRENT_CUTOFF))
+    return motion, GAINS * current, GAINS * smooth(current, CURRENT_CUTOFF)
 
 
 def machine(file: Path) -> Mechanism:
     """Return the robot of a URDF file, all links rigid."""
     robot = read_robot(file)
-    found, joints = scene_bodies(robot, (), robot.movable[-1].child), []
-    number = {body.link: k for k, body in enumerate(found)}
+    found = scene_bodies(robot, (), robot.movable[-1].child)
+    links = [body.link for body in found]
     moving = [body.link for body in found if body.joint.moves]
-    for body in found:
-        joints.append(
-            Joint(
-                name=body.joint.name,
-                kind="revolute" if body.joint.moves else "fixed",
-                parent=number.get(body.parent, GROUND),
-                coordinate=moving.index(body.link) if body.joint.moves else None,
-                axis=body.axis / np.linalg.norm(body.axis),
-                origin=body.pose[:3, 3],
-                rotation=body.pose[:3, :3],
-            )
+    joints = [
+        Joint(
+            body.joint.name,
+            "revolute" if body.joint.moves else "fixed",
+            links.index(body.parent) if body.parent in links else GROUND,
+            moving.index(body.link) if body.joint.moves else None,
+            body.axis / np.linalg.norm(body.axis),
+            body.pose[:3, 3],
+            body.pose[:3, :3],
         )
+        for body in found
+    ]
     bodies = [rigid_spatial_body(1.0, np.zeros(3), np.zeros(6)) for _ in found]
     down, end = np.array(GRAVITY)[:, None], (len(found) - 1, 0)
     return Mechanism(tuple(bodies), tuple(joints), {}, down, end, np.zeros(3))
@@ -307,20 +260,15 @@ def regressor(mechanism: Mechanism, motion: RigidMotion) -> np.ndarray:
 def ur10e_values(records: Path | None) -> dict[str, float]:
     """Return the share of each joint's torque that is not predicted, |measured - predicted|.
 
-    Over |measured|, of the record `PREDICTED` with the parameters of the record `LEARNT`.
-
-    Args:
-        records: a checkout of the repository with the robot and its records.
-
-    Raises:
-        InputError: a file of it is missing.
+    Over |measured|, of the record `PREDICTED` with the parameters of the record `LEARNT`; `records`
+    is a checkout of the repository with both and the robot. InputError: a file of it is missing.
     """
     assert records is not None
     mechanism = machine(records / UR10E)
     learnt, tested = (read_record(records / file, *rows) for file, *rows in (LEARNT, PREDICTED))
-    rows = regressor(mechanism, learnt.motion)
+    rows = regressor(mechanism, learnt[0])
     count = rows.shape[2]
-    found = np.linalg.lstsq(rows.reshape(-1, count), learnt.smooth.ravel(), rcond=TINY)[0]
-    off = tested.torque - regressor(mechanism, tested.motion) @ found
-    shares = np.linalg.norm(off, axis=0) / np.linalg.norm(tested.torque, axis=0)
+    found = np.linalg.lstsq(rows.reshape(-1, count), learnt[2].ravel(), rcond=TINY)[0]
+    off = tested[1] - regressor(mechanism, tested[0]) @ found
+    shares = np.linalg.norm(off, axis=0) / np.linalg.norm(tested[1], axis=0)
     return {f"joint {k}": float(one) for k, one in enumerate(shares, start=1)}

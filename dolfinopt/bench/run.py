@@ -16,7 +16,6 @@ from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, version, write
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.study.tables import Table
 
 Tell = Callable[[str], None]
@@ -106,7 +105,6 @@ def source(folder: Path = Path(__file__).parents[1]) -> str:
 FASTER = 50.0  # than SciPy
 LARGE = 4e4  # elements per arm up to which the exponent is fitted
 SETTLED, DEMO = (math.prod(cells) for cells in (iterations.SETTLED, iterations.DEMO))
-FEWEST, MILLION = 15_000, 900_000  # dofs from which on goals of links, and of their memory, hold
 
 
 class Goal(NamedTuple):
@@ -139,9 +137,6 @@ def _at(frame: Frame, **values: object) -> Frame:
     for name, value in values.items():
         frame = frame[frame[name.replace("_", " ")] == value]
     return frame
-
-
-# -- plane arms ------------------------------------------------------------------------------
 
 
 def _usual(coordinates: int, frame: Frame) -> Frame:
@@ -181,46 +176,6 @@ def _demo(frame: Frame) -> float:
     return done[done["iterations"] > iterations.COUNTED]["all iterations, wall clock [s]"].min()
 
 
-# -- solid links, the optimiser --------------------------------------------------------------
-
-
-def _links(frame: Frame, what: str, ranks: int) -> Frame:
-    return _at(frame[frame["dofs"] >= FEWEST], what=what, ranks=ranks)
-
-
-def _beside_plain(what: str, ranks: int, frame: Frame) -> float:
-    """Return the largest ratio of an iteration to plain DOLFINx's of all sizes."""
-    ours, plain = (_links(frame, one, ranks)["iteration [s]"] for one in (what, solid.PLAIN))
-    return (ours / plain.to_numpy()).max() if len(ours) == len(plain) else math.nan
-
-
-def _power_of_dofs(what: str, ranks: int, frame: Frame) -> float:
-    """Return the power of the dofs that time grows with beyond the range of factors."""
-    ours = _at(_links(frame, what, ranks), solver=solid.ITERATIVE)
-    return fitted_power(ours[["dofs", "iteration [s]"]])
-
-
-def _over_pymoto(design: str, dofs: int, frame: Frame) -> float:
-    """Return the seconds over pyMOTO's of the largest link with at most so many dofs."""
-    here = _at(frame[frame["dofs"] <= dofs], design=design)
-    ours, theirs = (_at(here, program=one) for one in (solid.STATIC, solid.PYMOTO))
-    if not len(ours) or len(ours) != len(theirs):
-        return math.nan
-    return ours["iteration [s]"].iloc[-1] / theirs["iteration [s]"].iloc[-1]
-
-
-def _over_straight(frame: Frame) -> float:
-    """Return the rod's least mass over that of the best one drawn by hand."""
-    kept = frame[(frame["problem"] == iterations.ROD) & (frame["largest excess [-]"] <= EXCESS)]
-    drawn = kept["start"].isin(iterations.DRAWN)
-    return kept[~drawn]["objective"].min() / kept[drawn]["objective"].min()
-
-
-def _infeasible(frame: Frame) -> float:
-    made = frame[frame["iterations"] > 0]
-    return float((made["largest excess [-]"] > EXCESS).sum()) if len(made) else math.nan
-
-
 GOALS = (
     Goal("time", "simulation to 1e-4 from cold, 4 coordinates per arm [s]", 0.03,
          lambda f: _usual(4, f)[accuracy.SECONDS].max()),
@@ -241,24 +196,4 @@ GOALS = (
          * _at(f, element=accuracy.DEFAULT, cells="50 x 3")[accuracy.TIP_ERROR].min()),
     Goal("tolerance", "largest true error over simulation.tolerance [-]", 1.0,  # inf: it failed
          lambda f: (f["true error [-]"] / f["tolerance [-]"]).max()),
-    Goal("optimiser", "objective from a start over the best of its problem, the largest [-]", 1.05,
-         lambda f: iterations.over_best(f[f["iterations"] > 0])[iterations.OVER].max()),
-    Goal("optimiser", "mass of the rod over the best straight one [-]", 1.0, _over_straight),
-    Goal("optimiser", "evaluations for an iteration, mean [-]", 1.3,
-         lambda f: f["evaluations"].sum() / (f["iterations"].sum() or math.nan)),
-    Goal("optimiser", "runs that end without a feasible design", 0.0, _infeasible),
-    *(Goal("solid", f"{what}, {ranks} rank{'s' * (ranks > 1)} [-]", limit,
-           partial(measure, design, ranks))
-      for ranks in (1, 2) for what, limit, measure, design in (
-       ("iteration beside plain DOLFINx, the largest of all links", 3.0, _beside_plain, solid.COLD),
-       ("with warm starts beside it, the largest of all links", 1.5, _beside_plain, solid.WARM),
-       ("exponent of a first design beyond the range of factors", 1.15, _power_of_dofs, solid.COLD),
-       ("exponent of a nearby design beyond the range of factors", 1.15, _power_of_dofs,
-        solid.WARM),
-    )),
-    *(Goal("statics", f"nearby design over pyMOTO's, up to {dofs} dofs [-]", limit,
-           partial(_over_pymoto, solid.NEARBY, dofs))
-      for dofs, limit in ((80_000, 0.7), (170_000, 1.0))),
-    Goal("solid", "memory of a million dofs on two ranks [GB]", 20.0,
-         lambda f: _links(f[f["dofs"] >= MILLION], solid.COLD, 2)["memory [GB]"].max()),
 )  # fmt: skip

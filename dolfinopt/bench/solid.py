@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.bench.iterations import PlainStatics, pymoto_iteration
+from dolfinopt.bench.iterations import plain_statics, pymoto_iteration
 from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.fem.multigrid import NAME as ITERATIVE
@@ -80,9 +80,9 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     """Return a static iteration in plain DOLFINx: trilinear hexahedra, one load (collective)."""
     arm, solid = box_arm(comm, "link", SIZE, cells), scene.material_of(0)
-    elastic = solid.modulus, solid.ratio
-    plain = PlainStatics(arm, *elastic, HEIGHT * THICKNESS, field_tolerance(scene))
-    return plain.load.getSize(), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
+    tolerance, area = field_tolerance(scene), HEIGHT * THICKNESS
+    plain = plain_statics(arm, solid.modulus, solid.ratio, area, tolerance)
+    return nodal_dofs(cells), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
 
 
 def static_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
@@ -107,11 +107,14 @@ def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found | None:
     if iterate is None:
         return None
     # Its cells run along first, then up the height.
-    places = [(np.arange(n) + 0.5) / n * size for n, size in zip(cells, SIZE, strict=True)]
-    z, y, x = (one.ravel() for one in np.meshgrid(*places[::-1], indexing="ij"))
-    centroid = np.column_stack([x, y - 0.5 * HEIGHT, z - 0.5 * THICKNESS])
-    found = [_seconds(comm, iterate, x) for x in two_designs(centroid)]
-    return 3 * math.prod(n + 1 for n in cells), ITERATIVE, found
+    places = np.indices(cells).reshape(3, -1, order="F").T + 0.5
+    centroid = places / cells * SIZE - [0.0, 0.5 * HEIGHT, 0.5 * THICKNESS]
+    return nodal_dofs(cells), ITERATIVE, [_seconds(comm, iterate, x) for x in two_designs(centroid)]
+
+
+def nodal_dofs(cells: Cells) -> int:
+    """Return the degrees of freedom of all nodes."""
+    return 3 * math.prod(n + 1 for n in cells)
 
 
 def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +125,8 @@ def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _static_steps(plan: Plan) -> Steps:
-    def rows(link: Callable[..., Found | None], name: str, cells: Cells) -> Rows:
+    def rows(name: str, cells: Cells) -> Rows:
+        link = static_link if name == STATIC else pymoto_link
         result, memory = in_processes(link, plan.scene, cells, ranks=1)
         if result is not None:
             dofs, solver, found = result
@@ -130,14 +134,15 @@ def _static_steps(plan: Plan) -> Steps:
                 yield name, design, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for cells in STATIC_CELLS[: 1 if plan.quick else None]:
-        for name, link in ((STATIC, static_link), (PYMOTO, pymoto_link)):
-            yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, link, name, cells)
+        for name in (STATIC, PYMOTO):
+            yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, name, cells)
 
 
 def _links(plan: Plan) -> Steps:
-    def rows(link: Callable[..., Found], cells: Cells, ranks: int) -> Rows:
+    def rows(who: str, cells: Cells, ranks: int) -> Rows:
+        link = plain_link if who == PLAIN else iterate_link
         (dofs, solver, found), memory = in_processes(link, plan.scene, cells, ranks=ranks)
-        for name, seconds in zip(OURS if link is iterate_link else [PLAIN], found, strict=True):
+        for name, seconds in zip([PLAIN] if who == PLAIN else OURS, found, strict=True):
             yield name, ranks, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for ranks, cells in product((1, 2) if mpirun() else (1,), QUICK if plan.quick else CELLS):
@@ -145,8 +150,8 @@ def _links(plan: Plan) -> Steps:
         if solid_bytes(math.prod(cells), ranks) > free_memory():
             yield f"{size} need more memory than is free: left out", list
             continue
-        for who, link in (("dolfinopt", iterate_link), (PLAIN, plain_link)):
-            yield f"{who}, {size}", partial(rows, link, cells, ranks)
+        for who in ("dolfinopt", PLAIN):
+            yield f"{who}, {size}", partial(rows, who, cells, ranks)
 
 
 SOLID = Diagram(

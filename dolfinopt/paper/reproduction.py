@@ -32,7 +32,7 @@ from dolfinopt.scene.load import Scene, tomllib
 from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
-from dolfinopt.study.tables import Figure, LineFigure, Panel, Table, embedded, html_page
+from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table, embedded, html_page
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -237,7 +237,7 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     again = [replace(outcomes[c], case=made) for c, made in zip(reductions.case, reductions.made)]
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
-    objective, grayness = studies.convergence(good(reductions.made))
+    objective, grayness = convergence(good(reductions.made))
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
     by_count = tuple(
         Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
@@ -266,6 +266,25 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
         table = studies.square_table("", title, SWEEPS["path"][1], labels, losses)
         figures[number] = studies.square_figure("", title, {"": table}), table
     return dict(sorted(figures.items()))
+
+
+def convergence(found: Sequence[Outcome]) -> tuple[Panel, Panel]:
+    """Return objective and grayness against the iteration."""
+    response = found[0].case.scene.objective.response if found else None
+    unit = response.unit if response else ""
+
+    def lines(what: str) -> tuple[Line, ...]:
+        return tuple(
+            Line(one.case.label, *np.array([(row.iteration, getattr(row, what)) for row in rows]).T)
+            for one in found
+            if (rows := one.history())
+        )
+
+    x = "iteration [-]"
+    seen = Panel(
+        "as the own model sees it", x, f"objective [{unit}]", lines("objective"), y_log=True
+    )
+    return seen, Panel("", x, "grayness [-]", lines("grayness"))
 
 
 def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
