@@ -182,14 +182,15 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
         own=[one.compliance for one in made],
         apart=math.nan,
     )
-    for name, distance in (("coordinates", _distance), ("reductions", _cells_apart)):
-        rows = results[results.table == name]
-        for _, group in rows.groupby(rows.label if name == "coordinates" else rows.table):
-            finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
-            pairs = [(outcomes[case], finest) for case in group.made]
-            results.loc[group.index, "apart"] = [
-                math.nan if a.failure or b.failure else distance(a, b) for a, b in pairs
-            ]
+    curves, reductions = (results[results.table == name] for name in ("coordinates", "reductions"))
+    for rows, apart in (
+        *((one, _deviations_apart) for _, one in curves.groupby("label")),
+        (reductions, _cells_apart),
+    ):
+        finest = outcomes[rows.made[rows.kind == CRAIG_BAMPTON].iloc[-1]]
+        for at, case in rows.made.items():
+            if not (outcomes[case].failure or finest.failure):
+                results.loc[at, "apart"] = apart(outcomes[case], finest)
     return results
 
 
@@ -200,7 +201,7 @@ def _cells_apart(one: Outcome, other: Outcome) -> float:
         return float(np.mean([((a[key] > 0.5) != (b[key] > 0.5)).mean() for key in keys]))
 
 
-def _distance(one: Outcome, other: Outcome) -> float:
+def _deviations_apart(one: Outcome, other: Outcome) -> float:
     """Return how far two deviations are apart at most, relative to the other's largest."""
     a, b = one.deviation()[1], other.deviation()[1]
     return float(np.abs(a - b).max() / b.max())
@@ -231,34 +232,29 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     def good(cases: Iterable[Case]) -> list[Outcome]:
         return [outcome for case in cases if not (outcome := outcomes[case]).failure]
 
-    optimum = coordinates[coordinates.label == OPTIMUM]
-    by_kind = optimum.groupby("kind", sort=False)
-    ends = [case for _, one in by_kind for case in one.case.iloc[[0, -1]]]
+    optimum = coordinates[coordinates.label == OPTIMUM].groupby("kind", sort=False)
+    ends = dict.fromkeys(case for _, one in optimum for case in one.case.iloc[[0, -1]])
     again = [replace(outcomes[c], case=made) for c, made in zip(reductions.case, reductions.made)]
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
-    objective, grayness = convergence(good(reductions.made))
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
     by_count = tuple(
         Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
         for label, one in coordinates.astype({"x": int}).groupby("label", sort=False)
     )
-    lines = {
-        3: _over_time("Deviation of the end-effector by objective", *shown),
-        5: LineFigure("", "Convergence of the compliance by reduction", (objective,)),
-        6: LineFigure("", "Convergence of the grayness by reduction", (grayness,)),
-        7: LineFigure("", "Compliance against the number of coordinates", by_count),
-        8: _over_time("Deviation of the optimised design by reduction", good(dict.fromkeys(ends))),
-        9: _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
-    }
-    swept = product(SWEEPS, QUANTITIES)
-    lines |= {n: _sweep(by[name], name, what) for n, (name, what) in enumerate(swept, 10)}
-    figures: Figures = {number: (figure, figure) for number, figure in lines.items()}
-    title = "Designs by objective"
+    lines = [
+        _over_time("Deviation of the end-effector by objective", *shown),
+        *_convergence(good(reductions.made)),
+        LineFigure("", "Compliance against the number of coordinates", by_count),
+        _over_time("Deviation of the optimised design by reduction", good(ends)),
+        _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
+        *(_sweep(by[name], name, what) for name, what in product(SWEEPS, QUANTITIES)),
+    ]
+    figures: Figures = {n: (one, one) for n, one in zip((3, *range(5, 14)), lines, strict=True)}
     names = {"label": "made for", "grayness": "grayness [-]", "note": "ended by"}
     columns = ["label", *QUANTITIES, "grayness", "iterations", "note"]
-    table = Table("", title, objectives[columns].rename(columns=names))
-    figures[4] = studies.design_figure("", title, good(objectives.case)), table
+    designs = studies.design_figure("", "Designs by objective", good(objectives.case))
+    figures[4] = designs, Table("", designs.title, objectives[columns].rename(columns=names))
     labels = [f"{value:g}" for value in by["path"].made_for.dropna().unique()]
     for number, what in enumerate(QUANTITIES, 14):
         losses = 100.0 * loss(by["path"], what).to_numpy()
@@ -268,29 +264,26 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     return dict(sorted(figures.items()))
 
 
-def convergence(found: Sequence[Outcome]) -> tuple[Panel, Panel]:
-    """Return objective and grayness against the iteration."""
-    response = found[0].case.scene.objective.response if found else None
-    unit = response.unit if response else ""
-
-    def lines(what: str) -> tuple[Line, ...]:
-        return tuple(
-            Line(one.case.label, *np.array([(row.iteration, getattr(row, what)) for row in rows]).T)
-            for one in found
-            if (rows := one.history())
-        )
-
-    x = "iteration [-]"
-    seen = Panel(
-        "as the own model sees it", x, f"objective [{unit}]", lines("objective"), y_log=True
-    )
-    return seen, Panel("", x, "grayness [-]", lines("grayness"))
-
-
 def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
     """Return deviations over time; empty axes where nothing could be simulated."""
     panels = [panel for outcomes in found for panel in studies.deviation_panels(outcomes)]
     return LineFigure("", title, tuple(panels) or (Panel("", "time [s]", "deviation [mm]", ()),))
+
+
+def _convergence(found: Sequence[Outcome]) -> Iterator[LineFigure]:
+    """Yield objective and grayness of designs against the iteration."""
+    histories = {one.case.label: one.history() for one in found}
+    for what, label in (("compliance", "objective [N m]"), ("grayness", "grayness [-]")):
+        name = label.partition(" [")[0]
+        curves = (
+            Line(label, *np.array([(row.iteration, getattr(row, name)) for row in rows]).T)
+            for label, rows in histories.items()
+        )
+        title = "as the own model sees it" if name == "objective" else ""
+        panel = Panel(
+            title, "iteration [-]", label, tuple(curves), y_log=name == "objective" or None
+        )
+        yield LineFigure("", f"Convergence of the {what} by reduction", (panel,))
 
 
 def _sweep(rows: pd.DataFrame, name: str, quantity: str) -> LineFigure:
@@ -306,19 +299,19 @@ def write_report(
     *, plots: bool = True,
 ) -> None:  # fmt: skip
     """Write figNN.csv, measured.json and, with plots, figNN.png and report.html (root only)."""
-    figures = all_figures(results, outcomes)
+    figures = {f"fig{number:02d}": pair for number, pair in all_figures(results, outcomes).items()}
     records = results[MEASURED].to_json(orient="records", double_precision=15, indent=1)
     write_text(folder / "measured.json", records + "\n")
-    for number, (_, data) in figures.items():
-        write_text(folder / f"fig{number:02d}.csv", data.csv())
+    for name, (_, data) in figures.items():
+        write_text(folder / f"{name}.csv", data.csv())
     if not plots:
         return
     from dolfinopt.study.figures import draw_all
 
-    files = draw_all({f"fig{number:02d}": one for number, (one, _) in figures.items()}, folder)
+    files = draw_all({name: one for name, (one, _) in figures.items()}, folder)
     pictures = [
-        (number, figure.title, embedded(file.read_bytes()))
-        for (number, (figure, _)), file in zip(figures.items(), files)
+        (int(name[3:]), one.title, embedded(file.read_bytes()))
+        for (name, (one, _)), file in zip(figures.items(), files, strict=True)
     ]
     tables = [data for _, data in figures.values() if isinstance(data, Table)]
     differing = variants.differences(load_paper(), plan.scene).items()
@@ -404,9 +397,9 @@ def quantities(results: pd.DataFrame) -> dict[str, Any]:
     by = dict(iter(results.groupby("table")))
     curves, reductions = by["coordinates"], by["reductions"].sort_values("x").astype({"x": int})
     cms, modal = (reductions[reductions.kind == method] for method in METHODS)
-    ends = {"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]}
-    ends |= {"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]}
-    return ends | {
+    return {
+        **{"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]},
+        **{"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]},
         "cms_change": abs(cms.compliance.iloc[0] / cms.compliance.iloc[-1] - 1.0),
         "before": _of_coordinates(curves[curves.label == INITIAL]),
         "after": _of_coordinates(curves[curves.label == OPTIMUM]),

@@ -41,6 +41,7 @@ from dolfinopt.study.studies import (
     Design,
     deviation_panels,
     given_designs,
+    results_of,
 )
 from dolfinopt.study.tables import LineFigure, Study, Table
 
@@ -551,20 +552,12 @@ def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
 
 def _cells(scene: Scene, row: Row) -> dict[str, Any]:
     """Return a row by column."""
-    outcome, summary = row.outcome, row.outcome.summary()
-    stress = summary.get("stress")
-    cells: dict[str, Any] = {
-        "section": row.kind,
-        "made": row.made,
-        "sizes [mm]": row.sizes,
-        "mass [kg]": row.mass,
-        f"objective [{scene.objective.response.unit}]": outcome.objective,
-        COMPLIANCE: outcome.compliance,
-        DEVIATION: 1e3 * outcome.max_deviation,
-        "settling [mm]": 1e3 * summary.get("settling", math.nan),
-        "stress [MPa]": math.nan if stress is None else 1e-6 * stress["value"],
-        "grayness [-]": outcome.grayness,
-    }
+    outcome, known = row.outcome, results_of(row.outcome)
+    cells: dict[str, Any]
+    cells = {"section": row.kind, "made": row.made, "sizes [mm]": row.sizes, "mass [kg]": row.mass}
+    cells[f"objective [{scene.objective.response.unit}]"] = outcome.objective
+    for name in (COMPLIANCE, DEVIATION, "settling [mm]", "stress [MPa]", "grayness [-]"):
+        cells[name] = known[name]
     for name, one in _limits(outcome).items():
         sign = ">=" if one["bound"] == "least" else "<="
         key = f"{name.replace('_', ' ')} {sign} {one['limit']:g} {one['unit']}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -24,7 +24,7 @@ from dolfinopt.output.design import arms_with_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.cases import Case, Outcome, Outcomes, Runner
+from dolfinopt.study.cases import Case, Outcome, Runner
 from dolfinopt.study.tables import (
     DesignFigure,
     Figure,
@@ -114,30 +114,35 @@ def carry_out(plan: Plan, runner: Runner) -> Study:
     """Do what is planned, see `study`."""
     outcomes = runner.run(case for _, case in plan.rows)
     with together(runner.world):
-        tables, figures = plan.report(tabulated(plan, outcomes))
+        rows = ((labels, outcomes[case]) for labels, case in plan.rows)
+        tables, figures = plan.report(tabulated(rows))
     failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
     return Study(plan.name, tuple(tables), tuple(figures), failures, runner.computed)
 
 
-def tabulated(plan: Plan, outcomes: Outcomes) -> pd.DataFrame:
-    """Return a row a case: the plan's labels, the results with units, and the outcome itself."""
-    found = ((labels, outcomes[case]) for labels, case in plan.rows)
-    return pd.DataFrame(
-        {
-            **labels,
-            "label": one.case.label,
-            COMPLIANCE: one.compliance,
-            DEVIATION: 1e3 * one.max_deviation,
-            "at [s]": one.max_deviation_time,
-            "grayness [-]": one.grayness,
-            "iterations": one.iterations,
-            "seconds": one.seconds,
-            "ended by": f"failed: {one.failure}" if one.failure else one.stopped,
-            "failure": one.failure,
-            "outcome": one,
-        }
-        for labels, one in found
-    )
+def tabulated(rows: Iterable[tuple[Mapping[str, Any], Outcome]]) -> pd.DataFrame:
+    """Return a row a case: its labels, the results with units, and the outcome itself."""
+    return pd.DataFrame({**labels, **results_of(outcome)} for labels, outcome in rows)
+
+
+def results_of(one: Outcome) -> dict[str, Any]:
+    """Return results by column, with units, and the outcome itself."""
+    summary = one.summary()
+    return {
+        "label": one.case.label,
+        COMPLIANCE: one.compliance,
+        DEVIATION: 1e3 * one.max_deviation,
+        "at [s]": one.max_deviation_time,
+        "settling [mm]": 1e3 * summary.get("settling", math.nan),
+        "stress [MPa]": 1e-6 * (summary.get("stress") or {}).get("value", math.nan),
+        "mass [kg]": summary.get("designed_mass", math.nan),
+        "grayness [-]": one.grayness,
+        "iterations": one.iterations,
+        "seconds": one.seconds,
+        "ended by": f"failed: {one.failure}" if one.failure else one.stopped,
+        "failure": one.failure,
+        "outcome": one,
+    }
 
 
 def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
@@ -441,28 +446,21 @@ def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
 
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
-    measures = pd.DataFrame([_measures(outcome, weights) for outcome in frame["outcome"]])
-    rest = ["grayness [-]", "iterations", "seconds", "ended by"]
-    whole = pd.concat([frame[["label", *QUANTITIES, "at [s]"]], measures, frame[rest]], axis=1)
+    """Return true values in the motion, efforts by one set of weights, and all designs."""
+    found = [outcome.summary() for outcome in frame["outcome"]]
+    none = {"": math.nan}
+    forces = [np.array([*one.get("drive_rms", none).values()]) for one in found]
+    by = 1.0 if weights is None else np.array(weights)
+    whole = frame.rename(columns={"label": "objective"}).assign(
+        **{"effort [-]": [float(np.linalg.norm(one * by)) for one in forces]},
+        **{"mass [kg]": [sum(one.get("mass", none).values()) for one in found]},
+    )
+    columns = ["objective", *QUANTITIES, "at [s]", "settling [mm]", "stress [MPa]", "effort [-]",
+               "mass [kg]", "grayness [-]", "iterations", "seconds", "ended by"]  # fmt: skip
     title = "Designs optimised for every objective, simulated in the scene."
-    table = Table("", title, whole.rename(columns={"label": "objective"}))
     good = [outcome for outcome in frame["outcome"] if not outcome.failure]
-    return [table], [design_figure("designs", "Designs by objective", good)]
-
-
-def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, float]:
-    """Return what else a design does in its motion: true values, efforts by one set of weights."""
-    summary = outcome.summary()
-    forces = np.array([*summary.get("drive_rms", {"": math.nan}).values()])
-    stress = (summary.get("stress") or {}).get("value", math.nan)
-    if weights is not None and summary:
-        forces = forces * weights
-    return {
-        "settling [mm]": 1e3 * summary.get("settling", math.nan),
-        "stress [MPa]": 1e-6 * stress,
-        "effort [-]": float(np.linalg.norm(forces)),
-        "mass [kg]": sum(summary.get("mass", {"": math.nan}).values()),
-    }
+    designs = design_figure("designs", "Designs by objective", good)
+    return [Table("", title, whole[columns])], [designs]
 
 
 # -- coordinates and reductions --------------------------------------------------------------

@@ -65,7 +65,6 @@ class Distribution:
 
     text: str  # as the user wrote it, e.g. "normal:6:0.3"
     law: Any = field(compare=False)  # SciPy's frozen distribution
-    bounded: bool  # whether it has bounds of its own
     low: float = -math.inf
     high: float = math.inf
     breakpoint: float | None = None  # where the density's slope jumps
@@ -81,7 +80,7 @@ class Distribution:
         InputError where bounds of its own reach beyond, or half of it does.
         """
         least, most = self.law.support()
-        if self.bounded and (least < low or most > high):
+        if math.isfinite(most - least) and (least < low or most > high):
             raise InputError(f"{self.text}: reaches from {least:g} to {most:g}")
         cut = replace(self, low=low, high=high)
         if cut.cut_off > 0.5:
@@ -127,19 +126,17 @@ class Distribution:
         return np.linalg.solve(upper.T, rows.T).T * np.sign(np.diag(upper))
 
 
-# By name: parameters and what they must fulfil, in words and as a function; SciPy's law of them.
-LAWS: dict[str, tuple[str, Callable[..., bool], Callable[..., Any]]] = {
-    "normal": ("MEAN:DEVIATION with DEVIATION > 0", lambda m, s: s > 0.0, stats.norm),
-    "uniform": ("LOW:HIGH with LOW < HIGH", lambda a, b: a < b,
-                lambda a, b: stats.uniform(a, b - a)),
+# By name: parameters and what they must fulfil, in words; SciPy's law of them, whose deviation is no
+# positive number otherwise.
+LAWS: dict[str, tuple[str, Callable[..., Any]]] = {
+    "normal": ("MEAN:DEVIATION with DEVIATION > 0", stats.norm),
+    "uniform": ("LOW:HIGH with LOW < HIGH", lambda a, b: stats.uniform(a, b - a)),
     "triangular": (
         "LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
-        lambda a, b, c: a <= b <= c and a < c,
         lambda a, b, c: stats.triang((b - a) / (c - a), a, c - a),
     ),
-    "lognormal": ("MEDIAN:SIGMA with both > 0", lambda m, s: m > 0.0 and s > 0.0,
-                  lambda m, s: stats.lognorm(s, scale=m)),
-}  # fmt: skip
+    "lognormal": ("MEDIAN:SIGMA with both > 0", lambda m, s: stats.lognorm(s, scale=m)),
+}
 
 
 def parse_distribution(text: str) -> Distribution:
@@ -150,16 +147,16 @@ def parse_distribution(text: str) -> Distribution:
     name, *words = (part.strip() for part in text.split(":"))
     if name not in LAWS:
         raise InputError(f"{text}: expected one of {', '.join(LAWS)}, for example normal:6:0.3")
-    form, is_allowed, law = LAWS[name]
+    form, make = LAWS[name]
     try:
         values = [float(word) for word in words]
-        allowed = all(map(math.isfinite, values)) and is_allowed(*values)
-    except (ValueError, TypeError):  # no number, too few or too many
+        law = make(*values)
+        allowed = 0.0 < law.std() < math.inf
+    except (ValueError, TypeError, ArithmeticError):  # no number, too few or too many
         allowed = False
     if not allowed:
         raise InputError(f"{text}: expected {name}:{form}")
-    middle = values[1] if name == "triangular" else None
-    return Distribution(text, law(*values), name in ("uniform", "triangular"), breakpoint=middle)
+    return Distribution(text, law, breakpoint=values[1] if name == "triangular" else None)
 
 
 # -- samples ---------------------------------------------------------------------------------
@@ -420,12 +417,10 @@ def parse_input(scene: Scene, text: str) -> Input:
         example = "for example payload.mass=normal:6:0.3"
         raise InputError(f"--random {text}: expected KEY=DISTRIBUTION, {example}")
     with asked_by(f"--random {text}"):
-        distribution = parse_distribution(law)
-        middle, named = float(distribution.at(np.array(0.5))), key
-        key = in_new_words(key)
-        if not isinstance(nominal_value(changed(scene, f"{named}={middle!r}"), key), float):
+        distribution, parts = parse_distribution(law), in_new_words(key).split(".")
+        there = changed(scene, f"{key}={float(distribution.at(np.array(0.5)))!r}")
+        if not isinstance(nominal_value(there, key), float):
             raise InputError("expected a key with a real number as its value")
-        parts = key.split(".")
         if parts[0] not in TABLES:
             raise InputError(
                 f"does not change what a given design does; expected a key of {', '.join(TABLES)}"
@@ -433,12 +428,13 @@ def parse_input(scene: Scene, text: str) -> Input:
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
         if key.endswith("*"):
-            return Input(named, 1.0, distribution.within(0.0, math.inf))
+            return Input(key, 1.0, distribution.within(0.0, math.inf))
         field = field_at((parts[0], parts[-1]))
         try:
-            return Input(named, nominal_value(scene, key), distribution.within(*_range(field)))
+            return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
         except InputError as error:
-            raise InputError(f"{error}; {key} is {allowed_words(field)}") from None
+            words = allowed_words(field)
+            raise InputError(f"{error}; {'.'.join(parts)} is {words}") from None
 
 
 def nominal_value(scene: Scene, key: str) -> object:
