@@ -272,17 +272,18 @@ def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
 
 def _convergence(found: Sequence[Outcome]) -> Iterator[LineFigure]:
     """Yield objective and grayness of designs against the iteration."""
-    histories = {one.case.label: one.history() for one in found}
-    for what, label in (("compliance", "objective [N m]"), ("grayness", "grayness [-]")):
-        name = label.partition(" [")[0]
-        curves = (
-            Line(label, *np.array([(row.iteration, getattr(row, name)) for row in rows]).T)
-            for label, rows in histories.items()
-        )
-        title = "as the own model sees it" if name == "objective" else ""
-        panel = Panel(
-            title, "iteration [-]", label, tuple(curves), y_log=name == "objective" or None
-        )
+    for what, quantity, label in (
+        ("compliance", "objective", "objective [N m]"),
+        ("grayness", "grayness", "grayness [-]"),
+    ):
+        seen = quantity == "objective"
+        curves = tuple(
+            Line(one.case.label, *np.array([(row.iteration, getattr(row, quantity))
+                                            for row in one.history()]).T)
+            for one in found
+        )  # fmt: skip
+        title = "as the own model sees it" * seen
+        panel = Panel(title, "iteration [-]", label, curves, y_log=seen or None)
         yield LineFigure("", f"Convergence of the {what} by reduction", (panel,))
 
 

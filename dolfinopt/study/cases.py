@@ -442,16 +442,14 @@ def _jobs(missing: Iterable[Case], ranks: int) -> list[Job]:
 
 def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
     """Do one job after the other that no other rank has taken; end when all ranks do."""
-    left = list(jobs)
     try:
-        while left:
+        for job in jobs:
             place.check()
-            job = next((one for one in left if _is_ready(one[0], place)), None)
-            if job is None:
-                time.sleep(IDLE)
-                continue
-            left.remove(job)
             if place.takes(job):
+                design = job[0].design
+                while isinstance(design, Case) and not place.has(design):  # another rank makes it
+                    time.sleep(IDLE)
+                    place.check()
                 _do(job, place)
     except OthersFailed:
         raise
@@ -464,11 +462,6 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
         while not ended.Test():  # asleep: waiting in MPI would keep the processor busy
             time.sleep(IDLE)
     place.check()
-
-
-def _is_ready(case: Case, place: _Place) -> bool:
-    """Tell whether the design is there, or will not be."""
-    return not isinstance(case.design, Case) or place.has(case.design)
 
 
 def _do(job: Job, place: _Place) -> None:

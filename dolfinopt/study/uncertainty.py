@@ -126,10 +126,10 @@ class Distribution:
         return np.linalg.solve(upper.T, rows.T).T * np.sign(np.diag(upper))
 
 
-# By name: parameters and what they must fulfil, in words; SciPy's law of them, whose deviation is no
-# positive number otherwise.
+# By name: parameters and what they must fulfil, in words; SciPy's law of them, whose deviation is
+# no positive number otherwise.
 LAWS: dict[str, tuple[str, Callable[..., Any]]] = {
-    "normal": ("MEAN:DEVIATION with DEVIATION > 0", stats.norm),
+    "normal": ("MEAN:DEVIATION with DEVIATION > 0", lambda m, s: stats.norm(m, s)),
     "uniform": ("LOW:HIGH with LOW < HIGH", lambda a, b: stats.uniform(a, b - a)),
     "triangular": (
         "LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
@@ -151,7 +151,7 @@ def parse_distribution(text: str) -> Distribution:
     try:
         values = [float(word) for word in words]
         law = make(*values)
-        allowed = 0.0 < law.std() < math.inf
+        allowed = all(map(math.isfinite, values)) and law.std() > 0.0
     except (ValueError, TypeError, ArithmeticError):  # no number, too few or too many
         allowed = False
     if not allowed:
