@@ -1,23 +1,24 @@
 """The benchmark of the field: published problems, reference values, and our results beside them.
 
 Every folder of `benchmarks` with a file case.toml is a case: a problem in words, a scene (or a
-machine of `PROGRAMS`), and values with reference, origin and limit. A program that is not this one
-needs the words, the scene's figures and the reference tables only.
+Python program that returns its values), and values with reference, origin and limit. A program that
+is not this one needs the words, the scene's figures and the reference tables only.
 """
 
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable, Iterable, Sequence
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 from mpi4py import MPI
 from pydantic import ConfigDict, ValidationError, model_validator
 
-from dolfinopt.bench.field_machines import crank_values, ur10e_values
 from dolfinopt.data import benchmark_folder
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
@@ -65,7 +66,7 @@ class Case(Table):
         title, problem, source: in words.
         scene: of the machine, or "" where `program` makes it.
         overrides: "key.path=value" for the scene.
-        program: a key of `PROGRAMS`, or "".
+        program: Python file, whose `values` returns numbers by their quantities; or "".
         records: what the folder of the measured records is that `program` reads; "" where it
             needs none.
         design: file of the design, or "" for the scene's initial one.
@@ -92,8 +93,8 @@ class Case(Table):
 
     @model_validator(mode="after")
     def _check(self) -> Case:
-        if bool(self.scene) == (self.program in PROGRAMS):
-            raise ValueError(f"expected either scene or program, one of {', '.join(PROGRAMS)}")
+        if bool(self.scene) == bool(self.program):
+            raise ValueError("expected either scene or program")
         for one in self.values if self.scene else ():
             known = HISTORIES if one.table else NUMBERS
             if one.quantity not in known:
@@ -222,11 +223,6 @@ HISTORIES: dict[str, History] = {
     "turning rate over time": _coordinate("turn", 1),
     "first arm's end along z over time": _first_end,
 }
-# Of the folder of records, where there are some.
-PROGRAMS: dict[str, Callable[[Path | None], dict[str, float]]] = {
-    "crank": lambda _: crank_values(),
-    "ur10e": ur10e_values,
-}
 
 
 def read_table(name: str) -> dict[str, np.ndarray]:
@@ -238,6 +234,15 @@ def read_table(name: str) -> dict[str, np.ndarray]:
 
 
 # -- checking --------------------------------------------------------------------------------
+
+
+def load_program(file: Path) -> Any:
+    """Return the module of a case's program."""
+    spec: Any = spec_from_file_location(f"benchmark_{file.stem}", file)
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look it up
+    spec.loader.exec_module(module)
+    return module
 
 
 class Checked(NamedTuple):
@@ -271,7 +276,7 @@ def check(case: Case, records: Path | None = None) -> list[Checked]:
         InputError: the records are not those of the case.
     """
     if case.program:
-        found = PROGRAMS[case.program](records)
+        found = load_program(case.folder / case.program).values(records)
         return [_number(case, one, found[one.quantity]) for one in case.values]
     asked = any(one.quantity == "stress" for one in case.values)
     model = Model(case.folder / case.scene, *case.overrides, comm=MPI.COMM_SELF)

@@ -9,7 +9,6 @@ import pytest
 from runs import TWO_ARM, refusal, refused, run
 
 from dolfinopt.bench import accuracy, field, iterations, measure, panel, solid
-from dolfinopt.bench import field_machines as ur10e
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, curves, figure_of, fitted_power, least_x
@@ -425,6 +424,9 @@ def test_wrong_words(words, told):
         run("bench", *words)
 
 
+ur10e = field.load_program(field.benchmark_folder() / "ur10e" / "ur10e.py")
+
+
 def write_robot(folder):
     """Write six links on joints that turn about x, y and z, and records of their rigid motion."""
     masses = [3.0, 2.5, 2.0, 1.0, 0.8, 0.5]
@@ -466,7 +468,7 @@ def write_robot(folder):
 def test_torques_of_a_known_robot_are_predicted(tmp_path):
     """What is left are the ends of the records, where the method has no accelerations."""
     write_robot(tmp_path)
-    assert max(ur10e.ur10e_values(tmp_path).values()) < 0.015
+    assert max(ur10e.values(tmp_path).values()) < 0.015
     (tmp_path / ur10e.LEARNT[0]).write_text("1,2\n" * 700)
     with pytest.raises(InputError, match="12harm"):
-        ur10e.ur10e_values(tmp_path)
+        ur10e.values(tmp_path)
