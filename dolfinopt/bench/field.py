@@ -29,61 +29,36 @@ from dolfinopt.scene.tables.base import Table, input_error, problem
 
 
 class Value(Table):
-    """What is compared: a number, or a history with a table of `benchmarks/reference`.
-
-    Attributes:
-        what, unit: in words; "" for a share.
-        quantity: a key of `NUMBERS` or `HISTORIES`, or of what a program returns.
-        reference: the number; nan where `table` has a history.
-        limit: of the difference, relative to the reference (of a history, to its largest value).
-        way: "near" the reference within the limit; a value that shall be "most" or "least" the
-            reference may pass it by the limit.
-        ours: the published result of this program.
-        origin: where the reference is from.
-        table, columns, until: file, its columns, and the last instant that counts, s.
-    """
+    """What is compared: a number, or a history with a table of `benchmarks/reference`."""
 
     model_config = ConfigDict(allow_inf_nan=True)
 
     what: str
-    unit: str
-    quantity: str
-    reference: float = np.nan
-    limit: float
-    way: Literal["near", "most", "least"] = "near"
-    ours: float
-    origin: str
-    table: str = ""
-    columns: tuple[str, ...] = ()
-    until: float = np.inf
+    unit: str  # "" of a share
+    quantity: str  # a key of `NUMBERS` or `HISTORIES`, or of what a program returns
+    reference: float = np.nan  # of a number
+    limit: float  # of the difference, relative to the reference, of a history to its largest value
+    way: Literal["near", "most", "least"] = "near"  # within the limit, or on one side up to it
+    ours: float  # the published result of this program
+    origin: str  # where the reference is from
+    table: str = ""  # file of a history
+    columns: tuple[str, ...] = ()  # of the file
+    until: float = np.inf  # the last instant that counts, s
 
 
 class Case(Table):
-    """One problem.
+    """One problem: a scene with its design (by default the initial one), or a program."""
 
-    Attributes:
-        folder: of its file and of the files that it names; its name is the case's.
-        title, problem, source: in words.
-        scene: of the machine, or "" where `program` makes it.
-        overrides: "key.path=value" for the scene.
-        program: Python file, whose `values` returns numbers by their quantities; or "".
-        records: what the folder of the measured records is that `program` reads; "" where it
-            needs none.
-        design: file of the design, or "" for the scene's initial one.
-        long: takes more than some ten seconds; runs with --all or by name.
-        values: what is compared.
-    """
-
-    folder: Path
+    folder: Path  # of its file and of the files that it names
     title: str
     problem: str
     source: str
-    scene: str = ""
-    overrides: tuple[str, ...] = ()
-    program: str = ""
-    records: str = ""
+    scene: str = ""  # of the machine
+    overrides: tuple[str, ...] = ()  # "key.path=value" for the scene
+    program: str = ""  # Python file, whose `values` returns numbers by their quantities
+    records: str = ""  # what the folder of measured records is that the program reads
     design: str = ""
-    long: bool = False
+    long: bool = False  # takes more than some ten seconds; runs with --all or by name
     values: tuple[Value, ...]
 
     @property
@@ -246,18 +221,13 @@ def load_program(file: Path) -> Any:
 
 
 class Checked(NamedTuple):
-    """A value of a case, computed.
-
-    Attributes:
-        value, reference: of a history the largest size of both over time.
-        difference: relative; of a history the largest over time, by the reference's largest.
-    """
+    """A value of a case, computed; of a history the largest size of both over time."""
 
     case: Case
     of: Value
     value: float
     reference: float
-    difference: float
+    difference: float  # relative; of a history the largest over time, by the reference's largest
 
     @property
     def met(self) -> bool:

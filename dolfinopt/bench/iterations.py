@@ -51,13 +51,17 @@ def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
     """
     clock: list[tuple[float, float]] = []
     begun = perf_counter()
-    result = optimize(
-        scene, world=comm, report=lambda _: clock.append((time.process_time(), perf_counter()))
-    )
+
+    def report(_: object) -> None:
+        clock.append((time.process_time(), perf_counter()))
+
+    result = optimize(scene, world=comm, report=report)
     elapsed = perf_counter() - begun
-    if comm.rank > 0:
-        return []
-    return [*np.median(np.diff(clock, axis=0), axis=0).tolist(), result.iterations, elapsed]
+    return (
+        []
+        if comm.rank
+        else [*np.median(np.diff(clock, axis=0), axis=0).tolist(), result.iterations, elapsed]
+    )
 
 
 def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:

@@ -163,7 +163,7 @@ def before_after_page(
         ],
         machines=machines,
         links=list(_links(sides)),
-        curves=list(_curves(sides, table)),
+        curves=list(_curves(sides)),
         table=table,
         sections=sections,
         differing=differences(before.scene, after.scene),
@@ -182,35 +182,25 @@ def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
         yield name, _embedded(solid_design_figure(views, name, masses))
 
 
-def _curves(sides: Mapping[str, Side], table: Table) -> Iterator[tuple[str, str, Image]]:
-    """Yield title, figures in words, and picture of deflection and drive forces over time."""
-    title = "deflection of the tool"
+def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
+    """Yield title and picture of deflection and drive forces over time."""
     deflections = {label: 1e3 * side.deviation for label, side in sides.items()}
-    words = _words(table, "largest", "largest tool deflection")
-    yield title, words, _plot(sides, title, f"{title} [mm]", deflections)
+    yield _plot(sides, "deflection of the tool", "deflection of the tool [mm]", deflections)
     for drive, unit in drive_units(sides[AFTER].scene).items():
         forces = {label: side.drive_forces[drive] for label, side in sides.items()}
-        title, kinds = f"drive {drive}", ("peak", "root mean square")
-        words = "; ".join(_words(table, kind, f"{kind} of {title}") for kind in kinds)
         what = "force" if unit == "N" else "torque"
-        yield title, words, _plot(sides, title, f"{what} [{unit}]", forces)
+        yield _plot(sides, f"drive {drive}", f"{what} [{unit}]", forces)
 
 
-def _words(table: Table, word: str, figure: str) -> str:
-    """Return a row of the table in words."""
-    row = table.frame.set_index("figure").loc[figure]
-    change = row["change [%]"]
-    ending = f" ({change:+.3g} %)" if np.isfinite(change) and change else ""
-    return f"{word} {row[BEFORE]:.4g} → {row[AFTER]:.4g} {row['unit']}{ending}"
-
-
-def _plot(sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]) -> Image:
-    """Return curves of both runs over time."""
+def _plot(
+    sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]
+) -> tuple[str, Image]:
+    """Return curves of both runs over time, and their title."""
     from dolfinopt.study.figures import line_figure
 
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return _embedded(line_figure(LineFigure("", title, (panel,)), LOOKS))
+    return title, _embedded(line_figure(LineFigure("", title, (panel,)), LOOKS))
 
 
 def _embedded(figure: Figure) -> Image:
