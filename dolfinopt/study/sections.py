@@ -502,23 +502,20 @@ def verdict(scene: Scene, rows: Sequence[Row]) -> str:
     if not limited(design.outcome):
         return _by_objective(scene, design, others)
     over = {name: _excess(one) for name, one in _limits(design.outcome).items() if not one["met"]}
-    broken = [name for name, excess in over.items() if excess > SLIGHT]
+    missed = ", ".join(f"{name} {100.0 * x:.2g} % over its limit" for name, x in over.items())
+    weight = f"{design.mass:.4g} kg" + f" ({missed})" * bool(over)
+    broken = max(over.values(), default=0.0) > SLIGHT
     able = [row for row in others if row.lightest and row.holds]
     if not able:
-        none = "o straight member within the arms' envelope holds the limits"
-        if broken:
-            return f"N{none}, nor does the design ({', '.join(broken)}): nobody wins."
-        return f"N{none}, the design does with {design.mass:.4g} kg: the design wins."
+        return (
+            "No straight member within the arms' envelope holds the limits, the design weighs "
+            f"{weight}: {'nobody' if broken else 'the design'} wins."
+        )
     best = min(able, key=lambda row: row.mass)
-    text = (
+    return (
         f"The lightest straight {best.kind} that holds the limits weighs {best.mass:.4g} kg, the "
-        f"design {design.mass:.4g} kg"
+        f"design {weight}: the {best.kind if broken or best.mass < design.mass else DESIGN} wins."
     )
-    if broken:
-        return f"{text} without holding them ({', '.join(broken)}): the {best.kind} wins."
-    if over:
-        text += f" ({', '.join(f'{k} {100.0 * x:.2g} % over its limit' for k, x in over.items())})"
-    return f"{text}: the {best.kind if best.mass < design.mass else DESIGN} wins."
 
 
 def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
@@ -527,12 +524,12 @@ def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
     if not able:
         return "No straight member within the arms' envelope has the design's mass."
     best = min(able, key=lambda row: row.outcome.objective)
-    values = best.outcome.objective, design.outcome.objective
+    ours, theirs = design.outcome.objective, best.outcome.objective
     name, unit = scene.objective.response.label, scene.objective.response.unit
     return (
         f"With the design's mass of {design.mass:.4g} kg the best straight member, a {best.kind}, "
-        f"has an objective ({name}) of {values[0]:.4g} {unit}, the design {values[1]:.4g} {unit}: "
-        f"the {best.kind if values[0] < values[1] else DESIGN} wins."
+        f"has an objective ({name}) of {theirs:.4g} {unit}, the design {ours:.4g} {unit}: the "
+        f"{best.kind if theirs < ours else DESIGN} wins."
     )
 
 

@@ -142,10 +142,10 @@ def row(kind, mass, deviation=0.9, lightest=False, objective=1.0):
          "rectangular tube wins."),
         ([row("design", 1.2), row("solid bar", 2.8, lightest=True)], "1.2 kg: the design wins."),
         ([row("design", 1.2), row("solid bar", 1.1)],  # lighter, but holds by chance
-         "No straight member within the arms' envelope holds the limits, the design does with "
-         "1.2 kg: the design wins."),
+         "No straight member within the arms' envelope holds the limits, the design weighs 1.2 kg: "
+         "the design wins."),
         ([row("design", 1.0, 1.1), row("solid bar", 2.8, lightest=True)],
-         "1 kg without holding them (deviation): the solid bar wins."),
+         "the design 1 kg (deviation 10 % over its limit): the solid bar wins."),
         ([row("design", 1.0, 1.001), row("solid bar", 2.8, lightest=True)],
          "the design 1 kg (deviation 0.1 % over its limit): the design wins."),
         ([row("design", 1.0, 1.1), row("solid bar", 2.8, 1.2)], "nobody wins."),
