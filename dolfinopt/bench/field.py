@@ -100,8 +100,7 @@ def read_case(file: Path) -> Case:
 def chosen_cases(names: Iterable[str], everything: bool, records: bool = False) -> tuple[Case, ...]:
     """Return the cases of these names; without names the quick ones, or `everything`.
 
-    Without measured records, cases that need some are left out; InputError where they are named, or
-    there is no such case.
+    Without records, cases that need some are left out. InputError: there is no such case.
     """
     known = {case.name: case for case in read_cases()}
     for name in names:
@@ -208,9 +207,6 @@ def read_table(name: str) -> dict[str, np.ndarray]:
     return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
 
 
-# -- checking --------------------------------------------------------------------------------
-
-
 def load_program(file: Path) -> Any:
     """Return the module of a case's program."""
     spec: Any = spec_from_file_location(f"benchmark_{file.stem}", file)
@@ -239,11 +235,8 @@ class Checked(NamedTuple):
 def check(case: Case, records: Path | None = None) -> list[Checked]:
     """Run a case on this rank; return its values beside their references.
 
-    `records` is the folder of the measured records, for a case that needs them.
-
-    Raises:
-        ConvergenceError: it cannot be simulated.
-        InputError: the records are not those of the case.
+    `records` is the folder of the measured records, for a case that needs them. ConvergenceError:
+    it cannot be simulated; InputError: the records are not those of the case.
     """
     if case.program:
         found = load_program(case.folder / case.program).values(records)

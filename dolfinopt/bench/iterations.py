@@ -114,8 +114,7 @@ ITERATION = Diagram(
     "program",
     "CPU seconds of the first rank, waiting for others included: median of whole iterations. Other "
     "programs: K assembled and factorised anew (plain DOLFINx: MUMPS), one load, the gradient; the "
-    "least of the repeats. Memory is that of all ranks.",
-    uses=("pymoto",),
+    "least of the repeats. Memory is that of all ranks. pyMOTO: pip install 'dolfinopt[bench]'.",
 )
 
 

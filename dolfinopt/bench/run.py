@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from dolfinopt.bench import accuracy, iterations, solid
 from dolfinopt.bench.measure import Plan
-from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, version, write
+from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, write
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.study.tables import Table
@@ -67,10 +67,10 @@ def bench(
 def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[list[Row], list[str]]:
     """Return the rows of all steps, kept in FOLDER/<name>.json or measured, and what failed.
 
-    Those of another source of this package, or other versions of what they use, are not kept.
+    Those of another source of this package are not kept.
     """
-    path, versions = folder / f"{diagram.name}.json", [version(one) for one in diagram.uses]
-    asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
+    path = folder / f"{diagram.name}.json"
+    asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict()]
     stamp = json.loads(json.dumps(asked))
     kept: dict[str, list[Row]] = {}
     try:

@@ -180,5 +180,4 @@ STATICS = Diagram(
     f"beam, then densities moved by up to {MOVE:g}. pyMOTO: conjugate gradients with three "
     "geometric grids; the loaded end is not rigid there.",
     each=("design",),
-    uses=("pymoto",),
 )

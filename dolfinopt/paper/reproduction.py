@@ -1,13 +1,12 @@
 """The paper's figures 3 to 15: its cases, what comes out of them, figures, data and page.
 
-Every row of the table is one design in one scene: its table, label, kind (of the objective or the
+A row of the table is one design in one scene: its table, label, kind (of the objective or the
 reduction), x (coordinates, or the swept value), the value that it was made for, the case that is
 simulated, and the one that made the design. `add_outcomes` adds compliance (N m), deviation
 (largest, m), grayness, iterations, note (how it ended), own (compliance as the design's own model
-sees it, N m) and apart: of "reductions" the part of the cells on the other side of one half than in
-the design made with the most Craig-Bampton coordinates, of "coordinates" the largest distance of
-the deviation from that with the most, over the latter's largest. What does not apply, or failed,
-is nan. The figures bear the paper's numbers; which of several shows what is our choice.
+sees it, N m) and apart: from what the most Craig-Bampton coordinates give, of "reductions" the part
+of the cells on the other side of one half, of "coordinates" the largest distance of the deviation
+over the largest one. What does not apply, or failed, is nan. Which figure shows what is our choice.
 """
 
 from __future__ import annotations
@@ -70,19 +69,13 @@ Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what h
 
 
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
-    """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden.
-
-    InputError where there is no such key, or it does not allow the value.
-    """
+    """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden."""
     return load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
 
 
 def cell_sizes(scene: Scene) -> dict[int, float]:
     """Return the longest side of a cell by arm, m, 0 where a mesh file decides it."""
     return {k: arm.cell_size or 0.0 for k, arm in enumerate(scene.arms) if arm.flexible}
-
-
-# -- cases -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -154,14 +147,10 @@ class Plan:
                 yield table, label, "", value, made_for, case, design or case
 
 
-# -- results ---------------------------------------------------------------------------------
-
-
 def reproduce(plan: Plan, folder: Path, world: MPI.Comm) -> tuple[pd.DataFrame, Outcomes]:
     """Return the plan's table with results, and all outcomes; the same on all ranks (collective).
 
-    What is done already is kept in DIR `folder`. InputError where the scene does not allow what the
-    paper varies, or DIR cannot be written.
+    InputError where the scene does not allow what the paper varies, or DIR cannot be written.
     """
     with together(world):
         cases = [*plan.table.case, *plan.table.made]
@@ -182,15 +171,13 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
         own=[one.compliance for one in made],
         apart=math.nan,
     )
-    curves, reductions = (results[results.table == name] for name in ("coordinates", "reductions"))
-    for rows, apart in (
-        *((one, _deviations_apart) for _, one in curves.groupby("label")),
-        (reductions, _cells_apart),
-    ):
-        finest = outcomes[rows.made[rows.kind == CRAIG_BAMPTON].iloc[-1]]
-        for at, case in rows.made.items():
-            if not (outcomes[case].failure or finest.failure):
-                results.loc[at, "apart"] = apart(outcomes[case], finest)
+    apart = {"coordinates": ("label", _deviations_apart), "reductions": ("table", _cells_apart)}
+    for name, (by, distance) in apart.items():
+        for _, rows in results[results.table == name].groupby(by):
+            finest = outcomes[rows.made[rows.kind == CRAIG_BAMPTON].iloc[-1]]
+            for at, case in rows.made.items():
+                if not (outcomes[case].failure or finest.failure):
+                    results.loc[at, "apart"] = distance(outcomes[case], finest)
     return results
 
 
@@ -272,18 +259,17 @@ def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
 
 def _convergence(found: Sequence[Outcome]) -> Iterator[LineFigure]:
     """Yield objective and grayness of designs against the iteration."""
-    for what, quantity, label in (
+    for what, key, label in (
         ("compliance", "objective", "objective [N m]"),
         ("grayness", "grayness", "grayness [-]"),
     ):
-        seen = quantity == "objective"
-        curves = tuple(
-            Line(one.case.label, *np.array([(row.iteration, getattr(row, quantity))
-                                            for row in one.history()]).T)
-            for one in found
-        )  # fmt: skip
+        lines = []
+        for one in found:
+            x, y = zip(*((row.iteration, getattr(row, key)) for row in one.history()))
+            lines.append(Line(one.case.label, np.array(x), np.array(y)))
+        seen = key == "objective"
         title = "as the own model sees it" * seen
-        panel = Panel(title, "iteration [-]", label, curves, y_log=seen or None)
+        panel = Panel(title, "iteration [-]", label, tuple(lines), y_log=seen or None)
         yield LineFigure("", f"Convergence of the {what} by reduction", (panel,))
 
 
@@ -388,9 +374,6 @@ def percent(part: float) -> str:
     """Return a part in per cent, or as "n times" where it is large."""
     digits = 2 if abs(part) < 0.1 else 1
     return f"{part:.0f} times" if part >= MANY else f"{100.0 * part:.{digits}f} %"
-
-
-# -- quantities ------------------------------------------------------------------------------
 
 
 def quantities(results: pd.DataFrame) -> dict[str, Any]:
