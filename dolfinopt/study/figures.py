@@ -194,4 +194,7 @@ def design_figure(figure: tables.DesignFigure) -> Figure:
         for label, row in zip(labels, views, strict=True)
         for view in row
     ]
-    return design.design_figure(every, figure.title)
+    drawn = design.design_figure(every, figure.title)
+    for axes, view in zip(drawn.axes, every):  # all arms have one size
+        axes.set_title(view.name, loc="left", fontsize=10, parse_math=False)
+    return drawn
