@@ -39,14 +39,18 @@ Cells = tuple[int, int, int]
 Found = tuple[int, str, list[float]]  # dofs of all ranks, solver, CPU seconds by design
 
 
-def link_scene(scene: Scene, cells: Cells) -> Scene:
+def link_scene(scene: Scene, cells: Cells, static: bool = False) -> Scene:
     """Return the scene with one solid link, whatever its motion would be."""
     size = {"length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": cells}
-    arm = scene.arms[0].unchecked_copy({**size, "element": "incompatible", "passive": 0.02})
-    reduction = scene.reduction.unchecked_copy({"method": "craig-bampton", "coordinates": 6})
-    radius = 1.5 * LENGTH / cells[0]
-    design = scene.design.unchecked_copy({"filter_radius": radius})
-    return scene.unchecked_copy({"arms": (arm,), "reduction": reduction, "design": design})
+    tables = {
+        "arms": {**size, "element": "incompatible", "passive": 0.02},
+        "reduction": {"method": "craig-bampton", "coordinates": 6},
+        "design": {"filter_radius": 1.5 * LENGTH / cells[0]},
+        "objective": {"kind": "static"} if static else {},
+    }
+    changed = {key: getattr(scene, key) for key in tables} | {"arms": scene.arms[0]}
+    found = {key: table.unchecked_copy(tables[key]) for key, table in changed.items()}
+    return scene.unchecked_copy(found | {"arms": (found["arms"],)})
 
 
 def box_beam(centroid: np.ndarray) -> np.ndarray:
@@ -63,18 +67,28 @@ def _seconds(comm: MPI.Comm, action: Callable[[np.ndarray], Any], x: np.ndarray)
     return float(comm.allreduce(time.process_time() - begun, op=MPI.MAX))
 
 
-def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
-    """Return an iteration of this package: a first design and one nearby (collective)."""
-    arm = Arm(link_scene(scene, cells), 0, comm, Profile())
+def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool = False) -> Found:
+    """Return an iteration of this package: a first design and one nearby (collective).
 
-    def iterate(x: np.ndarray) -> None:
+    With its constraint modes and loads of the motion; if static, under one load.
+    """
+    arm = Arm(link_scene(scene, cells, static), 0, comm, Profile())
+
+    def dynamic(x: np.ndarray) -> None:
         state = arm.state(arm.physical(x))
         state.elastic.constraint_modes()
         _ = state.body
         arm.backward(esl_gradient(state, np.eye(6)))
 
+    def loaded(x: np.ndarray) -> None:
+        state = arm.state(x)
+        loads = static_response(state.elastic, np.array([LOAD])).loads
+        tip_gradient(state, loads, loads)
+
+    iterate = loaded if static else dynamic
     found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
-    return arm.substructure.T.num_dofs, arm.substructure.interior.solver.name, found
+    system = static and arm.substructure.extended or arm.substructure.interior
+    return arm.substructure.T.num_dofs, system.solver.name, found
 
 
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
@@ -85,25 +99,9 @@ def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     return nodal_dofs(cells), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
 
 
-def static_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
-    """Return static iterations of this package: one load, two designs (collective)."""
-    link = link_scene(scene, cells)
-    objective = link.objective.unchecked_copy({"kind": "static"})
-    arm = Arm(link.unchecked_copy({"objective": objective}), 0, comm, Profile())
-
-    def iterate(x: np.ndarray) -> None:
-        state = arm.state(x)
-        loads = static_response(state.elastic, np.array([LOAD])).loads
-        tip_gradient(state, loads, loads)
-
-    found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
-    system = arm.substructure.extended or arm.substructure.interior
-    return arm.substructure.T.num_dofs, system.solver.name, found
-
-
-def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found | None:
+def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool) -> Found | None:
     """Return the same by pyMOTO, None where it is not installed."""
-    iterate = pymoto_iteration(link_scene(scene, cells), cells)
+    iterate = pymoto_iteration(link_scene(scene, cells, static), cells)
     if iterate is None:
         return None
     # Its cells run along first, then up the height.
@@ -124,10 +122,10 @@ def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.clip(moved, 1e-3, 1.0)
 
 
-def _static_steps(plan: Plan) -> Steps:
+def _statics(plan: Plan) -> Steps:
     def rows(name: str, cells: Cells) -> Rows:
-        link = static_link if name == STATIC else pymoto_link
-        result, memory = in_processes(link, plan.scene, cells, ranks=1)
+        link = iterate_link if name == STATIC else pymoto_link
+        result, memory = in_processes(link, plan.scene, cells, True, ranks=1)
         if result is not None:
             dofs, solver, found = result
             for design, seconds in zip(DESIGNS, found, strict=True):
@@ -172,7 +170,7 @@ STATICS = Diagram(
     "statics",
     "One solid link: a static iteration against degrees of freedom",
     "program | design | dofs | iteration [s] | memory [GB] | solver",
-    _static_steps,
+    _statics,
     "dofs",
     ("iteration [s]", "memory [GB]"),
     "program",

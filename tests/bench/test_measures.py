@@ -121,7 +121,7 @@ def test_both_links():
     assert dofs == 3 * 3 * 4 * 3 + 6 and solver == "LAPACK's band" and len(seconds) == 2
     dofs, _, seconds = solid.plain_link(MPI.COMM_SELF, SCENE, (4, 3, 2))
     assert dofs == 3 * 5 * 4 * 3 and len(seconds) == 1
-    dofs, solver, seconds = solid.static_link(MPI.COMM_SELF, SCENE, (4, 3, 2))
+    dofs, solver, seconds = solid.iterate_link(MPI.COMM_SELF, SCENE, (4, 3, 2), True)
     assert dofs == 3 * 3 * 4 * 3 + 6 and solver == "LAPACK's band" and len(seconds) == 2
 
 
