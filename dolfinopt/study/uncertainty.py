@@ -427,7 +427,7 @@ def parse_input(scene: Scene, text: str) -> Input:
             )
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
-        if key.endswith("*"):
+        if parts[-1].endswith("*"):
             return Input(key, 1.0, distribution.within(0.0, math.inf))
         field = field_at((parts[0], parts[-1]))
         try:
@@ -439,9 +439,9 @@ def parse_input(scene: Scene, text: str) -> Input:
 
 def nominal_value(scene: Scene, key: str) -> object:
     """Return the scene's value of a key, None where arms differ in it."""
-    if key.endswith("*"):
-        return 1.0
     table, *which, name = in_new_words(key).split(".")
+    if name.endswith("*"):
+        return 1.0
     rows = getattr(scene, table)
     if not isinstance(rows, tuple):
         return getattr(rows, name, None)
