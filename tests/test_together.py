@@ -305,10 +305,10 @@ def payloads(*overrides):
 
 
 @ON_RANKS
-@pytest.mark.parametrize("name", ["_optimise", "_simulate"])
-def test_cases(name, monkeypatch, shared_tmp_path):
+@pytest.mark.parametrize(("place", "name"), [(computing, "_optimise"), (computing._Place, "read")])
+def test_cases(place, name, monkeypatch, shared_tmp_path):
     """A rank that fails ends the others' work, too; what they have finished stays."""
-    fail_on(monkeypatch, LONE, computing, name)
+    fail_on(monkeypatch, LONE, place, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
         run_cases(payloads(), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
