@@ -34,7 +34,6 @@ STATIC, PYMOTO = "dolfinopt, one load", "pyMOTO, one load"
 DESIGNS = FIRST, NEARBY = "first design", "nearby design"
 STATIC_CELLS = (64, 8, 8), (112, 16, 12), (156, 20, 16)  # that three grids divide
 LOAD = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0  # N across the end
-
 Cells = tuple[int, int, int]
 Found = tuple[int, str, list[float]]  # dofs of all ranks, solver, CPU seconds by design
 
@@ -87,8 +86,9 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool = Fals
 
     iterate = loaded if static else dynamic
     found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
-    system = static and arm.substructure.extended or arm.substructure.interior
-    return arm.substructure.T.num_dofs, system.solver.name, found
+    parts = arm.substructure
+    system = (parts.extended if static else None) or parts.interior
+    return parts.T.num_dofs, system.solver.name, found
 
 
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:

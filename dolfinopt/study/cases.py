@@ -126,7 +126,7 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `store.SAMPLED`
+    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `SAMPLED`
     messages: Mapping[int, str] = field(default_factory=dict)  # of samples that failed, by number
 
     def __str__(self) -> str:
