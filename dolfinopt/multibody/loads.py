@@ -91,12 +91,10 @@ class Stiffening:
         estimate: largest relative change of an arm's stiffness along the motion; None in space
             where the scene itself says whether it counts.
         on: whether it is taken into account.
-        neglected: what the deviation would miss without it, over its largest; None if not compared.
     """
 
     estimate: float | None
     on: bool
-    neglected: float | None = None
 
 
 def largest_change(

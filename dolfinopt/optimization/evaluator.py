@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import PhysicalDesign
+from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.optimization.problem import EvaluatedDesign
@@ -17,6 +17,7 @@ from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
+from dolfinopt.responses.response import CellGradient
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class Evaluator:
 
     Attributes:
         scene, partition, arms, profile: of the run.
-        variables, projection: how x makes designs.
+        variables, projection, patterns: how x makes designs.
         trajectory: of the design evaluated last; None without a motion and off the root.
         solutions: its motions; the next evaluation sets out from them.
         start: from where that of the last x set out, so that it can be repeated in the same bits.
@@ -43,7 +44,7 @@ class Evaluator:
     ):
         self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
         self.variables = Variables(scene, partition, arms)
-        self.projection = Projection(scene, partition, arms)
+        self.projection, self.patterns = Projection(scene), Patterns(scene, partition, arms)
         self.trajectory: Trajectory | None = None
         self.solutions: tuple[Solution, ...] = ()
         self.start: Start = (), {}
@@ -53,9 +54,24 @@ class Evaluator:
 
         Collective; of this rank's arms.
         """
-        designs = self.projection.physical_designs(self.variables.split(x))
+        parts, arms, beta = self.variables.split(x), self.variables.arms, self.projection.beta
+        with together(self.partition.world):
+            designs = {k: arm.physical_designs(parts[k], beta) for k, arm in arms.items()}
         count = 3 if self.scene.design.projection == "robust" else 1
-        return [{k: one[variant] for k, one in designs.items()} for variant in range(count)]
+        variants = [{k: one[variant] for k, one in designs.items()} for variant in range(count)]
+        return [self._spread(one) for one in variants]
+
+    def _spread(self, designs: dict[int, PhysicalDesign]) -> dict[int, PhysicalDesign]:
+        """Add the arms that repeat another's design, with its densities (collective)."""
+        every = self.patterns.spread(densities(designs))
+        return {k: designs.get(k) or PhysicalDesign(x, None) for k, x in every.items()}
+
+    def smoothed(self, x: np.ndarray) -> dict[int, np.ndarray]:
+        """Return what is projected, of all arms of this rank (collective)."""
+        parts, arms = self.variables.split(x), self.variables.arms
+        with together(self.partition.world):
+            smooth = {k: arm.smoothed(parts[k]) for k, arm in arms.items()}
+        return self.patterns.spread(smooth)
 
     def evaluate(self, x: np.ndarray) -> list[EvaluatedDesign]:
         """Evaluate the designs that x stands for, the nominal one last (collective)."""
@@ -135,20 +151,33 @@ class Evaluator:
         """Add the gradients by x of the design evaluated last (collective)."""
         if self.trajectory is not None:
             self.solutions = self.trajectory.solutions
-        analysed = self.scene, self.partition, self.arms, self.trajectory, self.profile
-        collect = self.projection.patterns.collect
-        by_cells = [collect(gradient(*analysed))]
-        rows = constraint_gradients(*analysed, measured=evaluation.responses)
-        by_cells += [collect(row.smooth) for row in rows]
+        rows = constraint_gradients(*self._analysed, evaluation.responses)
+        by_cells = [gradient(*self._analysed), *(row.smooth for row in rows)]
+        by_x, limits = self._by_variables(design, by_cells), np.array([row.limit for row in rows])
+        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None])
+
+    def objective_gradient(self, design: Mapping[int, PhysicalDesign]) -> np.ndarray:
+        """Return the objective's gradient (n,) by x of the design evaluated last (collective)."""
+        return self._by_variables(design, [gradient(*self._analysed)])[0]
+
+    @property
+    def _analysed(
+        self,
+    ) -> tuple[Scene, Partition, Mapping[int, Arm], Trajectory | None, Profile]:
+        return self.scene, self.partition, self.arms, self.trajectory, self.profile
+
+    def _by_variables(
+        self, design: Mapping[int, PhysicalDesign], by_cells: Sequence[CellGradient]
+    ) -> np.ndarray:
+        """Return gradients (k, n) by x from those by the physical densities (collective)."""
+        by_cells = [self.patterns.collect(one) for one in by_cells]
         backward = {}
         with together(self.partition.world):
             for k, arm in self.variables.arms.items():
                 none = np.zeros(arm.mesh.num_cells)
                 by = [arm.backward(one[k], design[k]) if k in one else none for one in by_cells]
                 backward[k] = np.stack(by, axis=1)
-        by_x = np.ascontiguousarray(self.variables.join(backward).T)
-        limits = np.array([row.limit for row in rows])
-        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None])
+        return np.ascontiguousarray(self.variables.join(backward).T)
 
 
 def densities(design: Mapping[int, PhysicalDesign]) -> dict[int, np.ndarray]:

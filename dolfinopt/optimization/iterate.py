@@ -11,13 +11,10 @@ from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
     GREY_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
-    LEAP_FACTOR,
     LEAST_REACH,
-    MERIT_RISE,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
     SHORTER_REACH,
-    SHORTER_STEP,
     STEP_ATTEMPTS,
 )
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
@@ -26,7 +23,7 @@ from dolfinopt.optimization.residual import Residual, kkt_residual
 from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Progress
 from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.constraints import EXCESS, tightest
-from dolfinopt.responses.static import cell_volumes
+from dolfinopt.responses.static import depths
 
 
 class Iterate:
@@ -39,7 +36,7 @@ class Iterate:
         iteration, change: updates made, and the largest change of a variable in the last one.
         reach: factor on the move limit, at most 1.
         returned_to: iteration of the best design that was gone back to last, -1 of none.
-        residual, grayness: of x; the latter is known on the root.
+        residual: of x.
         curved: whether limits other than volume and mass are to be kept.
         stuck: why no step leads on from x, "" while one does.
     """
@@ -55,8 +52,7 @@ class Iterate:
         self.x, self.state = x, initial_state(x)
         self.best, self.progress = Best.none(x), Progress()
         self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
-        self.residual, self.grayness = Residual.unknown(), 0.0
-        self.stuck = ""
+        self.residual, self.stuck = Residual.unknown(), ""
         self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
 
     @property
@@ -99,7 +95,7 @@ class Iterate:
             return False
         self.return_to_best()
         self.returned_to = self.best.iteration
-        self.state, self.reach = initial_state(self.x), SHORTER_STEP
+        self.state, self.reach = initial_state(self.x), SHORTER_REACH**2
         self.progress, self.stuck = self.progress.anew(), ""
         return True
 
@@ -158,14 +154,14 @@ class Iterate:
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
         rises = self.projection.rises(self.problem.excess)
         for attempt in range(STEP_ATTEMPTS):
-            shorter = SHORTER_STEP**attempt
+            shorter = SHORTER_REACH ** (2 * attempt)
             new, after = self._proposed(shorter * self.reach * self.projection.move)
             if rises:
                 self.projection.advance()
             designs = self._tried(new)
             if designs is not None:
                 self._go_on(new, after, designs, rises)
-                rose = self.problem.merit(size) > merit + MERIT_RISE
+                rose = self.problem.merit(size) > merit + EXCESS
                 self.reach = self._reach_after(shorter * self.reach, rises, rose)
                 return
             self.projection.beta = before
@@ -235,12 +231,12 @@ class Iterate:
         """
         with self.evaluator.profile.phase("kkt residual"):
             self.residual = self._residual()
-        _, volume_fraction, self.grayness = self._volumes()
+        _, volume_fraction, grayness = self._volumes()
         return HistoryRow(
             iteration=self.iteration,
             objective=self.problem.f0,
             max_deviation=self.nominal.evaluation.max_deviation,
-            grayness=self.grayness,
+            grayness=grayness,
             volume_fraction=volume_fraction,
             change=self.change,
             seconds=0.0,
@@ -251,13 +247,11 @@ class Iterate:
 
     def _volumes(self) -> tuple[float, float, float]:
         """Return the volume of all arms, and which shares of it are filled, and grey."""
-        parts = {}
-        x_phys, arms = self.nominal.x_phys, self.evaluator.arms
-        meshes = {k: arm.mesh for k, arm in arms.items()}
-        for k, volume in cell_volumes(self.scene, meshes).items():
-            kind = arms[k].kind
-            filled, x = kind.filled(x_phys[k]), kind.share(x_phys[k])
-            parts[k] = np.array([volume.sum(), volume @ filled, volume @ (4.0 * x * (1.0 - x))])
+        x_phys, depth, parts = self.nominal.x_phys, depths(self.scene), {}
+        for k, arm in self.evaluator.arms.items():
+            filled, x = arm.kind.filled(x_phys[k]), arm.kind.share(x_phys[k])
+            counted = np.array([np.ones_like(x), filled, 4.0 * x * (1.0 - x)])
+            parts[k] = counted @ (depth[k] * arm.mesh.area)
         total, volume, grey = sum_over_arms(self.evaluator.partition, parts)
         return float(total), float(volume / total), float(grey / total)
 
@@ -307,12 +301,14 @@ class Iterate:
 
 
 def leaps(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether a step makes things so much worse that it leads nowhere.
+    """Return whether a step makes things twice as bad, and so leads nowhere.
+
+    Either a limit, or the objective of a design that keeps all.
 
     Args:
         before, after: (1 + m,) values of what is minimised and of the relative limits.
     """
     kept = bool((before[1:] <= EXCESS).all())
-    up = kept and after[0] > before[0] + (LEAP_FACTOR - 1.0) * abs(before[0])
-    far = 1.0 + after[1:] > LEAP_FACTOR * (1.0 + np.maximum(before[1:], 0.0))
+    up = kept and after[0] > before[0] + abs(before[0])
+    far = 1.0 + after[1:] > 2.0 * (1.0 + np.maximum(before[1:], 0.0))
     return bool(up or far.any() or not np.isfinite(after).all())

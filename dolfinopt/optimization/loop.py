@@ -22,7 +22,6 @@ from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.measured import (
     CHECKPOINT_SECONDS,
-    COMPARED_ITERATIONS,
     COORDINATE_RESERVE_FACTOR,
     FROZEN_GAIN,
     WINDOW,
@@ -89,9 +88,9 @@ def run(
     Raises:
         ConvergenceError: a simulation failed.
     """
-    run_ = _Run(Evaluator(scene, partition, arms, profile), recorder, report, x0)
-    run_.compared = compared and scene.optimizer.max_iterations >= COMPARED_ITERATIONS
-    return run_.go(memory)
+    compared = compared and scene.optimizer.max_iterations >= 2 * WINDOW
+    evaluator = Evaluator(scene, partition, arms, profile)
+    return _Run(evaluator, recorder, report, compared, x0).go(memory)
 
 
 def begins_with_frozen_loads(scene: Scene) -> bool:
@@ -107,9 +106,11 @@ class _Run:
         evaluator: Evaluator,
         recorder: Recorder | None,
         report: Report | None,
+        compared: bool,
         x0: Mapping[int, np.ndarray] | None,
     ) -> None:
         self.evaluator, self.recorder, self.report = evaluator, recorder, report
+        self.compared = compared  # whether to look at solid arms and bars
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
         variables = evaluator.variables
@@ -124,15 +125,23 @@ class _Run:
         self.selection: OrderSelection | None = None  # of coordinates, where order is "auto"
         # (n_times, 2) of the initial design, evenly over the horizon, m (root only)
         self.initial_deviation = np.empty((0, 2))
-        self.compared = False  # whether to look at solid arms and bars
         self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
     def go(self, memory: Memory | None) -> RankResult:
         """Iterate until the design gains no more or the iterations are spent."""
-        self._begin(memory)
-        self._evaluate(anew=memory is None)
         if memory is None:
+            self._begin()
+        else:
+            self._restore(memory)
+        if self.recorder is not None:
+            self.recorder.begin(self.history)
+        if memory is not None:
+            self.iterate.evaluate_again()
+        else:
+            self.iterate.evaluate()
+            if (trajectory := self.evaluator.trajectory) is not None:
+                self.initial_deviation = trajectory.deviation
             self._record()
             self._look_at_solid_arms()
         while not self._finished() or self._goes_on():
@@ -143,32 +152,17 @@ class _Run:
         self._checkpoint(force=True)
         return self._result()
 
-    def _begin(self, memory: Memory | None) -> None:
-        """Go on from `memory`, or choose the coordinates for the initial design (collective)."""
+    def _begin(self) -> None:
+        """Choose gradient and coordinates for the initial design (collective)."""
         scene = self.scene
-        if memory is not None:
-            self._restore(memory)
-        else:
-            if begins_with_frozen_loads(scene):
-                self.evaluator.use_gradient("esl")
-            elif scene.objective.gradient == "exact":
-                self.exact_from = 0
-            if needs(scene, "motion"):
-                initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
-                place = scene, self.partition, self.arms, initial, self.profile
-                self.selection = choose_coordinates(*place, reserve=COORDINATE_RESERVE_FACTOR)
-        if self.recorder is not None:
-            self.recorder.begin(self.history)
-
-    def _evaluate(self, anew: bool) -> None:
-        """Evaluate the first design, or again that of a run that goes on (collective)."""
-        if anew:
-            self.iterate.evaluate()
-        else:
-            self.iterate.evaluate_again()
-        trajectory = self.evaluator.trajectory
-        if trajectory is not None and len(self.initial_deviation) == 0:
-            self.initial_deviation = trajectory.deviation
+        if begins_with_frozen_loads(scene):
+            self.evaluator.use_gradient("esl")
+        elif scene.objective.gradient == "exact":
+            self.exact_from = 0
+        if needs(scene, "motion"):
+            initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
+            place = scene, self.partition, self.arms, initial, self.profile
+            self.selection = choose_coordinates(*place, reserve=COORDINATE_RESERVE_FACTOR)
 
     def _look_at_solid_arms(self) -> None:
         """Tell what solid arms make of the limits (collective)."""
@@ -181,7 +175,7 @@ class _Run:
 
     def _bars(self, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
         """Evaluate straight solid bars of the same mass (collective)."""
-        if not self.compared or self.iterate.iteration < COMPARED_ITERATIONS:
+        if not self.compared or self.iterate.iteration < 2 * WINDOW:
             return None
         bars = straight_bars(self.evaluator, x_phys)
         with self.profile.phase("comparison"):
@@ -265,7 +259,7 @@ class _Run:
             partition=self.partition,
             arms=self.arms,
             x_phys=x_phys,
-            x_filtered=self._filtered(),
+            x_filtered=self.evaluator.smoothed(one.x) if self.scene.design.projection else None,
             evaluation=final.evaluation,
             crisp=final.crisp,
             trajectory=self.evaluator.trajectory,
@@ -285,13 +279,6 @@ class _Run:
             choice=final.selection,
             bars=self._bars(x_phys),
         )
-
-    def _filtered(self) -> dict[int, np.ndarray] | None:
-        """Return what the final design was projected from (collective), None if it was not."""
-        if not self.scene.design.projection:
-            return None
-        x = self.evaluator.variables.split(self.iterate.x)
-        return self.evaluator.projection.smoothed(x)
 
     def _conflicts(self, code: StopCode) -> str:
         """Return what holds back the limits that x does not meet (collective)."""
@@ -359,5 +346,4 @@ class _Run:
         self.iterate.restore(memory)  # with the vectors of this order
         self.history = memory.history if self.partition.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
-        self.iterate.grayness = memory.history[-1].grayness
         self.seconds_before = memory.history[-1].seconds

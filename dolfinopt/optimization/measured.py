@@ -6,13 +6,12 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 
 # -- The step (iterate); figures of the sixteen problems in docs: theory/optimiser --
 
-SHORTER_REACH = 0.5  # on the move limit where the merit rose
+# On the move limit where the merit rose; twice on a step without a motion or that leaps, and after
+# a return to the best design.
+SHORTER_REACH = 0.5
 REACH_GROWTH = 1.2  # on it where it did not
 LEAST_REACH = 0.05  # of the scene's move limit
-MERIT_RISE = 1e-3  # of the merit, from which on it counts as risen
-SHORTER_STEP = 0.25  # on a step without a motion, or that leaps; reach after a return to the best
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
-LEAP_FACTOR = 2.0  # on a limit, or on the objective of a design that keeps all: leads nowhere
 # For each time step of the last motion, and each of robust designs, before a design is given up;
 # most take 3 to 10, machines 16 to 44, what falls apart thousands.
 NEWTON_ITERATIONS = 100.0
@@ -46,7 +45,6 @@ TRIAL_STEP_SHARE = 0.1
 # Grayness above which a projection has not done its work: 2 % of the cells at 1/2.
 GREY_SHARE = 0.02
 WINDOW = 20  # iterations in which a run that goes on gains `optimizer.tolerance`; 10 end rods early
-LOOKED_AT = 5  # every so many iterations: counts do not depend on rounding then
 # Of the best design in half a window, with which frozen loads go on; with less the exact gradient.
 FROZEN_GAIN = 0.01
 OPPOSING_SHARE = 0.05  # of a violated limit's gradient that another one balances: they conflict
@@ -61,14 +59,9 @@ CHECKPOINT_SECONDS = 2.0
 # 2.7 times as much (3 to 8 coordinates, 48 x 6 cells).
 COORDINATE_RESERVE_FACTOR = 3.0
 
-COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a twentieth
-
 # -- Taylor tests (gradient_check) --
 
-STEP_RATIO = 4.0  # of one step to the next: remainders of second order fall by 16
-INSIDE_MARGIN = 0.05  # design variables are moved this far inside [0, 1]: steps must not leave it
-OBJECTIVE_ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
-FORCE_ROUNDING = 1e-9  # the same of drive forces, which are made of accelerations
+ROUNDING_SHARE = 1e-10  # of the objective, that Newton's tolerance leaves open
 PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 
 # -- Approximation and its dual (mma); what is Svanberg's stands there --
@@ -83,8 +76,5 @@ CURVED_ASYMPTOTE_DISTANCE = 1.0
 # Of the range: a smaller move counts neither as back nor as forth. With 1e-9 rounding decides, and
 # the kernels of OpenBLAS end in 2 % of the runs with other counts; with 1e-6 in none of 200.
 REST_MOVE_SHARE = 1e-6
-# The dual is stepped in units of (multiplier + this), as they span decades; below raa0 they hardly
-# change the design.
-MULTIPLIER_FLOOR = 1e-5
 DUAL_EVALUATIONS = 300  # at most; 4 to 5 are the rule
 ROUNDING = 1e-14  # of sums relative to their terms

@@ -30,7 +30,6 @@ from dolfinopt.optimization.measured import (
     FIRST_ASYMPTOTE_DISTANCE,
     LARGEST_ASYMPTOTE_DISTANCE,
     LEAST_ASYMPTOTE_DISTANCE,
-    MULTIPLIER_FLOOR,
     REST_MOVE_SHARE,
     ROUNDING,
 )
@@ -41,8 +40,10 @@ _WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: a
 _NARROW = 0.7  # where it turned back (asydecr)
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
 
-CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
-_RAA0 = 1e-5  # his raa0: convex even where all gradients are zero
+_CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
+# His raa0: convex even where all gradients are zero. The dual is stepped in units of
+# (multiplier + this), as they span decades; below it they hardly change the design.
+_RAA0 = 1e-5
 _PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y
 
 _TINY = float(np.finfo(np.float64).tiny)
@@ -136,11 +137,11 @@ def mma_step(
     used = np.append(True, felt)  # an objective without gradient still holds the variables
     scale = np.where(largest > 0.0, largest, 1.0)[used]
     G = distance * gradients[used] / scale[:, None]
-    H = CURVATURE * np.abs(G) + 2.0 * _RAA0 * distance
+    H = _CURVATURE * np.abs(G) + 2.0 * _RAA0 * distance
     cost = np.full(f.size, _PENALTY)[felt]
     if prices is not None:
         dear = np.asarray(prices, dtype=np.float64)[felt] * scale[1:] / scale[0]
-        cost = np.maximum(dear, MULTIPLIER_FLOOR)
+        cost = np.maximum(dear, _RAA0)
     # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
     with np.errstate(over="ignore"):
         normalised = np.clip(f[felt] / scale[1:], -1e30, 1e30)
@@ -255,7 +256,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     for _ in range(DUAL_EVALUATIONS):
         new = _newton_step(point, radius, dual.prices)
         change = new - point.multipliers
-        relative = np.abs(change) / (point.multipliers + MULTIPLIER_FLOOR)
+        relative = np.abs(change) / (point.multipliers + _RAA0)
         if relative.max() <= ROUNDING:
             return point
         trial = dual.at(new)
@@ -284,7 +285,7 @@ def _newton_step(point: _DualPoint, radius: Array, prices: Array) -> Array:
     Near: each grows or shrinks by the factor 1 + radius at most, in units of it and a floor.
     """
     old = point.multipliers
-    unit = old + MULTIPLIER_FLOOR
+    unit = old + _RAA0
     lower = np.maximum(-old / unit, -radius / (1.0 + radius))
     upper = np.minimum((prices - old) / unit, radius)
     curvature = point.curvature * np.outer(unit, unit)
@@ -324,7 +325,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
         slope = gradient - curvature @ z
         inward = np.where(fixed, np.where(z >= upper, -slope, slope), 0.0)
         k = int(np.argmax(inward))
-        if inward[k] <= 1e-12 * np.abs(gradient).max():
+        if inward[k] <= DEPENDENT_SHARE * np.abs(gradient).max():
             break
         fixed[k] = False
     return z

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.optimization.measured import (
     GENTLE_SHARPNESS,
     LEAST_REACH,
     REACHED_LIMIT_SHARE,
     SLOW_CONTINUATION,
 )
-from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
 
 
 class Projection:
@@ -26,15 +16,11 @@ class Projection:
 
     Attributes:
         beta: steepness; grows from 1 to design.sharpness.
-        patterns: arms that repeat another's design.
     """
 
-    def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
+    def __init__(self, scene: Scene):
         """Begin with the gentlest projection."""
-        self.scene, self.partition, self.arms = scene, partition, arms
-        self.beta = 1.0
-        self.patterns = Patterns(scene, partition, arms)
-        self.designed = [k for k in arms if k in scene.designed]  # of this rank
+        self.scene, self.beta = scene, 1.0
 
     @property
     def complete(self) -> bool:
@@ -51,31 +37,6 @@ class Projection:
     def least_reach(self) -> float:
         """Least factor on the move limit while beta rises: x can follow it."""
         return LEAST_REACH * (SLOW_CONTINUATION / self.scene.design.continuation) ** 1.5
-
-    def physical_designs(
-        self, x: Mapping[int, np.ndarray]
-    ) -> dict[int, tuple[PhysicalDesign, ...]]:
-        """Return the designs that x stands for, the nominal one last (collective).
-
-        Of all arms of this rank; those that repeat another's design have its densities.
-        """
-        with together(self.partition.world):
-            designs = {k: self.arms[k].physical_designs(x[k], self.beta) for k in self.designed}
-        if not self.patterns.repeats:
-            return designs
-        count = 3 if self.scene.design.projection == "robust" else 1
-        spread = [
-            self.patterns.spread({k: variants[i].x_phys for k, variants in designs.items()})
-            for i in range(count)
-        ]
-        repeats = [k for k in self.arms if k in self.patterns.repeats]
-        return designs | {k: tuple(PhysicalDesign(x[k], None) for x in spread) for k in repeats}
-
-    def smoothed(self, x: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
-        """Return what is projected, of all arms of this rank (collective)."""
-        with together(self.partition.world):
-            smooth = {k: self.arms[k].smoothed(x[k]) for k in self.designed}
-        return self.patterns.spread(smooth)
 
     def rises(self, excess: float) -> bool:
         """Return whether beta rises with the next update; not as long as limits are far.

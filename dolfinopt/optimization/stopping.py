@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from dolfinopt.optimization.measured import LOOKED_AT, WINDOW
+from dolfinopt.optimization.measured import WINDOW
 from dolfinopt.optimization.state import Best, Progress
 from dolfinopt.scene.load import Scene
 
@@ -26,7 +26,7 @@ def stop_code(
 
     A run ends where its best design gained at most `optimizer.tolerance` in `WINDOW` iterations of
     one projection, or in three times as many while no design keeps all limits, and where no step
-    leads on. It is looked at every few iterations, so that rounding does not change their number.
+    leads on. It is looked at four times a window, so that rounding does not change their number.
 
     Args:
         scene: with the tolerance.
@@ -39,7 +39,7 @@ def stop_code(
     if stuck:
         gained_nothing = best.excess == 0.0 and iteration - best.iteration >= WINDOW
         return StopCode.SETTLED if gained_nothing else StopCode.STUCK
-    if iteration and iteration % LOOKED_AT == 0:
+    if iteration and iteration % (WINDOW // 4) == 0:
         tolerance, feasible = scene.optimizer.tolerance, best.excess == 0.0
         if progress.gain(WINDOW if feasible else 3 * WINDOW) <= tolerance:
             return StopCode.SETTLED if feasible else StopCode.INFEASIBLE

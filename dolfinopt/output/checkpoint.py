@@ -85,10 +85,8 @@ def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -
         arrays["coordinates"] = memory.choice.coordinates
         arrays["tried"] = np.array(memory.choice.tried)
     if memory.stiffening is not None:
-        known = memory.stiffening
-        arrays["stiffening"] = [
-            np.nan if x is None else float(x) for x in (known.estimate, known.on, known.neglected)
-        ]
+        estimate = memory.stiffening.estimate
+        arrays["stiffening"] = [np.nan if estimate is None else estimate, memory.stiffening.on]
     _sealed(folder, {key: np.asarray(value) for key, value in arrays.items()})
 
 
@@ -139,10 +137,8 @@ def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
         choice = OrderSelection(count, dict(tried)[count], tried)
     stiffening = None
     if "stiffening" in arrays:
-        estimate, on, neglected = (
-            None if np.isnan(x) else x for x in arrays["stiffening"].tolist()
-        )
-        stiffening = Stiffening(estimate, bool(on), neglected)
+        estimate, on = arrays["stiffening"].tolist()
+        stiffening = Stiffening(None if np.isnan(estimate) else estimate, bool(on))
     exact_from = int(arrays["exact_from"])
     return Memory(
         **fields_from(arrays, arms),

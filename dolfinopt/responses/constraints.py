@@ -58,10 +58,8 @@ class Limit:
     @property
     def sentence(self) -> str:
         """E.g. "first frequency of arm2: 60.4 Hz, at least 80 Hz required"."""
-        unit = "" if self.unit == "-" else f" {self.unit}"
-        value, limit = distinct(self.value, self.limit)
-        bound = "at least" if self.least else "at most"
-        return f"{self.words}: {value}{unit}, {bound} {limit}{unit} required"
+        value, limit = (with_unit(x, self.unit) for x in distinct(self.value, self.limit))
+        return f"{self.words}: {value}, {'at least' if self.least else 'at most'} {limit} required"
 
     @property
     def words(self) -> str:
@@ -78,14 +76,15 @@ class Limit:
         """E.g. "deviation 5.3 of 8 mm: 66 %"; of a lower limit the limit's share of the value."""
         (value, limit), unit = shown((self.value, self.limit), self.unit)
         of = "of at least" if self.least else "of"
-        share = 100.0 * (1.0 + self.excess) if not self.least else 100.0 * self.limit / self.value
-        return with_unit(f"{self.words} {value:.3g} {of} {limit:.4g}", unit) + f": {share:.0f} %"
+        share = limit / value if self.least else value / limit
+        both = with_unit(f"{value:.3g} {of} {limit:.4g}", unit)
+        return f"{self.words} {both}: {100.0 * share:.0f} %"
 
     @property
     def bound(self) -> str:
         """E.g. "first frequency of arm2 >= 80 Hz"."""
-        unit = "" if self.unit == "-" else f" {self.unit}"
-        return f"{self.words} {'>=' if self.least else '<='} {self.limit:g}{unit}"
+        limit = with_unit(f"{self.limit:g}", self.unit)
+        return f"{self.words} {'>=' if self.least else '<='} {limit}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of summary.json."""

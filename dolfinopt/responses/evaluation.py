@@ -17,17 +17,12 @@ from dolfinopt.dynamics.build import largest_stiffness_change
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.errors import InputError
 from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.measured import (
-    NEGLECTED_DEVIATION_SHARE,
-    STIFFENING_INSTANTS,
-    STIFFENING_OFF_CHANGE,
-    STIFFENING_ON_CHANGE,
-)
+from dolfinopt.responses.measured import COARSE_INSTANTS, STIFFNESS_CHANGE
 from dolfinopt.responses.motion import motion_objective, worst_instants
 from dolfinopt.responses.products import By, by_design
 from dolfinopt.responses.response import (
@@ -126,9 +121,14 @@ def evaluate(
             arm.set_design(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or needs(scene, "motion"):
-        decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
-        owned = _reduced(partition, arms, x_phys)
-        motion, trajectory = _simulated(scene, partition, owned, profile, start)
+        scenes = [scene, *pose_scenarios(scene)]
+        decide_stiffening(scenes, partition, arms)
+        with together(partition.world):
+            bodies = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
+        owned = gather_arms(partition, bodies)
+        trajectory = simulated_together(scenes, partition, owned, profile, start)
+        with profile.phase("objective"):
+            motion = on_root(partition.world, _motion, trajectory)
     analysis = analysis_of(scene, partition, arms, trajectory, profile)
     return _measured(analysis, motion), trajectory
 
@@ -163,8 +163,8 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
         limits = bound.smooth_limits(found)
-        constraints += [float(x) for x in np.array(found.smooth) / limits - 1.0]
-        smooth_limits += [float(x) for x in limits]
+        constraints += (np.array(found.smooth) / limits - 1.0).tolist()
+        smooth_limits += limits.tolist()
         measured.append(found)
     return Evaluation(
         **vars(replace(motion, objective=measured[0].total)),
@@ -254,70 +254,46 @@ def constraint_gradients(
 # -- the motion ------------------------------------------------------------------------------
 
 
-def _reduced(
-    partition: Partition, arms: Mapping[int, Arm], x_phys: Cells
-) -> Mapping[int, ShapeIntegrals]:
-    """Return the bodies of the arms with a design of their own, on the root (collective)."""
-    with together(partition.world):
-        bodies = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
-    return gather_arms(partition, bodies)
-
-
-def _simulated(
-    scene: Scene,
+def simulated_together(
+    scenes: Sequence[Scene],
     partition: Partition,
     owned: Mapping[int, ShapeIntegrals],
     profile: Profile,
-    starts: Sequence[Solution],
-) -> tuple[Motion, Trajectory | None]:
-    """Simulate a scene and its scenarios (collective); the trajectory is the root's.
-
-    Raises:
-        ConvergenceError: on all ranks.
-    """
-    kept: list[Trajectory] = []
-
-    def run() -> Motion:
-        kept.append(moved([scene, *pose_scenarios(scene)], owned, profile, starts))
-        with profile.phase("objective"):
-            return _motion(kept[0])
-
-    motion = on_root(partition.world, run)
-    return motion, kept[0] if kept else None
-
-
-def moved(
-    scenes: Sequence[Scene],
-    owned: Mapping[int, ShapeIntegrals],
-    profile: Profile,
     starts: Sequence[Solution] = (),
-) -> Trajectory:
-    """Simulate a scene with its scenarios (root only).
+) -> Trajectory | None:
+    """Simulate a scene with its scenarios on the root; there the trajectory is (collective).
 
     Args:
         scenes: it and them.
+        partition: which ranks do which arm.
         owned: bodies of the arms with a design of their own.
         profile: counts and seconds.
         starts: solutions of a nearby design; scenarios begin with the scene's unless theirs is
             known.
+
+    Raises:
+        ConvergenceError: on all ranks.
     """
     scene, *others = scenes
-    first = simulate(scene, chain_of(scene, owned), profile, starts[0] if starts else None)
-    found = []
-    for number, one in enumerate(others, 1):
-        start = starts[number] if number < len(starts) else first.solution
-        # The nominal machine's feed-forward is kept where the motion is the same.
-        held = first.feed_forward if one.motion == scene.motion else None
-        found.append(simulate(one, bodies_in(scene, one, owned), profile, start, held))
-    return replace(first, scenarios=tuple(found))
+    kept: list[Trajectory] = []
+
+    def run() -> None:
+        first = simulate(scene, chain_of(scene, owned), profile, starts[0] if starts else None)
+        found = []
+        for number, one in enumerate(others, 1):
+            start = starts[number] if number < len(starts) else first.solution
+            # The nominal machine's feed-forward is kept where the motion is the same.
+            held = first.feed_forward if one.motion == scene.motion else None
+            found.append(simulate(one, bodies_in(scene, one, owned), profile, start, held))
+        kept.append(replace(first, scenarios=tuple(found)))
+
+    on_root(partition.world, run)
+    return kept[0] if kept else None
 
 
 def _motion(trajectory: Trajectory) -> Motion:
     """Return what the motion does, of all scenarios together where there are any."""
-    motion = _figures(trajectory)
-    if not trajectory.scenarios:
-        return motion
-    return replace(motion, scenarios=tuple(_figures(one) for one in trajectory.scenarios))
+    return replace(_figures(trajectory), scenarios=tuple(map(_figures, trajectory.scenarios)))
 
 
 def _figures(trajectory: Trajectory) -> Motion:
@@ -336,12 +312,8 @@ def _figures(trajectory: Trajectory) -> Motion:
     )
 
 
-# -- whether the arms' bodies get geometric stiffness: as the scene says, or by what it changes
-#
-# "auto" simulates the machine twice, with and without it, with arms that have the static modes of
-# their outboard interfaces alone, and leaves out what changes the deviation by less than
-# `NEGLECTED_DEVIATION_SHARE`. Where the loads change the stiffness of no arm by more than
-# `STIFFENING_OFF_CHANGE`, nothing is simulated.
+# -- whether the arms' bodies get geometric stiffness: as the scene says; with "auto" where the
+# loads change an arm's stiffness by more than `STIFFNESS_CHANGE`
 
 
 def decide_stiffening(
@@ -393,55 +365,10 @@ def _stiffening(
     with together(partition.world):
         mine = {k: arm.current.static_body for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
-    found: Stiffening = on_root(partition.world, _decided, scenes, owned)
-    return found
 
+    def largest(one: Scene) -> float:
+        t = np.linspace(0.0, one.motion.horizon, COARSE_INSTANTS + 1)
+        return largest_stiffness_change(one, bodies_in(scenes[0], one, owned), t)
 
-def _decided(scenes: Sequence[Scene], owned: Mapping[int, ShapeIntegrals]) -> Stiffening:
-    """Return what is decided by the bodies of the arms' designs."""
-    stated = scenes[0].simulation.stiffening
-    bodies = [bodies_in(scenes[0], one, owned) for one in scenes]
-    estimate = max(map(_change, scenes, bodies))
-    if stated != "auto":
-        return Stiffening(estimate, stated)
-    if not STIFFENING_OFF_CHANGE < estimate < STIFFENING_ON_CHANGE:
-        return Stiffening(estimate, estimate >= STIFFENING_ON_CHANGE)
-    neglected = _neglected(scenes, bodies)
-    on = neglected is None or neglected > NEGLECTED_DEVIATION_SHARE
-    return Stiffening(estimate, on, neglected)
-
-
-def _change(scene: Scene, bodies: list[ShapeIntegrals]) -> float:
-    """Return the largest change of an arm's stiffness by the loads of the motion."""
-    t = np.linspace(0.0, scene.motion.horizon, STIFFENING_INSTANTS)
-    return largest_stiffness_change(scene, bodies, t)
-
-
-def _neglected(group: Sequence[Scene], bodies: list[list[ShapeIntegrals]]) -> float | None:
-    """Return what share of the largest deviation linear bodies miss; None if one cannot move."""
-    # Simulated beside the run: the comparison is none of its simulations.
-    profile = Profile()
-    largest = 0.0
-    for scene, chain in zip(group, bodies, strict=True):
-        try:
-            stiffened = simulate(scene, chain, profile)
-            without = simulate(scene, [linear_part(body) for body in chain], profile)
-        except ConvergenceError:
-            return None
-        moved, other = _displacements(stiffened), _displacements(without.at(stiffened.t))
-        size = np.linalg.norm(moved, axis=-1).max(initial=0.0)
-        if size > 0.0:
-            apart = np.linalg.norm(moved - other, axis=-1).max()
-            largest = max(largest, float(apart / size))
-    return largest
-
-
-def _displacements(trajectory: Trajectory) -> np.ndarray:
-    """Return the deviation (n, 1, d); of closed loops the arms' outboard ends' (n, arms, d), m."""
-    deviation = trajectory.deviation
-    if trajectory.closure_force is None:
-        return deviation[:, None]
-    d, mechanism = deviation.shape[1], trajectory.mechanism
-    parts = zip(mechanism.slices, mechanism.bodies, strict=True)
-    ends = [trajectory.q_e[:, part] @ body.outboard[:d].T for part, body in parts]
-    return np.stack(ends, axis=1)
+    change: float = on_root(partition.world, lambda: max(map(largest, scenes)))
+    return Stiffening(change, change > STIFFNESS_CHANGE if stated == "auto" else stated)

@@ -20,11 +20,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import decide_stiffening
-from dolfinopt.responses.measured import (
-    POLE_COORDINATES_LIMIT,
-    POLE_ERROR,
-    RICHER_RATIO,
-)
+from dolfinopt.responses.measured import COORDINATES_LIMIT, POLE_ERROR
 from dolfinopt.responses.order_selection import RICHER_METHOD, Reductions, fewest
 from dolfinopt.scene.load import Scene, pose_scenarios
 
@@ -73,7 +69,7 @@ def linearised_machine(
     @cache
     def judged(count: int) -> StateSpace:
         found = machine(scene.reduction.method, count)
-        exact = machine(RICHER_METHOD, min(RICHER_RATIO * count, reductions.limit))
+        exact = machine(RICHER_METHOD, min(2 * count, reductions.limit))
         held = accurate_below(found.poles, exact.poles, 1.0 / scene.motion.horizon)
         return replace(found, accurate_below=held)
 
@@ -83,7 +79,7 @@ def linearised_machine(
         return replace(machine(RICHER_METHOD, 0), accurate_below=np.inf)
     if below is None or judged(count).accurate_below >= below:
         return judged(count)
-    limit = max(count, min(POLE_COORDINATES_LIMIT, reductions.limit))
+    limit = max(count, min(COORDINATES_LIMIT, reductions.limit))
     enough = fewest(count, limit, lambda n: judged(n).accurate_below >= below)
     if enough is None:
         raise ConvergenceError(

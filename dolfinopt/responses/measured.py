@@ -3,23 +3,17 @@
 Each stands with its unit, what it rules, and what was measured.
 """
 
-# -- evaluation: whether the arms get geometric stiffness ------------------------------------
+# -- motions, and whether arms get geometric stiffness     ------------------------------------
 
-STIFFENING_INSTANTS = 201  # of the horizon, at which loads are looked at
-# Of the largest deviation, that "auto" may leave out: 0.5 %, less what the static modes do not show
-# of it (measured: a tenth).
-NEGLECTED_DEVIATION_SHARE = 4e-3
-# Largest change of an arm's stiffness with which it is left out, and that with which it is taken
-# into account, without a simulation. Measured: the deviation changes by 0.3 to 3 times as much.
-STIFFENING_OFF_CHANGE = 5e-4
-STIFFENING_ON_CHANGE = 0.05
+COARSE_INSTANTS = 200  # of a motion, at which loads and stress are looked at first
+# Of an arm's stiffness, by the loads of the motion, from which on "auto" takes it into account. The
+# deviation changes by 0.1 to 2.5 times as much, under feed-forward by 10 to 20 times.
+STIFFNESS_CHANGE = 2.5e-3
 
 # -- order_selection -------------------------------------------------------------------------
 
-# The motion is compared with one of at least so many coordinates, and so many times those tried.
-RICHER_COORDINATES = 24
-RICHER_RATIO = 2
-TRIED_COORDINATES_LIMIT = 48  # of an arm
+RICHER_COORDINATES = 24  # least, of the motion that others are compared with; else twice theirs
+COORDINATES_LIMIT = 64  # of an arm, tried at most, also for poles
 TIME_ERROR_SHARE = 0.03  # of the tolerance, that time steps may add to a motion
 
 # -- stress: p-mean and screening ------------------------------------------------------------
@@ -28,9 +22,6 @@ MAP_ERROR_SHARE = 1e-3  # of the largest length, a map's error; with 0 it takes 
 # Instants whose largest stress to the power p is below this part of the largest one's are left out
 # of the p-mean. With all of them an iteration at 400 x 24 cells takes 1.3 times as long.
 NEGLIGIBLE_POWER_SHARE = 1e-2
-# At most, at which all points are looked at first; every second one makes up the p-mean.
-COARSE_INSTANTS = 200
-BOUND_BATCH_INSTANTS = 16  # looked at before the bound is compared again
 BLOCK_SIZE = 256  # points, and instants, of one block: it stays in the cache
 
 # -- buckling: instants and modes ------------------------------------------------------------
@@ -51,7 +42,6 @@ LARGEST_FACTOR = 1e3  # above, nothing buckles: it tells nothing of a machine
 # Of a pole, over its size, that an exported machine may have. Poles that differ by half of it from
 # those with twice as many coordinates hold it, in all demos, against four to sixteen times as many.
 POLE_ERROR = 0.01
-POLE_COORDINATES_LIMIT = 100  # of an arm: two in the plane take 14 s for all tries
 
 # -- poles -----------------------------------------------------------------------------------
 

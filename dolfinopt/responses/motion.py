@@ -23,9 +23,9 @@ from dolfinopt.responses.response import (
     cotangents_of_scene,
     factors,
     find,
-    p_norm,
     p_norm_of_lengths,
     response,
+    sums,
     worst_of,
 )
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
@@ -226,16 +226,13 @@ class MotionResponse(Response):
 
     def _frozen_moments(self, trajectory: Trajectory) -> dict[int, np.ndarray]:
         """Return `load_case_moments` of every design, of all scenarios together."""
-        scene, moments = trajectory.scene, dict[int, np.ndarray]()
+        scene, found = trajectory.scene, list[tuple[int, np.ndarray]]()
         weights = self._weights_of_scenarios(trajectory)
         for weight, one in zip(weights, motions_of(trajectory), strict=True):
-            found = [
-                weight * factors(scene, one.scene, k).stiffness * A
-                for k, A in enumerate(self.load_case_moments(one)[: len(scene.arms)])
-            ]
-            for k, A in by_owner(scene, found).items():
-                moments[k] = moments[k] + A if k in moments else A
-        return moments
+            moments = self.load_case_moments(one)[: len(scene.arms)]
+            scales = [weight * factors(scene, one.scene, k).stiffness for k in range(len(moments))]
+            found += by_owner(scene, list(map(np.multiply, scales, moments))).items()
+        return sums(found)
 
 
 def motions_of(trajectory: Trajectory) -> tuple[Trajectory, ...]:
@@ -260,7 +257,7 @@ def over_motions(
         By the bodies of the scene, by the index of the arm that owns the design.
     """
     scene, nominal, profile = analysis.scene, analysis.motion.feed_forward, analysis.profile
-    total: dict[int, ShapeIntegrals] = {}
+    parts: list[tuple[int, ShapeIntegrals]] = []
     by_coefficients: list[np.ndarray] = []
     for number, one in enumerate(motions_of(analysis.motion)):
         with profile.phase("adjoint"):
@@ -279,12 +276,10 @@ def over_motions(
                 cotangents_of_scene(by, factors(scene, one.scene, k), weight)
                 for k, by in enumerate(bodies)
             ]
-        for k, by in by_owner(scene, bodies).items():
-            total[k] = total[k] + by if k in total else by
+        parts += by_owner(scene, bodies).items()
     if nominal is not None and by_coefficients:
-        further = by_owner(scene, nominal.gradient(np.sum(by_coefficients, axis=0)))
-        total = {k: by + further[k] for k, by in total.items()}
-    return total
+        parts += by_owner(scene, nominal.gradient(np.sum(by_coefficients, axis=0))).items()
+    return sums(parts)
 
 
 class ComplianceResponse(MotionResponse):
@@ -331,19 +326,8 @@ def motion_objective(trajectory: Trajectory) -> MotionResponse | None:
     return one if isinstance(one, MotionResponse) else None
 
 
-# -- deviation of the end-effector from its rigid path -------------------------------------------
-
-
-@response("deviation")
-class Deviation(MotionResponse):
-    """(1/T int |e|^p dt)^(1/p), m: close to the largest deviation, and smooth.
-
-    With e from eq. (6) of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
-    """
-
-    def quantity(self, trajectory: Trajectory) -> np.ndarray:
-        """Return e, m."""
-        return trajectory.deviation
+class PMean(MotionResponse):
+    """(1/T int |y|^p dt)^(1/p) of the length of a quantity: close to the largest, and smooth."""
 
     def value(self, y: np.ndarray, weights: np.ndarray) -> float:
         """Return the p-mean."""
@@ -352,6 +336,21 @@ class Deviation(MotionResponse):
     def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return that of the p-mean."""
         return p_norm_of_lengths(y, self.options.exponent, weights / weights.sum())[1]
+
+
+# -- deviation of the end-effector from its rigid path -------------------------------------------
+
+
+@response("deviation")
+class Deviation(PMean):
+    """(1/T int |e|^p dt)^(1/p), m: close to the largest deviation, and smooth.
+
+    With e from eq. (6) of Seifried, Moghadasi & Held (2015), doi:10.1016/j.piutam.2015.01.018.
+    """
+
+    def quantity(self, trajectory: Trajectory) -> np.ndarray:
+        """Return e, m."""
+        return trajectory.deviation
 
     def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return the derivatives through the outboard interfaces' modes."""
@@ -453,10 +452,8 @@ class DriveResponse(MotionResponse):
 
     def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
-        by, (columns, weights) = (
-            np.zeros_like(trajectory.joint_forces),
-            self._counted(trajectory.scene),
-        )
+        columns, weights = self._counted(trajectory.scene)
+        by = np.zeros_like(trajectory.joint_forces)
         by[np.ix_(cases.indices, columns)] = by_y * weights
         by_rates, by_motion, bodies = trajectory.drive_forces.gradient(by)
         own = [integrals_of(one) for one in bodies]
@@ -498,7 +495,7 @@ class Effort(DriveResponse):
 
 
 @response("peak_force")
-class PeakForce(DriveResponse):
+class PeakForce(PMean, DriveResponse):
     """(1/T int |F_k|^p dt)^(1/p) of every drive k, N and N m; its true value the largest |F_k|.
 
     What drives must be able to give. As objective the sum over the drives, each times its weight of
@@ -528,13 +525,3 @@ class PeakForce(DriveResponse):
     def extreme(self, trajectory: Trajectory) -> float:
         """Return the largest force of all instants."""
         return float(np.abs(self.quantity(trajectory)).max())
-
-    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
-        """Return the p-mean of one drive's force."""
-        return p_norm(np.abs(y[:, 0]), self.options.exponent, weights / weights.sum())[0]
-
-    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return its derivatives."""
-        sizes = np.abs(y[:, 0])
-        _, by = p_norm(sizes, self.options.exponent, weights / weights.sum())
-        return np.sign(y) * by[:, None]

@@ -21,13 +21,8 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Basis
-from dolfinopt.responses.evaluation import decide_stiffening, moved
-from dolfinopt.responses.measured import (
-    RICHER_COORDINATES,
-    RICHER_RATIO,
-    TIME_ERROR_SHARE,
-    TRIED_COORDINATES_LIMIT,
-)
+from dolfinopt.responses.evaluation import decide_stiffening, simulated_together
+from dolfinopt.responses.measured import COORDINATES_LIMIT, RICHER_COORDINATES, TIME_ERROR_SHARE
 from dolfinopt.responses.response import factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
@@ -77,15 +72,15 @@ def choose_coordinates(
         The choice; None where the scene states a number, or no arm is flexible.
 
     Raises:
-        ConvergenceError: no number up to `TRIED_COORDINATES_LIMIT` meets the tolerance; on all
+        ConvergenceError: no number up to `COORDINATES_LIMIT` meets the tolerance; on all
             ranks alike.
     """
     if scene.reduction.coordinates != "auto" or not scene.cell_counts:
         return None
-    comparison = _Comparison(scene, partition, arms, x_phys, profile)
+    comparison = Comparison(scene, partition, arms, x_phys, profile)
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
     goal = scene.reduction.tolerance / reserve
-    most = min(max(TRIED_COORDINATES_LIMIT, least), comparison.reductions.limit)
+    most = min(max(COORDINATES_LIMIT, least), comparison.reductions.limit)
     tried: dict[int, float] = {}
 
     def holds(count: int) -> bool:
@@ -98,28 +93,6 @@ def choose_coordinates(
     for arm in arms.values():
         arm.set_order(found)
     return OrderSelection(found, tried[found], tuple(sorted(tried.items())))
-
-
-def estimated_error(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
-    coordinates: int,
-    profile: Profile,
-) -> float:
-    """Return the error that so many coordinates make, see `OrderSelection`; inf if impossible.
-
-    Collective; the arms keep what they have.
-
-    Args:
-        scene, partition, arms, x_phys, profile: as for `evaluate`.
-        coordinates: of every arm.
-
-    Raises:
-        ConvergenceError: the motion cannot be simulated with the richer basis; on all ranks.
-    """
-    return _Comparison(scene, partition, arms, x_phys, profile).error(coordinates)
 
 
 def _none_found(scene: Scene, tried: Mapping[int, float], goal: float) -> ConvergenceError:
@@ -135,8 +108,11 @@ def _none_found(scene: Scene, tried: Mapping[int, float], goal: float) -> Conver
     )
 
 
-class _Comparison:
-    """Owns the richer motion that others are compared with."""
+class Comparison:
+    """Owns the richer motion of a design that others are compared with.
+
+    The arms keep what they have.
+    """
 
     def __init__(
         self,
@@ -146,6 +122,7 @@ class _Comparison:
         x_phys: Mapping[int, np.ndarray],
         profile: Profile,
     ):
+        """Take what `evaluate` does (collective)."""
         self.partition, self.profile = partition, profile
         self.method = scene.reduction.method
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
@@ -156,38 +133,38 @@ class _Comparison:
         self.reductions = Reductions(scene, partition, arms, profile)
         self.richer = 0  # coordinates
         self.bases: dict[int, Basis] = {}
-        self.motions: list[Trajectory] = []
+        self.motion: Trajectory | None = None
 
     def error(self, count: int) -> float:
-        """Return the error that `count` coordinates make (collective)."""
-        richer = min(max(RICHER_COORDINATES, RICHER_RATIO * count), self.reductions.limit)
+        """Return the error that `count` coordinates make, see `OrderSelection` (collective).
+
+        Infinite where so few are not possible.
+
+        Raises:
+            ConvergenceError: the motion cannot be simulated with the richer basis; on all ranks.
+        """
+        richer = min(max(RICHER_COORDINATES, 2 * count), self.reductions.limit)
         if richer > self.richer:
             self.bases = self.reductions.reduced(RICHER_METHOD, richer)
-            self.motions = self._moved(self.bases)
-            self.richer = richer
+            self.motion, self.richer = self._moved(self.bases), richer
         try:
             bases = self.reductions.reduced(self.method, count)
-            motions = self._moved(bases)
+            motion = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do
         energy = gather_arms(self.partition, self.reductions.energies(bases, self.bases))
 
         def largest() -> float:
-            pairs = zip(motions, self.motions, strict=True)
-            return max(_distance(self.scenes[0], *pair, energy) for pair in pairs)
+            assert motion is not None and self.motion is not None
+            few, many = [motion, *motion.scenarios], [self.motion, *self.motion.scenarios]
+            return max(_distance(self.scenes[0], *one, energy) for one in zip(few, many))
 
         return on_root(self.partition.world, largest)
 
-    def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
-        """Return the root's motions of the scene and its scenarios (collective)."""
-        owned, kept = self.reductions.bodies(bases), list[Trajectory]()
-
-        def move() -> None:
-            first = moved(self.scenes, owned, self.profile)
-            kept.extend([first, *first.scenarios])
-
-        on_root(self.partition.world, move)
-        return kept
+    def _moved(self, bases: Mapping[int, Basis]) -> Trajectory | None:
+        """Return the root's motion of the scene with its scenarios (collective)."""
+        owned = self.reductions.bodies(bases)
+        return simulated_together(self.scenes, self.partition, owned, self.profile)
 
 
 def _timed(scene: Scene) -> Scene:
@@ -213,12 +190,9 @@ def _distance(
         q, richer = few.q_e[:, a], many.q_e[:, b]
         owner = scene.owners[place] if place < len(scene.owners) else None
         if owner is None:  # rigid, from a file, or a bearing: the same body in both
-            K = many.mechanism.bodies[place].K
-            errors.append(_norm(K, q - richer))
-            sizes.append(_norm(K, richer))
-            continue
-        # A scenario's material scales both.
-        K = factors(scene, many.scene, owner).stiffness * energy[owner]
+            K = np.tile(many.mechanism.bodies[place].K, (2, 2))
+        else:  # a scenario's material scales both
+            K = factors(scene, many.scene, owner).stiffness * energy[owner]
         errors.append(_norm(K, np.hstack([q, -richer])))
         sizes.append(_norm(K, np.hstack([np.zeros_like(q), richer])))
     size = np.maximum(sizes, RESTING_GROUP_SHARE * max(sizes))

@@ -15,7 +15,7 @@ Source: Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -276,10 +276,14 @@ def by_owner(scene: Scene, parts: Sequence[T]) -> dict[int, T]:
     Returns:
         A sum a design, by the index of the arm that owns it.
     """
+    return sums((owner, part) for owner, part in zip(scene.owners, parts) if owner is not None)
+
+
+def sums(parts: Iterable[tuple[int, T]]) -> dict[int, T]:
+    """Add up what has the same index, in the order given."""
     total: dict[int, T] = {}
-    for owner, part in zip(scene.owners, parts):
-        if owner is not None:
-            total[owner] = total[owner] + part if owner in total else part  # type: ignore[operator]
+    for k, part in parts:
+        total[k] = total[k] + part if k in total else part  # type: ignore[operator]
     return total
 
 
@@ -427,19 +431,12 @@ def p_norm_of_lengths(
 ) -> tuple[float, np.ndarray]:
     """Return the p-norm of the lengths |e_k| and its derivative by the vectors (n, d).
 
-    |e|^(p - 2) e: no division by a length of zero.
-
     Args:
-        vectors: (n, d) e, d = 2 or 3.
+        vectors: (n, d) e.
         exponent: p >= 2.
         weights: as for `p_norm`.
     """
     distances = lengths(vectors)
-    largest = distances.max()
-    if largest == 0.0:
-        return 0.0, np.zeros_like(vectors)
-    relative = distances / largest
-    weights = np.ones_like(distances) if weights is None else weights
-    total = float(weights @ relative**exponent)
-    factor = total ** (1.0 / exponent - 1.0) * weights * relative ** (exponent - 2.0) / largest
-    return float(largest * total ** (1.0 / exponent)), factor[:, None] * vectors
+    value, by_lengths = p_norm(distances, exponent, weights)
+    share = np.divide(by_lengths, distances, out=by_lengths, where=distances > 0.0)
+    return value, share[:, None] * vectors

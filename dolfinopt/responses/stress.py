@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from itertools import product
 
 import numpy as np
 from mpi4py import MPI
@@ -20,7 +21,6 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.parallel import gather_arms, on_root, sum_over_arms, together
 from dolfinopt.responses.measured import (
     BLOCK_SIZE,
-    BOUND_BATCH_INSTANTS,
     COARSE_INSTANTS,
     MAP_ERROR_SHARE,
     NEGLIGIBLE_POWER_SHARE,
@@ -164,10 +164,6 @@ def _power(x: np.ndarray, exponent: float) -> np.ndarray:
         return x
     square = _power(x * x, half)
     return square * x if odd else square
-
-
-def _runs(count: int) -> list[slice]:
-    return [slice(first, first + BLOCK_SIZE) for first in range(0, count, BLOCK_SIZE)]
 
 
 # -- along a motion: the coefficients of every arm's static fields, whose sum is its
@@ -562,12 +558,8 @@ def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> Screened:
     values = np.full(len(a), -np.inf)
     values[coarse] = _largest_by_instant(comm, A, a[coarse])
     bounds = np.interp(n, coarse, values[coarse]) + _off_straight(comm, A, a, coarse)
-    left = np.setdiff1d(n, coarse)
-    left = left[np.argsort(-bounds[left], kind="stable")]
-    for batch in np.split(left, range(BOUND_BATCH_INSTANTS, len(left), BOUND_BATCH_INSTANTS)):
-        if not (bounds[batch] > values.max()).any():
-            break
-        values[batch] = _largest_by_instant(comm, A, a[batch])
+    left = np.flatnonzero(bounds > values.max())
+    values[left] = _largest_by_instant(comm, A, a[left])
     instant = int(values.argmax())
     point, counted = _point_of(comm, A, a[instant]), coarse[::2]
     return Screened(float(values[instant]), instant, point, counted, values[counted])
@@ -581,14 +573,8 @@ def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np
     """
     instants = every(len(a))
     enough = MAP_ERROR_SHARE * _largest_by_instant(comm, A, a[instants]).max(initial=0.0)
-    while True:
-        off = np.flatnonzero(_off_straight(comm, A, a, instants) > enough)
-        after = np.unique(np.searchsorted(instants, off))
-        halves = (instants[after - 1] + instants[after]) // 2
-        wider = np.union1d(instants, halves)
-        if len(wider) == len(instants):
-            break
-        instants = wider
+    off = np.flatnonzero(_off_straight(comm, A, a, instants) > enough)
+    instants = np.union1d(instants, off)
     largest, when = np.full(A.shape[1], -1.0), np.zeros(A.shape[1], dtype=int)
     for here, part, squares in _blocks(A, a[instants]):
         worst = squares.argmax(axis=1)
@@ -615,9 +601,12 @@ def _off_straight(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, known: np.ndarra
 
 def _blocks(A: np.ndarray, a: np.ndarray) -> Iterator[tuple[slice, slice, np.ndarray]]:
     """Yield |A_e a_n|^2 of some points at some instants, and which they are."""
-    for part in _runs(len(a)):
-        for here in _runs(A.shape[1]):
-            yield here, part, np.square(A[:, here] @ a[part].T).sum(axis=0)
+    parts, places = (
+        [slice(first, first + BLOCK_SIZE) for first in range(0, count, BLOCK_SIZE)]
+        for count in (len(a), A.shape[1])
+    )
+    for part, here in product(parts, places):
+        yield here, part, np.square(A[:, here] @ a[part].T).sum(axis=0)
 
 
 def _largest_by_instant(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> np.ndarray:

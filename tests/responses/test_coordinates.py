@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.responses.order_selection import OrderSelection, estimated_error
+from dolfinopt.responses.order_selection import Comparison, OrderSelection
 from dolfinopt.study.cases import simulate_scenarios
 
 WORLD = MPI.COMM_WORLD
@@ -31,7 +32,7 @@ def auto(*overrides: str, tolerance: float = 1e-2, cells: tuple[int, int] = (24,
 
 
 def error(built: Built, x: dict[int, np.ndarray], count: int) -> float:
-    return estimated_error(built.scene, built.partition, built.arms, x, count, built.profile)
+    return Comparison(*built.place, x, built.profile).error(count)
 
 
 def choose(built: Built, x: dict[int, np.ndarray]) -> OrderSelection:
@@ -130,9 +131,10 @@ def test_motions_are_compared_at_the_same_instants():
     """Where the richer one is looked at half as often: the instants of the other."""
     built = auto()
     parts = built.scene, built.partition, built.arms, built.fields(wave), built.profile
-    comparison = coordinates._Comparison(*parts)
+    comparison = coordinates.Comparison(*parts)
     found = comparison.error(4)
-    comparison.motions = [one.at(one.t[::2]) for one in comparison.motions]
+    if (one := comparison.motion) is not None:
+        comparison.motion = one.at(one.t[::2])
     assert comparison.error(4) == pytest.approx(found, rel=1e-12)
 
 
@@ -195,7 +197,7 @@ def test_more_coordinates_than_dofs_are_not_tried():
 
 
 def test_none_is_enough(monkeypatch):
-    monkeypatch.setattr(coordinates, "TRIED_COORDINATES_LIMIT", 6)
+    monkeypatch.setattr(coordinates, "COORDINATES_LIMIT", 6)
     built = auto("reduction.method=modal", tolerance=1e-3)
     words = "up to 6 coordinates", "reduction.tolerance = 0.001"
     with refused(*words, error=do.ConvergenceError):
@@ -258,7 +260,8 @@ def test_any_number_of_ranks():
 
 
 def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
-    monkeypatch.setattr(assessment, "estimated_error", lambda *_: 0.02)
+    known = SimpleNamespace(error=lambda count: 0.02)
+    monkeypatch.setattr(assessment, "Comparison", lambda *_: known)
     scene = small(iterations=1)
     written = write_result(shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
     if written is not None:

@@ -298,7 +298,7 @@ class Simulation(Table):
     stiffening: bool | Literal["auto"] = Field(
         default="auto",
         description="geometric stiffening by the arms' own stress: true, false, or where the "
-        "deviation would be off by 0.5 % without it [-]",
+        "loads change an arm's stiffness by 0.25 % [-]",
     )
     sample: float = Field(
         default=1e-3,
