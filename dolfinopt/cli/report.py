@@ -29,7 +29,9 @@ def conclude(result: Result, summary: Summary, folder: Path, verbose: bool = Fal
     warn(summary["warnings"])
     for line in _choices(summary):
         click.echo(line)
-    ending = f"{_counted(result)} ({result.ending})" if result.optimised else result.ending
+    ending = (
+        f"{result.iterations} iterations ({result.ending})" if result.optimised else result.ending
+    )
     seconds = summary["seconds"]["total"]
     click.echo(f"{summary['name']}: {ending}, {seconds:.1f} s; results in {folder}")
     for line in (_objective(result, summary), _largest(summary), *_limits(result.limits)):
@@ -87,12 +89,6 @@ def _choices(summary: Summary) -> Iterator[str]:
             'simulation.stiffening = "auto": on, the loads of the motion change the stiffness of '
             f"an arm by {100.0 * loads['estimate']:.2g} %"
         )
-
-
-def _counted(result: Result) -> str:
-    """Return the number of iterations; those with the exact gradient after the limit apart."""
-    made, most = result.iterations, result.scene.optimizer.max_iterations
-    return f"{made} iterations" if made <= most else f"{most} iterations and {made - most} further"
 
 
 def _objective(result: Result, summary: Summary) -> str:

@@ -291,7 +291,8 @@ class Iterate:
         self.x, x_old1, x_old2, low, upp, best = (column.copy() for column in columns.T)
         self.state = MMAState(memory.mma_steps, x_old1, x_old2, low, upp, memory.multipliers)
         self.best, self.progress = memory.best.with_variables(best), memory.progress
-        self.evaluator.use_gradient(memory.gradient)
+        if self.scene.objective.gradient == "exact":  # which may follow one with frozen loads
+            self.evaluator.use_gradient(memory.gradient)
         self.evaluator.solutions = memory.solutions
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]

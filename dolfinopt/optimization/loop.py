@@ -37,7 +37,6 @@ from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene, pose_scenarios
-from dolfinopt.scene.tables.responses import freezes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -183,13 +182,8 @@ class _Run:
 
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
-        one, options = self.iterate, self.scene.optimizer
-        last = options.max_iterations
-        if self.scene.objective.gradient == "esl" and self.exact_from is not None:
-            last = self.exact_from + options.exact_iterations
-        self.finished = stop_code(
-            self.scene, one.iteration, last, one.progress, one.best, one.stuck
-        )
+        one = self.iterate
+        self.finished = stop_code(self.scene, one.iteration, one.progress, one.best, one.stuck)
         late = self._begins_with_frozen_loads and one.progress.gain(WINDOW // 2) <= FROZEN_GAIN
         return late or self.finished is not None
 
@@ -207,13 +201,8 @@ class _Run:
         """Go over to the exact gradient where frozen loads have done their work (collective)."""
         # Frozen loads lead past resonances of the initial design, which the exact gradient, true
         # as it is, does not see beyond.
-        one, options = self.iterate, self.scene.optimizer
-        more = options.exact_iterations > 0 and self.exact_from is None and freezes(self.scene)
-        if one.iteration >= options.max_iterations and not (
-            self.scene.objective.gradient == "esl" and more
-        ):
-            return False
-        if not (more or self._begins_with_frozen_loads):
+        one, most = self.iterate, self.scene.optimizer.max_iterations
+        if not self._begins_with_frozen_loads or one.iteration >= most:
             return False
         one.use_gradient("exact")
         one.stuck, self.exact_from, self.finished = "", one.iteration, None

@@ -20,7 +20,7 @@ class StopCode(Enum):
 
 
 def stop_code(
-    scene: Scene, iteration: int, last: int, progress: Progress, best: Best, stuck: str
+    scene: Scene, iteration: int, progress: Progress, best: Best, stuck: str
 ) -> StopCode | None:
     """Return why the iterations end here, None where they go on.
 
@@ -29,9 +29,8 @@ def stop_code(
     leads on. It is looked at four times a window, so that rounding does not change their number.
 
     Args:
-        scene: with the tolerance.
+        scene: with the tolerance and the largest number of iterations.
         iteration: design updates made.
-        last: of them at most.
         progress: of the iterations.
         best: the best design so far.
         stuck: why no step leads on, "" where one does.
@@ -43,7 +42,7 @@ def stop_code(
         tolerance, feasible = scene.optimizer.tolerance, best.excess == 0.0
         if progress.gain(WINDOW if feasible else 3 * WINDOW) <= tolerance:
             return StopCode.SETTLED if feasible else StopCode.INFEASIBLE
-    return StopCode.ITERATIONS if iteration >= last else None
+    return StopCode.ITERATIONS if iteration >= scene.optimizer.max_iterations else None
 
 
 def ending(

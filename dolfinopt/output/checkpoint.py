@@ -27,10 +27,13 @@ if TYPE_CHECKING:
 
 NAME = CHECKPOINT
 SEAL = "digest"  # of all other arrays
-# Keys a resumed run may change: they say when to stop, not what design is computed.
 # Numbers of the best design.
 BEST = "iteration", "beta", "objective", "excess", "crisp"
-MAY_CHANGE = ("max_iterations", "tolerance", "kkt_tolerance", "exact_iterations")
+# Keys a resumed run may change: when to stop, and how to go on from where it is.
+MAY_CHANGE = {
+    *(f"optimizer.{key}" for key in ("max_iterations", "tolerance", "kkt_tolerance")),
+    "objective.gradient",
+}
 
 
 def _scene_text(scene: Scene) -> str:
@@ -194,9 +197,9 @@ def _difference(theirs: Any, ours: Any, key: str = "") -> str:
     """Describe the first difference between two scenes; empty when they compute the same."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
         for name in [*ours, *(k for k in theirs if k not in ours)]:
-            if key == "optimizer" and name in MAY_CHANGE:
-                continue
             path = f"{key}.{name}" if key else name
+            if path in MAY_CHANGE:
+                continue
             found = _difference(theirs.get(name), ours.get(name), path)
             if found:
                 return found

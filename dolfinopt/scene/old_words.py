@@ -101,6 +101,12 @@ def _bore(name: str) -> Callable[[Tree, Row, Any], None]:
     return translate
 
 
+def _exact(tree: Tree, row: Row, value: Any) -> None:
+    if value:
+        for objective in rows(tree, "objective") or [tree.setdefault("objective", {})]:
+            objective["gradient"] = "exact"
+
+
 OLD_WORDS = (
     OldWord("arms.joint_stiffness", "arms.gear_stiffness", _renamed("gear_stiffness"), 0.0),
     OldWord("arms.joint_damping", "arms.gear_damping", _renamed("gear_damping"), 0.0),
@@ -120,6 +126,7 @@ OLD_WORDS = (
     OldWord("reduction.band", "reduction.frequencies", _frequencies("balanced"), [0.0, 50.0]),
     OldWord("control.stiffness_factor", "control.stiffness times it", _scaled("stiffness"), 1.0),
     OldWord("control.damping_factor", "control.damping times it", _scaled("damping"), 1.0),
+    OldWord("optimizer.exact_iterations", 'objective.gradient = "exact"', _exact, 0),
     OldWord("simulation.integrator", "every motion is integrated by Radau IIA", None, "radau"),
     OldWord("simulation.rho_inf", "every motion is integrated by Radau IIA", None, 0.8),
     *(OldWord(f"constraints.{old}", f"constraints.{key}", _renamed(key))

@@ -37,7 +37,6 @@ USED = {
     "design.erosion": ["design.projection=robust", DENSE],
     "objective.exponent": ["objective.kind=deviation", "objective.gradient=exact"],
     "optimizer.max_iterations": ["optimizer.tolerance=1", "optimizer.kkt_tolerance=1e6"],
-    "optimizer.exact_iterations": ["optimizer.tolerance=1", "optimizer.kkt_tolerance=1e6"],
     "objective.stress_exponent": ["objective.kind=stress"],
     "objective.effort_weights": ["objective.kind=effort", "constraints.deviation=1.0"],
     "objective.modes": ["objective.kind=eigenfrequency"],

@@ -63,7 +63,7 @@ PRESCRIBED = [
     ("constraints.peak_force=[inf,inf,inf]", "peak_force", "one drive at least"),
     ("constraints.peak_force=[inf,1.0]", "peak_force", "3 numbers"),
     ("constraints.buckling=1.5", BALANCED, ESL, "reduction.method", "constraints.buckling"),
-    (BALANCED, "optimizer.exact_iterations=1", "reduction.method", "exact_iterations"),
+    (BALANCED, "optimizer.exact_iterations=1", "reduction.method", 'gradient = "exact"'),
     *((f"constraints.stiffness=[{one}]", *words) for one, *words in (
         ("{arm='arm3', moment=1.0, rotation=1.0}", "stiffness.0.arm", '"arm3"', "arm1, arm2"),
         ("{arm='arm1', moment=1.0}", "stiffness.0", "displacement or rotation"),

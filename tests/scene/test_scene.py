@@ -412,7 +412,7 @@ BAD_VALUES = [
     ("design.minimum_member design.minimum_gap", [-1e-9], "a number >= 0 and <= 10000"),
     ("part.minimum_member", [-1e-9], "a number >= 1e-06 and <= 10000"),
     ("design.erosion", [0.5], "a number >= 0.001 and <= 0.499"),
-    ("optimizer.max_iterations optimizer.exact_iterations", [-1, 400.0], "an integer >= 0"),
+    ("optimizer.max_iterations", [-1, 400.0], "an integer >= 0"),
     ("optimizer.kkt_tolerance", [-1e-9], "a number >= 0 and <= 1000000"),
     ("material", [5], "a table with the keys name, kind, young_modulus, poisson_ratio"),
     ("motion", [[1, 2]], "a table with the keys path, radius"),
@@ -494,8 +494,6 @@ LINE = {"motion.path": "line"}
 SHARED = {"arms.1.design": "arm1"}
 CONTRADICTIONS = [
     (2, {"arms.0.gear_ratio": 9.0}, "arms.0.gear_ratio", "used only with rotor_inertia"),
-    (2, {"optimizer.exact_iterations": 3, "objective.gradient": "exact"},
-     "optimizer.exact_iterations", "used only with objective.gradient"),
     # changes, the key that is shown, what is allowed
     (2, LINE | {"motion.radius": 2.0}, "motion.radius = 2.0", "1.0, the default, with motion.path"),
     (2, LINE | {"motion.flattening": 0}, "motion.flattening = 0", "1.0, the default"),

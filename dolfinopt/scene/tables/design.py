@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, model_validator
 
 from dolfinopt.scene.tables.base import MAX_ITERATIONS, Length, Loc, Position, Refusal, Table
-from dolfinopt.scene.tables.responses import need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -475,35 +474,6 @@ class Optimizer(Table):
         description="Karush-Kuhn-Tucker residual up to which the certificate calls a design "
         "stationary [-]",
     )
-    exact_iterations: int = Field(
-        default=0,
-        ge=0,
-        le=MAX_ITERATIONS,
-        description="iterations with the exact gradient that follow where frozen loads (gradient = "
-        '"esl") bring no further gain [-]',
-    )
-
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse further iterations where there is no exact gradient to iterate with."""
-        own = ("optimizer", "exact_iterations")
-        if self.exact_iterations and (
-            scene.objective.gradient == "exact" or not need_of(scene, "motion")
-        ):
-            raise Refusal(
-                'expected 0, the default: used only with objective.gradient = "esl" of a motion, '
-                "whose frozen loads it replaces",
-                own,
-                ("objective", "gradient"),
-            )
-        if not self.exact_iterations:
-            return
-        if scene.reduction.method == "balanced":
-            raise Refusal(
-                'expected "craig-bampton", "modal" or "krylov" with optimizer.exact_iterations: '
-                "the Gramian's basis has no adjoint",
-                ("reduction", "method"),
-                own,
-            )
 
 
 # -- [part]: what `dolfinopt part` makes of a result, unless its options say otherwise ----------
