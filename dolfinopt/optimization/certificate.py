@@ -84,7 +84,7 @@ def judge(
         exact: the problem at x with its exact gradients.
         frozen: (n,) the objective's gradient with frozen loads; None where nothing is frozen.
     """
-    residual = kkt_residual(x, xmin, xmax, exact.df0dx, exact.f, exact.dfdx).rms
+    residual = kkt_residual(x, exact.df0dx, exact.f, exact.dfdx, xmin, xmax).rms
     angle = ratio = np.nan
     if frozen is not None:
         width = xmax - xmin

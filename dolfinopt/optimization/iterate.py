@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from dolfinopt.dynamics.work import counted
@@ -10,7 +12,6 @@ from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
     GREY_SHARE,
-    LARGEST_ASYMPTOTE_DISTANCE,
     LEAST_REACH,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
@@ -211,16 +212,19 @@ class Iterate:
 
     def _proposed(self, move: float) -> tuple[np.ndarray, MMAState]:
         """Return MMA's next design, and what it remembers then (collective)."""
-        problem, bounds = self.problem, (self.variables.xmin, self.variables.xmax)
-        gradients = problem.df0dx, problem.f, problem.dfdx
-        widest = CURVED_ASYMPTOTE_DISTANCE if self.curved else LARGEST_ASYMPTOTE_DISTANCE
-
-        def stepped() -> tuple[np.ndarray, MMAState]:
-            return mma_step(self.x, *gradients, *bounds, self.state, move=move, widest=widest)
-
+        step = partial(mma_step, state=self.state, move=move)
+        if self.curved:
+            step = partial(step, widest=CURVED_ASYMPTOTE_DISTANCE)
         with self.evaluator.profile.phase("mma"):
-            found: tuple[np.ndarray, MMAState] = on_root(self.world, stepped)
+            found: tuple[np.ndarray, MMAState] = on_root(self.world, step, *self._posed)
         return found
+
+    @property
+    def _posed(self) -> tuple[np.ndarray, ...]:
+        """The problem at x: x, gradients and values, bounds."""
+        problem, variables = self.problem, self.variables
+        gradients = problem.df0dx, problem.f, problem.dfdx
+        return self.x, *gradients, variables.xmin, variables.xmax
 
     # -- measures ----------------------------------------------------------------------------
 
@@ -257,10 +261,7 @@ class Iterate:
 
     def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
-        variables, problem = self.variables, self.problem
-        bounds = variables.xmin, variables.xmax
-        gradients = problem.df0dx, problem.f, problem.dfdx
-        found: Residual = on_root(self.world, kkt_residual, self.x, *bounds, *gradients)
+        found: Residual = on_root(self.world, kkt_residual, *self._posed)
         return found
 
     # -- memory ------------------------------------------------------------------------------

@@ -26,11 +26,10 @@ from dolfinopt.optimization.measured import (
     FROZEN_GAIN,
     WINDOW,
 )
-from dolfinopt.optimization.residual import conflict_sentences
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
-from dolfinopt.optimization.stopping import StopCode, ending, stop_code
-from dolfinopt.parallel import Partition, on_root, together
+from dolfinopt.optimization.stopping import StopCode, conflicts, ending, stop_code
+from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import log
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
@@ -240,7 +239,7 @@ class _Run:
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
-        conflicts, kept = self._conflicts(code), one.problem.excess == 0.0
+        kept = one.problem.excess == 0.0
         best = one.best.iteration
         returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"
         return RankResult(
@@ -262,22 +261,12 @@ class _Run:
             exact_from=self.exact_from,
             certificate=certificate,
             limits=one.problem.limits,
-            conflicts=conflicts,
+            conflicts=conflicts(code, one.problem.limits),
             profile=self.profile,
             counts=counts,
             choice=final.selection,
             bars=self._bars(x_phys),
         )
-
-    def _conflicts(self, code: StopCode) -> str:
-        """Return what holds back the limits that x does not meet (collective)."""
-        one, v = self.iterate, self.evaluator.variables
-        if code is StopCode.ITERATIONS and one.problem.excess > 0.0:
-            return "let the optimisation go on (optimizer.max_iterations)"
-        found: str = on_root(
-            self.partition.world, conflict_sentences, one.problem, one.x, v.xmin, v.xmax
-        )
-        return found
 
     # -- history -----------------------------------------------------------------------------
 

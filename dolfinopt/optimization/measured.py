@@ -47,7 +47,6 @@ GREY_SHARE = 0.02
 WINDOW = 20  # iterations in which a run that goes on gains `optimizer.tolerance`; 10 end rods early
 # Of the best design in half a window, with which frozen loads go on; with less the exact gradient.
 FROZEN_GAIN = 0.01
-OPPOSING_SHARE = 0.05  # of a violated limit's gradient that another one balances: they conflict
 # Of a limit: nearer than that it counts as reached; beta waits for a design that is farther beyond.
 REACHED_LIMIT_SHARE = 0.02
 # After which a checkpoint is written: a kill costs no more, writing stays below a percent.
@@ -69,9 +68,8 @@ PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 # Of the range of a variable. With Svanberg's 0.5 rounding grows to 7e-5 of the objective of
 # two_arm.toml in 90 iterations, with 0.2 to 1e-10, and to 5e-6 where distances grow by 1.4.
 FIRST_ASYMPTOTE_DISTANCE = 0.2
-LEAST_ASYMPTOTE_DISTANCE = 0.01  # of it
-LARGEST_ASYMPTOTE_DISTANCE = 10.0  # of it
-# Of it, largest with curved constraints: with 10 limits of the motion are left every 25 steps.
+# Of it, largest with curved constraints: with Svanberg's 10 limits of the motion are left every 25
+# steps.
 CURVED_ASYMPTOTE_DISTANCE = 1.0
 # Of the range: a smaller move counts neither as back nor as forth. With 1e-9 rounding decides, and
 # the kernels of OpenBLAS end in 2 % of the runs with other counts; with 1e-6 in none of 200.

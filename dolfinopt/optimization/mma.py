@@ -28,8 +28,6 @@ from dolfinopt.optimization.measured import (
     DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
     FIRST_ASYMPTOTE_DISTANCE,
-    LARGEST_ASYMPTOTE_DISTANCE,
-    LEAST_ASYMPTOTE_DISTANCE,
     REST_MOVE_SHARE,
     ROUNDING,
 )
@@ -38,6 +36,7 @@ Array = npt.NDArray[np.float64]
 
 _WIDEN = 1.2  # where a variable went on in the same direction (Svanberg 2007: asyincr)
 _NARROW = 0.7  # where it turned back (asydecr)
+_NEAREST, _FARTHEST = 0.01, 10.0  # asymptotes, in ranges of the variables
 _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
 
 _CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
@@ -88,7 +87,7 @@ def mma_step(
     *,
     move: float = 0.2,
     first: float = FIRST_ASYMPTOTE_DISTANCE,
-    widest: float = LARGEST_ASYMPTOTE_DISTANCE,
+    widest: float = _FARTHEST,
     prices: npt.ArrayLike | None = None,
 ) -> tuple[Array, MMAState]:
     """Minimise Svanberg's convex approximation of min f0(x), f_i(x) <= 0, xmin <= x <= xmax.
@@ -179,7 +178,7 @@ def _asymptote_distances(
     moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE
     factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
     distance = factor * (state.upp - state.low) / (2.0 * width)
-    return np.clip(distance, LEAST_ASYMPTOTE_DISTANCE, widest)
+    return np.clip(distance, _NEAREST, widest)
 
 
 @dataclass(frozen=True, eq=False)

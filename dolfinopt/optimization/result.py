@@ -38,7 +38,7 @@ class Result:
         stop_code: why the iterations ended, "simulated" where there were none; `ending` in words.
         iterations: design updates made.
         best_iteration: updates after which this design was found.
-        conflicts: what holds those limits back that are not met, see `conflict_sentences`.
+        conflicts: what holds those limits back that are not met, see `stopping.conflicts`.
         kkt: residual by the gradient in use, see `residual.kkt_residual`; nan without one.
         exact_from: iteration from which on the gradient was exact, None where it never was.
         certificate: what the exact gradient says of an optimised design.

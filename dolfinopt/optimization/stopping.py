@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 
-from dolfinopt.optimization.measured import WINDOW
+from dolfinopt.optimization.measured import REACHED_LIMIT_SHARE, WINDOW
 from dolfinopt.optimization.state import Best, Progress
+from dolfinopt.responses.constraints import Limit
 from dolfinopt.scene.load import Scene
 
 
@@ -68,3 +70,24 @@ def ending(
     if code is StopCode.ITERATIONS and kept and gain < 100.0:
         reason += f", {gain:.2g} % gained in the last {WINDOW}"
     return f"{reason}; {returned}" if returned else reason
+
+
+def conflicts(code: StopCode, limits: Sequence[Limit]) -> str:
+    """Say what holds back the limits that a design does not meet; "" if it meets all.
+
+    Where no step lessens their violation any more, they conflict with those that are reached. All
+    of the volume is no limit that could be relaxed, but that of a solid arm.
+    """
+    if all(one.met for one in limits):
+        return ""
+    if code is StopCode.ITERATIONS:
+        return "let the optimisation go on (optimizer.max_iterations)"
+    *rest, last = sorted(
+        one.bound
+        for one in limits
+        if one.excess >= -REACHED_LIMIT_SHARE
+        and not (one.quantity == "volume_fraction" and one.limit >= 1.0)
+    )
+    if rest:
+        return f"{', '.join(rest)} and {last} conflict: relax one of them"
+    return f"no design near this one meets {last}, whatever its material: relax it"

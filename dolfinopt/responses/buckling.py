@@ -29,8 +29,6 @@ from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BUCKLING_MODES,
     BUCKLING_PEAKS,
-    BUCKLING_PROMINENCE,
-    BUCKLING_RANK_SHARE,
     LARGEST_FACTOR,
     VOID_STRESS_SHARE,
 )
@@ -95,7 +93,7 @@ def pressed(state: DesignState, loads: ArmLoads) -> list[Pressed]:
 def worst_instants(values: np.ndarray) -> list[int]:
     """Return the highest peaks of values (n,), largest first."""
     around = np.concatenate([[0.0], np.maximum(values, 0.0), [0.0]])  # the ends may be peaks
-    peaks = find_peaks(around, prominence=BUCKLING_PROMINENCE * around.max())[0] - 1
+    peaks = find_peaks(around)[0] - 1
     if not around.any():
         return []
     return list(map(int, peaks[np.argsort(-values[peaks], kind="stable")][:BUCKLING_PEAKS]))
@@ -123,7 +121,8 @@ def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> 
 
     def largest() -> np.ndarray:
         values, vectors = np.linalg.eigh(K)
-        kept = values > BUCKLING_RANK_SHARE * values[-1]
+        # The same modes of several instants count once.
+        kept = values > np.sqrt(np.finfo(float).eps) * values[-1]
         W = vectors[:, kept] / np.sqrt(values[kept])
         of_instants = np.tensordot(a, W.T @ K0 @ W, 1)
         return np.asarray(np.linalg.eigvalsh(-of_instants)[:, -1])

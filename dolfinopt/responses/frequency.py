@@ -29,21 +29,6 @@ from dolfinopt.responses.sensitivity import period_gradient, rigid_gradient
 from dolfinopt.scene.load import Scene
 
 
-def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
-    """Return (sum_k T_k^(2 p))^(1/p) in s2, and its derivative by the eigenvalues (k,).
-
-    At least the longest period squared, and smooth: a symmetric function of the eigenvalues has a
-    gradient where they cross or coincide. With `follow` the followed mode's alone.
-    """
-    squared = 4.0 * np.pi**2 / modes.values
-    if follow:
-        weight = np.zeros(len(squared))
-        weight[modes.followed] = 1.0
-        return float(squared[modes.followed]), -weight * squared / modes.values
-    value, by_squared = p_norm(squared, exponent)
-    return value, -by_squared * squared / modes.values
-
-
 @response("eigenfrequency")
 class Eigenfrequency(Response):
     """Squared longest period of every flexible arm, s2; its true value is the frequency, Hz.
@@ -52,8 +37,17 @@ class Eigenfrequency(Response):
     """
 
     def _squared_period(self, modes: LoadedModes) -> tuple[float, np.ndarray]:
-        follow = self.options.follow and not self.limited
-        return squared_period(modes, self.options.exponent, follow)
+        """Return (sum_k T_k^(2 p))^(1/p) in s2, and its derivative by the eigenvalues (k,).
+
+        At least the longest period squared, and smooth: a symmetric function of the eigenvalues has
+        a gradient where they cross or coincide. With `follow` the followed mode's alone.
+        """
+        squared = 4.0 * np.pi**2 / modes.values
+        if self.options.follow and not self.limited:
+            value, by_squared = squared[modes.followed], np.arange(len(squared)) == modes.followed
+        else:
+            value, by_squared = p_norm(squared, self.options.exponent)
+        return float(value), -by_squared * squared / modes.values
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return squared period and first frequency of every flexible arm (collective)."""
@@ -83,7 +77,7 @@ class Eigenfrequency(Response):
             for place, one in modes.items():
                 _, by_values = self._squared_period(one)
                 own[place] = period_gradient(by_place[place], one, by_values, analysis.by)
-        by_carried = on_all_ranks(partition, {place: one.carried for place, one in own.items()})
+        by_carried = on_all_ranks(partition, {place: one[1] for place, one in own.items()})
         rows = []
         zero = list(map(np.zeros_like, chain.carried()))
         with together(partition.world):
@@ -98,7 +92,7 @@ class Eigenfrequency(Response):
                 }
                 owner = scene.owners[place]
                 if owner in row:
-                    row[owner] = row[owner] + own[place].own
+                    row[owner] = row[owner] + own[place][0]
                 rows.append(row)
         return rows
 

@@ -27,9 +27,7 @@ BLOCK_SIZE = 256  # points, and instants, of one block: it stays in the cache
 # -- buckling: instants and modes ------------------------------------------------------------
 
 BUCKLING_PEAKS = 3  # instants of an arm that count in the smooth value, at most
-BUCKLING_PROMINENCE = 0.1  # of the largest value, by which peaks over time stand out
 BUCKLING_MODES = 4  # of an instant: of several equal struts all
-BUCKLING_RANK_SHARE = 1e-8  # of energies, below which modes of several instants are the same
 # Part of solid stiffness at which the stress of a cell stiffens half as much as it would: so light
 # a cell, x = 0.1 with the default law, buckles with a strut beside it, not by itself. Of a gap that
 # closes, void buckles by itself at 2.6 times the load, with x = 0.01 in it at 4.3 times; with this

@@ -206,7 +206,7 @@ def _norm(K: np.ndarray, q: np.ndarray) -> float:
     return float(np.sqrt(max(np.einsum("nk,nk->n", q @ K, q).max(initial=0.0), 0.0)))
 
 
-# -- bases of any number of coordinates: Craig-Bampton bases of fewer are the leading part of more
+# -- bases of any number of coordinates
 
 
 class Reductions:
@@ -224,19 +224,9 @@ class Reductions:
         self._damping = scene.damping.stiffness_proportional
         own = min((arm.elastic.num_dofs for arm in arms.values()), default=maxsize)
         self.limit: int = partition.world.allreduce(own, min)
-        self._richest: dict[int, Basis] = {}
-        self._count = 0  # of its coordinates
 
     def reduced(self, method: str, count: int) -> dict[int, Basis]:
         """Return this rank's bases of so many coordinates (collective)."""
-        if method != RICHER_METHOD:
-            return self._reduce(method, count)
-        if count > self._count:
-            self._richest, self._count = self._reduce(method, count), count
-        with together(self.partition.world):
-            return {k: _leading(basis, count) for k, basis in self._richest.items()}
-
-    def _reduce(self, method: str, count: int) -> dict[int, Basis]:
         reduce = METHODS[method].reduce
         with self.profile.phase("choice of coordinates"), together(self.partition.world):
             return {
@@ -263,18 +253,6 @@ class Reductions:
                 k: self.arms[k].elastic.energy_matrix(np.concatenate([a.V, others[k].V], axis=2))
                 for k, a in bases.items()
             }
-
-
-def _leading(basis: Basis, count: int) -> Basis:
-    """Return the first Craig-Bampton coordinates: constraint modes, then fixed-interface modes."""
-    part = slice(count)
-    return Basis(
-        basis.V[:, :, part],
-        basis.MV[:, :, part],
-        basis.stiffness[part, part],
-        basis.outboard[:, part],
-        basis.start[:, : count - len(basis.outboard)],
-    )
 
 
 def fewest(first: int, most: int, holds: Callable[[int], bool]) -> int | None:

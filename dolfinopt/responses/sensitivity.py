@@ -196,33 +196,22 @@ def tip_gradient(
         return by(state, of_pairs(state.elastic, ((of_left, of_right),)))
 
 
-@dataclass(frozen=True, eq=False)
-class PeriodGradient:
-    """Derivatives of one arm's squared period.
-
-    Attributes:
-        own: (n_cells,) by its own physical densities, or by other variables of its design, what
-            it carries held.
-        carried: (b, b) by the matrix of what it carries.
-    """
-
-    own: np.ndarray
-    carried: np.ndarray
-
-
 def period_gradient(
     state: DesignState, modes: LoadedModes, by_values: np.ndarray, by: By = by_design
-) -> PeriodGradient:
-    """Differentiate a function of the eigenvalues, given its derivative by them (k,).
+) -> tuple[np.ndarray, np.ndarray]:
+    """Differentiate a function of one arm's eigenvalues, given its derivative by them (k,).
 
     d lambda = phi' (dK - lambda dM) phi, phi of unit mass.
+
+    Returns:
+        (n_cells,) by its own physical densities, or by other variables of its design, what it
+        carries held; (b, b) by the matrix of what it carries.
     """
     with state.elastic.profile.phase("gradient"):
         weighted = modes.field * by_values
         pairs = ((weighted, modes.field),), ((weighted * -modes.values, modes.field),)
         own = by(state, of_pairs(state.elastic, *pairs))
-        carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
-        return PeriodGradient(own, carried)
+        return own, -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
 
 
 def rigid_gradient(state: DesignState, by_rigid: ShapeIntegrals, by: By = by_design) -> np.ndarray:

@@ -35,7 +35,7 @@ def test_no_residual_at_an_optimum():
     assert ((x == 1.0).any() and (x == 0.2).any()) and ((x > 0.2) & (x < 1.0)).sum() > 50
     constraint = np.array([x.sum() / limit - 1.0])
     gradient = np.full((1, len(x)), 1.0 / limit)
-    found = residual(x, xmin, xmax, -c / x**2, constraint, gradient)
+    found = residual(x, -c / x**2, constraint, gradient, xmin, xmax)
     assert found.rms < 1e-9
     # Of the objective scaled to a root mean square of 1, in units of the range.
     rms = np.sqrt(np.mean((0.8 * c / x**2) ** 2))
@@ -43,7 +43,7 @@ def test_no_residual_at_an_optimum():
     # The same in any unit, and with a repeated and an inactive constraint beside it.
     more = np.append(np.append(constraint, constraint), -0.3)
     rows = np.vstack([gradient, gradient, -np.ones(len(x))])
-    scaled = residual(x, xmin, xmax, -1e9 * c / x**2, more, np.array([[1e6], [1.0], [1.0]]) * rows)
+    scaled = residual(x, -1e9 * c / x**2, more, np.array([[1e6], [1.0], [1.0]]) * rows, xmin, xmax)
     assert scaled.rms < 1e-9 and scaled.multipliers[2] < 1e-6 * multiplier * limit / rms
 
 
@@ -57,7 +57,7 @@ def test_residual_grows_with_the_distance():
         moved = x + step * d
         slope = -c / moved**2
         row = np.full((1, len(x)), 1.0 / limit)
-        found.append(residual(moved, xmin, xmax, slope, np.zeros(1), row).rms)
+        found.append(residual(moved, slope, np.zeros(1), row, xmin, xmax).rms)
     assert found[1] == pytest.approx(10.0 * found[0], rel=0.1)
 
 
@@ -71,13 +71,13 @@ def test_residual_of_what_no_multiplier_balances():
     def of(*problem):
         return residual(*problem).rms
 
-    assert of(x, low, high, slope, *none) == pytest.approx(1.0, rel=1e-9)
-    assert of(np.where(slope > 0.0, 0.0, 1.0), low, high, slope, *none) == 0.0
+    assert of(x, slope, *none, low, high) == pytest.approx(1.0, rel=1e-9)
+    assert of(np.where(slope > 0.0, 0.0, 1.0), slope, *none, low, high) == 0.0
     # Multipliers are not negative: a constraint that points the other way is no help.
     row = slope[None]
-    assert of(x, low, high, slope, np.zeros(1), row) == pytest.approx(1.0, rel=1e-9)
-    assert of(x, low, high, slope, np.zeros(1), -row) < 1e-12
-    assert of(x, low, high, np.zeros(n), *none) == 0.0
+    assert of(x, slope, np.zeros(1), row, low, high) == pytest.approx(1.0, rel=1e-9)
+    assert of(x, slope, np.zeros(1), -row, low, high) < 1e-12
+    assert of(x, np.zeros(n), *none, low, high) == 0.0
 
 
 def test_residual_of_a_gradient_that_lives_in_few_cells():
@@ -85,7 +85,7 @@ def test_residual_of_a_gradient_that_lives_in_few_cells():
     n = 4000
     x, low, high = np.full(n, 0.5), np.zeros(n), np.ones(n)
     slope = np.where(np.arange(n) % 1000 == 0, -1.0, -1e-6)
-    found = residual(x, low, high, slope, np.zeros(0), np.zeros((0, n)))
+    found = residual(x, slope, np.zeros(0), np.zeros((0, n)), low, high)
     assert found.rms == pytest.approx(1.0, rel=1e-9)
 
 
@@ -98,7 +98,7 @@ def test_residual_of_a_limit_that_is_not_reached(left, least, most):
     x, low, high = np.full(n, 0.5), np.zeros(n), np.ones(n)
     slope = np.full(n, -1.0)
     rows = np.full((1, n), 1.0 / n)  # full ranges of all cells bring it from 0 to 1
-    found = residual(x, low, high, slope, np.array([-left]), rows)
+    found = residual(x, slope, np.array([-left]), rows, low, high)
     assert least <= found.rms <= most
 
 
