@@ -22,7 +22,7 @@ import time
 from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from html import escape
 from math import nan
@@ -39,7 +39,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.loading import load_scene
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.optimization.result import RankResult, Result
-from dolfinopt.optimization.state import HistoryRow, fields_of
+from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import (
     ArmView,
     canonical_order,
@@ -509,7 +509,7 @@ class Model:
             write_result(place, found, time.perf_counter() - begun)
         stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
         return OptimizationResult(
-            **fields_of(found, Result),
+            **_fields(found),
             design=self._gathered(found.x_phys, found.partition),
             views=gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
             filtered=self._gathered(found.x_filtered or {}, found.partition),
@@ -529,7 +529,7 @@ class Model:
             for k, arm in arms.items():
                 arm.set_design(x_phys[k])
         run = RankResult(
-            **fields_of(result, Result),
+            **_fields(result),
             partition=partition,
             arms=arms,
             x_phys=x_phys,
@@ -773,3 +773,8 @@ def _texts(change: str | Mapping[str, Any]) -> list[str]:
     if isinstance(change, str):
         return [change]
     return [f"{key}={toml_value(value)}" for key, value in change.items()]
+
+
+def _fields(result: Result) -> dict[str, Any]:
+    """Return the fields that every result has, by their names."""
+    return {field.name: getattr(result, field.name) for field in fields(Result)}

@@ -119,13 +119,11 @@ def evaluated_beside(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> 
         arm.coordinates = one.arms[k].coordinates
         if (known := one.arms[k].stiffening) is not None:
             arm.set_stiffening(known)
-    counts = replace(one.profile.counts)
+    counts, found = replace(one.profile.counts), None
     with suppress(ConvergenceError):
-        beside = evaluate(scene, one.partition, arms, x_phys, one.profile, simulated=False)[0]
-        one.profile.counts = counts
-        return beside
+        found = evaluate(scene, one.partition, arms, x_phys, one.profile, simulated=False)[0]
     one.profile.counts = counts
-    return None
+    return found
 
 
 def solid_limits(evaluator: Evaluator) -> tuple[Limit, ...]:

@@ -111,11 +111,6 @@ class Evaluator:
         self.undo()
         return self.evaluate(x)
 
-    @property
-    def gradient(self) -> str:
-        """Gradient in use, "exact" or "esl"."""
-        return self.scene.objective.gradient
-
     def use_gradient(self, kind: str) -> None:
         """Use another gradient from the next evaluation on."""
         objective = self.scene.objective.unchecked_copy({"gradient": kind})

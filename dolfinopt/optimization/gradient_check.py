@@ -98,7 +98,7 @@ def taylor_test(
         frozen = chain.with_gradient("esl").objective_gradient(design)
     value = _fixed_objective(chain)
     here, rows = value(inside), []
-    for name, parts in _directions(scene, chain.variables.arms).items():
+    for name, parts in _directions(chain.variables.arms).items():
         d = chain.variables.join(parts)
         along = float(slope @ d)
         remainders = tuple(abs(value(inside + h * d) - here - h * along) for h in STEPS)
@@ -151,29 +151,22 @@ def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float
     return part.combine(trajectory.scene, values)[0]
 
 
-def _directions(scene: Scene, arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
-    """Return directions of largest entry 1: random, smooth, and boxes at both ends of the chain."""
-    # They are functions of the place, the same on any partition. First and last are among the arms
-    # with a design of their own.
-    designed = scene.designed
-
-    def along(k: int) -> np.ndarray:
-        return arms[k].mesh.centroid[:, 0] / arms[k].mesh.outboard_point[0]
+def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
+    """Return a random and a smooth direction of largest entry 1."""
+    # They are functions of the place, the same on any partition.
 
     def noise(k: int) -> np.ndarray:
         x, y, *z = arms[k].mesh.centroid.T * 1e3
         angle = 12.9898 * x + 78.233 * y + sum(37.719 * one for one in z)
         return 2.0 * np.modf(np.abs(np.sin(angle + k) * 43758.5453))[0] - 1.0
 
-    chosen: dict[str, Callable[[int], np.ndarray]] = {
-        "random": noise,
-        "smooth": lambda k: np.sin(3.0 * np.pi * along(k) + k),
-        "root of the first arm": lambda k: ((along(k) < 0.1) & (k == designed[0])).astype(float),
-        "tip of the last arm": lambda k: ((along(k) > 0.9) & (k == designed[-1])).astype(float),
-    }
+    def smooth(k: int) -> np.ndarray:
+        mesh = arms[k].mesh
+        return np.sin(3.0 * np.pi * mesh.centroid[:, 0] / mesh.outboard_point[0] + k)
+
     return {
         name: {k: np.where(arm.mesh.fixed, 0.0, field(k)) for k, arm in arms.items()}
-        for name, field in chosen.items()
+        for name, field in {"random": noise, "smooth": smooth}.items()
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from dolfinopt.optimization.measured import (
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
 from dolfinopt.optimization.residual import Residual, kkt_residual
-from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Progress
+from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
 from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.constraints import EXCESS, tightest
 from dolfinopt.responses.static import depths
@@ -161,7 +162,10 @@ class Iterate:
                 self.projection.advance()
             designs = self._tried(new)
             if designs is not None:
-                self._go_on(new, after, designs, rises)
+                self.x, self.state, self.iteration = new, after, self.iteration + 1
+                if rises:  # designs of another projection are compared with nothing
+                    self.progress = self.progress.anew()
+                self._take(self.evaluator.accepted(designs))
                 rose = self.problem.merit(size) > merit + EXCESS
                 self.reach = self._reach_after(shorter * self.reach, rises, rose)
                 return
@@ -200,15 +204,6 @@ class Iterate:
             self.evaluator.undo()
             return None
         return designs
-
-    def _go_on(
-        self, new: np.ndarray, after: MMAState, designs: list[EvaluatedDesign], rises: bool
-    ) -> None:
-        """Take a design that was tried (collective)."""
-        self.x, self.state, self.iteration = new, after, self.iteration + 1
-        if rises:  # designs of another projection are compared with nothing
-            self.progress = self.progress.anew()
-        self._take(self.evaluator.accepted(designs))
 
     def _proposed(self, move: float) -> tuple[np.ndarray, MMAState]:
         """Return MMA's next design, and what it remembers then (collective)."""
@@ -266,17 +261,17 @@ class Iterate:
 
     # -- memory ------------------------------------------------------------------------------
 
-    def memory(self) -> IterateMemory:
-        """Return all that the next step depends on, but for the problem at x."""
+    def memory(self, **others: Any) -> Memory:
+        """Return all that the next step depends on but the problem at x, and other fields."""
         state, (solutions, vectors) = self.state, self.evaluator.start
         columns = [self.x, state.x_old1, state.x_old2, state.low, state.upp, self.best.x]
-        return IterateMemory(
+        return Memory(
             iteration=self.iteration,
             change=self.change,
             reach=self.reach,
             returned_to=self.returned_to,
             mma_steps=state.iteration,
-            gradient=self.evaluator.gradient,
+            gradient=self.evaluator.scene.objective.gradient,
             cells=self.variables.split(np.column_stack(columns)),
             modes=vectors,
             multipliers=state.multipliers,
@@ -284,9 +279,10 @@ class Iterate:
             progress=self.progress,
             solutions=solutions,
             beta=self.projection.beta,
+            **others,
         )
 
-    def restore(self, memory: IterateMemory) -> None:
+    def restore(self, memory: Memory) -> None:
         """Go back to what `memory` describes; `evaluate_again` is to follow."""
         columns = self.variables.join(memory.cells)
         self.x, x_old1, x_old2, low, upp, best = (column.copy() for column in columns.T)

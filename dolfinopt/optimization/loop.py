@@ -27,7 +27,7 @@ from dolfinopt.optimization.measured import (
     WINDOW,
 )
 from dolfinopt.optimization.result import RankResult
-from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
+from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.optimization.stopping import StopCode, conflicts, ending, stop_code
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
@@ -279,7 +279,7 @@ class _Run:
                 first = self.history[0].objective if self.history else row.objective
                 row = replace(
                     row,
-                    seconds=self._seconds(),
+                    seconds=self.seconds_before + time.perf_counter() - self.begun,
                     merit=problem.merit(abs(first) or 1.0),
                     multipliers=problem.by_limit(residual.scale * residual.multipliers),
                 )
@@ -288,9 +288,6 @@ class _Run:
                     self.recorder.append(row)
                 if self.report is not None:
                     self.report(row)
-
-    def _seconds(self) -> float:
-        return self.seconds_before + time.perf_counter() - self.begun
 
     # -- memory ------------------------------------------------------------------------------
 
@@ -305,8 +302,7 @@ class _Run:
 
     def _memory(self) -> Memory:
         """Return what to save."""
-        return Memory(
-            **fields_of(self.iterate.memory()),
+        return self.iterate.memory(
             history=list(self.history),
             initial_deviation=self.initial_deviation,
             exact_from=self.exact_from,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
-from typing import Any
 
 import numpy as np
 
@@ -161,7 +160,7 @@ class Progress:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class IterateMemory:
+class Memory:
     """Everything the next step depends on; cell and node arrays are this rank's.
 
     Attributes:
@@ -178,6 +177,11 @@ class IterateMemory:
         progress: the course of the iterations.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
+        history: rows so far.
+        initial_deviation: (n, 2) m of the initial design, evenly over the horizon.
+        exact_from: iteration from which on the gradient is exact, None as long as it is not.
+        choice: of the coordinates, where the scene leaves it to "auto".
+        stiffening: decided for the initial design; None where nothing was simulated.
     """
 
     iteration: int
@@ -193,27 +197,8 @@ class IterateMemory:
     progress: Progress
     solutions: tuple[Solution, ...]
     beta: float
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Memory(IterateMemory):
-    """A whole optimisation.
-
-    Attributes:
-        history: rows so far.
-        initial_deviation: (n, 2) m of the initial design, evenly over the horizon.
-        exact_from: iteration from which on the gradient is exact, None as long as it is not.
-        choice: of the coordinates, where the scene leaves it to "auto".
-        stiffening: decided for the initial design; None where nothing was simulated.
-    """
-
     history: list[HistoryRow]
     initial_deviation: np.ndarray
     exact_from: int | None
     choice: OrderSelection | None = None
     stiffening: Stiffening | None = None
-
-
-def fields_of(one: Any, kind: type | None = None) -> dict[str, Any]:
-    """Return the fields of a dataclass, or those of one that it derives from, by their names."""
-    return {field.name: getattr(one, field.name) for field in fields(kind or one)}

@@ -14,7 +14,7 @@ from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.collocation import Solution, Strategy
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.optimization.state import Best, HistoryRow, IterateMemory, Memory, Progress
+from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
@@ -224,7 +224,7 @@ SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "
 
 
 def arrays_of(
-    partition: Partition, arms: Mapping[int, Arm], memory: IterateMemory, number: int
+    partition: Partition, arms: Mapping[int, Arm], memory: Memory, number: int
 ) -> dict[str, Any]:
     """Return the arrays of one design, of whole arms (collective; complete on the root).
 
@@ -268,7 +268,7 @@ def arrays_of(
 
 
 def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
-    """Return the fields of `IterateMemory`."""
+    """Return the fields of `Memory`."""
     cells: dict[int, np.ndarray] = {}
     modes: dict[int, list[np.ndarray]] = {}
     for k, arm in arms.items():

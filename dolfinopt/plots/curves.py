@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from dolfinopt.motion.build import rests
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.trajectory import drive_units, free_drives
@@ -27,8 +28,8 @@ from dolfinopt.plots.style import (
     shortened,
     spread,
 )
-from dolfinopt.responses.constraints import constraint_label, deviation_limits, limits_by_column
-from dolfinopt.responses.response import constraints_of
+from dolfinopt.responses.response import constraints_of, find_limited
+from dolfinopt.scene.tables.responses import DECLARED, VOLUME
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,7 +93,7 @@ def history_figure(
     Args:
         rows: at least one.
         objective_label: name and unit of the objective.
-        limits: of constraints by their column, see `constraints.limits_by_column`.
+        limits: of constraints by their column, see `limits_by_column`.
     """
     panels = history_panels(rows, objective_label)
     used = np.arange(2 * (-(-len(panels) // 2))).reshape(2, -1).T < len(panels)
@@ -402,3 +403,37 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
         row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
         rows += [row] if name not in scene.driven else []  # a driven rod's is its drive's
     return rows
+
+
+# -- limits by the columns of the history, and over time ----------------------------------------
+
+
+def constraint_label(name: str) -> str:
+    """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
+    for quantity in (VOLUME.name, *(one.key for one in DECLARED.values() if one.key)):
+        if name == quantity or name.startswith(f"{quantity}_"):
+            arm = name[len(quantity) + 1 :]
+            unit = find_limited(quantity).unit_of(arm)
+            return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
+    return name
+
+
+def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
+    """Return the limit of every column of history.csv that is a constraint's."""
+    found: dict[str, float] = {}
+    for one in constraints_of(scene):
+        own = [c for c in columns if c == one.name or c.startswith(f"{one.name}_")]
+        limits = [float(limit) for limit in np.broadcast_to(one.limit, len(own))]
+        found.update(zip(own, limits, strict=True))
+    return found
+
+
+def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
+    """Return the limits of the deviation, m, with first and last instant of each, s."""
+    found = []
+    if (deviation := scene.constraints.limit("deviation")) is not None:
+        found.append((deviation, scene.lead, scene.horizon))
+    if (settling := scene.constraints.limit("settling")) is not None:
+        lead = scene.lead
+        found += [(settling, lead + begin, lead + end) for begin, end in rests(scene)]
+    return found

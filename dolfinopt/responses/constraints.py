@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from dolfinopt.motion.build import rests
 from dolfinopt.progress import shown, with_unit
 from dolfinopt.responses.evaluation import Evaluation
-from dolfinopt.responses.response import constraints_of, find_limited
+from dolfinopt.responses.response import constraints_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.responses import DECLARED, VOLUME, limited_by
+from dolfinopt.scene.tables.responses import limited_by
 
 # Relative violation of the true value up to which a constraint counts as met: MMA meets an active
 # one to a fraction of its last change, which optimizer.tolerance leaves at 1e-3.
@@ -122,37 +119,6 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
             for arm, value, limit in zip(found.arms, found.values, bound.limits(found), strict=True)
         ]
     return tuple(limits)
-
-
-def constraint_label(name: str) -> str:
-    """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
-    for quantity in (VOLUME.name, *(one.key for one in DECLARED.values() if one.key)):
-        if name == quantity or name.startswith(f"{quantity}_"):
-            arm = name[len(quantity) + 1 :]
-            unit = find_limited(quantity).unit_of(arm)
-            return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
-    return name
-
-
-def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
-    """Return the limit of every column of history.csv that is a constraint's."""
-    found: dict[str, float] = {}
-    for one in constraints_of(scene):
-        own = [c for c in columns if c == one.name or c.startswith(f"{one.name}_")]
-        limits = [float(limit) for limit in np.broadcast_to(one.limit, len(own))]
-        found.update(zip(own, limits, strict=True))
-    return found
-
-
-def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
-    """Return the limits of the deviation, m, with first and last instant of each, s."""
-    found = []
-    if (deviation := scene.constraints.limit("deviation")) is not None:
-        found.append((deviation, scene.lead, scene.horizon))
-    if (settling := scene.constraints.limit("settling")) is not None:
-        lead = scene.lead
-        found += [(settling, lead + begin, lead + end) for begin, end in rests(scene)]
-    return found
 
 
 def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:

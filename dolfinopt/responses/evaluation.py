@@ -115,9 +115,10 @@ def evaluate(
         InputError: densities that are none, see `Arm.refusal`; on all ranks.
         ConvergenceError: on all ranks alike.
     """
-    _check_densities(partition, arms, x_phys)
     with together(partition.world):
         for index, arm in arms.items():
+            if index not in x_phys:
+                raise InputError(f"arm {arm.mesh.name!r}: expected densities")
             arm.set_design(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or needs(scene, "motion"):
@@ -144,15 +145,6 @@ def analysis_of(
     """Return what the scene's responses are computed from: the designs that the arms have."""
     designs = {k: arm.current for k, arm in arms.items()}
     return Analysis(scene, partition, designs, trajectory, profile, by)
-
-
-def _check_densities(partition: Partition, arms: Mapping[int, Arm], x_phys: Cells) -> None:
-    """Raise InputError on all ranks where densities of one cannot be those of a design."""
-    with together(partition.world):
-        for k, arm in arms.items():
-            missing = "" if k in x_phys else f"arm {arm.mesh.name!r}: expected densities"
-            if reason := missing or arm.refusal(x_phys[k]):
-                raise InputError(reason)
 
 
 def _measured(analysis: Analysis, motion: Motion) -> Evaluation:

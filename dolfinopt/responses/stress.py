@@ -354,16 +354,13 @@ class Stress(Response):
         screened: dict[int, list[Screened]] = {}
         with together(world):
             for k, state in analysis.designs.items():
-                fields = state.load_fields
-                points[k] = own = self.points_of(k, state, fields)
+                points[k] = self.points_of(k, state, state.load_fields)
                 with analysis.profile.phase("stress"):
-                    screened[k] = [
-                        screen(partition.comm, own.A, one.coefficients) for one in by_owner[k]
-                    ]
-        each = [one for own in screened.values() for one in own]
-        largest = world.allreduce(max((one.largest for one in each), default=0.0), MPI.MAX)
+                    own = partial(screen, partition.comm, points[k].A)
+                    screened[k] = [own(one.coefficients) for one in by_owner[k]]
+        each = [(one.largest, one.summed.max()) for own in screened.values() for one in own]
         # The largest of all may lie between the instants that are summed.
-        summed = world.allreduce(max((one.summed.max() for one in each), default=0.0), MPI.MAX)
+        largest, summed = np.max(world.allgather(np.max([(0.0, 0.0), *each], axis=0)), axis=0)
         cut, sums = NEGLIGIBLE_POWER_SHARE ** (1.0 / p) * summed, {}
         counts = {k: sum(len(one.summed) for one in own) for k, own in screened.items()}
         with together(world), analysis.profile.phase("stress"):

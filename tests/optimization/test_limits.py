@@ -13,7 +13,8 @@ from dolfinopt.optimization.iterate import leaps
 from dolfinopt.optimization.measured import ERODED_LIMIT_FACTOR
 from dolfinopt.optimization.problem import limits_at, problem_of
 from dolfinopt.optimization.stopping import StopCode
-from dolfinopt.responses.constraints import EXCESS, Limit, limits_by_column, tightest
+from dolfinopt.plots.curves import limits_by_column
+from dolfinopt.responses.constraints import EXCESS, Limit, tightest
 from dolfinopt.responses.response import constraints_of
 
 WORLD = MPI.COMM_WORLD

@@ -15,13 +15,8 @@ import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.motion.build import rests
 from dolfinopt.part.folder import toml_text
-from dolfinopt.responses.constraints import (
-    EXCESS,
-    constraint_label,
-    deviation_limits,
-    limits_by_column,
-    limits_of,
-)
+from dolfinopt.plots.curves import constraint_label, deviation_limits, limits_by_column
+from dolfinopt.responses.constraints import EXCESS, limits_of
 from dolfinopt.responses.response import find
 from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.load import scene_from_dict

@@ -46,13 +46,13 @@ def test_nothing_to_check(key: str, value: str, remedy: str) -> None:
 
 @pytest.mark.serial  # ranks have no part in it
 def test_frozen_deviation_stands_beside_the_exact_one() -> None:
-    """Static loads tell most of a heavy payload's deviation, but not its sign everywhere."""
+    """Static loads tell most of a heavy payload's deviation, but not all."""
     test = taylor(scene(*QUICK, "objective.kind=deviation"), wave, FINER)
     assert test.passed, rates(test)
     assert 0.1 < test.angle < 45.0 and 0.5 < test.ratio < 1.0
     slopes = {row.direction: (row.slope, row.slope_frozen) for row in test.rows}
-    exact, frozen = slopes["tip of the last arm"]
-    assert exact > 0.0 > frozen
+    exact, frozen = slopes["random"]
+    assert abs(exact - frozen) > 0.1 * abs(exact)
 
 
 def no_modes(patch: pytest.MonkeyPatch) -> None:
