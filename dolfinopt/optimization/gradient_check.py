@@ -13,7 +13,7 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.certificate import compared, without_exact_gradient
 from dolfinopt.optimization.evaluator import Evaluator, densities
-from dolfinopt.optimization.measured import PASSING_RATE, ROUNDING_SHARE
+from dolfinopt.optimization.measured import INSIDE_MARGIN, PASSING_RATE, ROUNDING_SHARE
 from dolfinopt.parallel import Partition, on_root
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
@@ -74,7 +74,7 @@ def taylor_test(
     """Test the gradient by the design variables x: filter, reduction, simulation, objective.
 
     The instants of the objective and the time steps are those of x throughout; with them the
-    objective is smooth. Variables are moved inside their bounds first, by the largest step; a
+    objective is smooth. Variables are moved `INSIDE_MARGIN` inside their bounds first; a
     projection is as gentle as a run begins with, and of robust designs the nominal one is tested.
 
     Args:
@@ -88,7 +88,7 @@ def taylor_test(
     check_exact(scene)
     chain = Evaluator(scene, partition, arms, profile).with_gradient("exact")
     given = chain.variables.join({k: x[k] for k in chain.variables.arms})
-    inside = STEPS[0] + (1.0 - 2.0 * STEPS[0]) * given
+    inside = INSIDE_MARGIN + (1.0 - 2.0 * INSIDE_MARGIN) * given
     design = chain.physical_designs(inside)[-1]
     chain.evaluate_densities(densities(design))
     chain.solutions = held_steps(chain.trajectory)

@@ -18,9 +18,6 @@ NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --
 
-# Beta from which on the move limit falls with its square root: x_phys moves by at most twice what x
-# does, its slope being beta / 2.
-GENTLE_SHARPNESS = 4.0
 # Iterations in which beta doubles with which steps may get as short as `LEAST_REACH` meanwhile: the
 # merit rises then by itself, and makes them so. Within 8 iterations and with that length a design
 # falls apart, ten times as soft as with five times the length; it is five times as soft with three.
@@ -60,6 +57,7 @@ COORDINATE_RESERVE_FACTOR = 3.0
 
 # -- Taylor tests (gradient_check) --
 
+INSIDE_MARGIN = 0.05  # design variables are moved so far inside [0, 1]: steps must not leave it
 ROUNDING_SHARE = 1e-10  # of the objective, that Newton's tolerance leaves open
 PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dolfinopt.optimization.measured import (
-    GENTLE_SHARPNESS,
     LEAST_REACH,
     REACHED_LIMIT_SHARE,
     SLOW_CONTINUATION,
@@ -31,7 +30,8 @@ class Projection:
     @property
     def move(self) -> float:
         """Move limit, shorter where the projection is steep and x_phys would leap."""
-        return self.scene.optimizer.move * min(1.0, (GENTLE_SHARPNESS / self.beta) ** 0.5)
+        slope = 0.5 * self.beta  # x_phys moves by that times what x does; where x_phys is 1/2
+        return self.scene.optimizer.move * min(1.0, (2.0 / slope) ** 0.5)
 
     @property
     def least_reach(self) -> float:

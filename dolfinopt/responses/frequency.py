@@ -44,7 +44,7 @@ class Eigenfrequency(Response):
         """
         squared = 4.0 * np.pi**2 / modes.values
         if self.options.follow and not self.limited:
-            value, by_squared = squared[modes.followed], np.arange(len(squared)) == modes.followed
+            value, by_squared = squared[modes.followed], np.eye(len(squared))[modes.followed]
         else:
             value, by_squared = p_norm(squared, self.options.exponent)
         return float(value), -by_squared * squared / modes.values

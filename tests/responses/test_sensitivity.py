@@ -86,7 +86,8 @@ def no_filter(patch: pytest.MonkeyPatch) -> None:
 def test_a_wrong_gradient_is_found(monkeypatch: pytest.MonkeyPatch, fault) -> None:
     """Each part of the chain left out alone: the remainders become of first order, or less."""
     fault(monkeypatch)
-    test = taylor(scene(*QUICK, "design.filter_radius=0.05", *LOADED), wave, FINER)
+    finest = (2e-5, 5e-6)
+    test = taylor(scene(*QUICK, "design.filter_radius=0.05", *LOADED), wave, finest)
     assert not test.passed
     assert min(row.rate for row in test.rows) < 1.3
 
