@@ -183,8 +183,8 @@ def _next(result: Result, summary: Summary, folder: Path) -> str:
         f"--set optimizer.max_iterations={2 * max(1, scene.optimizer.max_iterations)}"
     )
     if result.violated:
-        more = f"go on with {longer}" if result.stop_code is StopCode.ITERATIONS else "ease a limit"
-        return f"next: {more}"
+        spent = result.stop_code is StopCode.ITERATIONS
+        return "next: relax a limit" + f", or go on with {longer}" * spent
     if is_grey(scene, summary["grayness"]):
         return (
             f"this is a grey optimum (grayness {summary['grayness']:.2g}), as in the paper: for "

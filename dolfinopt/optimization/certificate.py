@@ -106,12 +106,9 @@ def compared(exact: np.ndarray, frozen: np.ndarray) -> tuple[float, float]:
 
 def without_exact_gradient(scene: Scene) -> str:
     """Return why the scene has no exact gradient, in words; "" if it has one."""
-    if not needs(scene, "motion"):
-        return ""
     method = scene.reduction.method
-    if METHODS[method].adjoint is None:
-        return f'reduction.method = "{method}" has no adjoint'
-    return ""
+    known = METHODS[method].adjoint is not None or not needs(scene, "motion")
+    return "" if known else f'reduction.method = "{method}" has no adjoint'
 
 
 def certify(

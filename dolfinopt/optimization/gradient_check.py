@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 # by 16.
 STEPS = tuple(0.01 / 4.0**k for k in range(5))
 
-Cells = Mapping[int, np.ndarray]
-
 
 @dataclass(frozen=True)
 class TaylorRow:
@@ -69,7 +67,11 @@ class TaylorTest:
 
 
 def taylor_test(
-    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x: Cells, profile: Profile
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x: Mapping[int, np.ndarray],
+    profile: Profile,
 ) -> TaylorTest:
     """Test the gradient by the design variables x: filter, reduction, simulation, objective.
 

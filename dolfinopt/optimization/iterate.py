@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -54,7 +55,7 @@ class Iterate:
         self.x, self.state = x, initial_state(x)
         self.best, self.progress = Best.none(x), Progress()
         self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
-        self.residual, self.stuck = Residual.unknown(), ""
+        self.residual, self.stuck = Residual(np.nan, np.empty(0)), ""
         self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
 
     @property
@@ -287,7 +288,7 @@ class Iterate:
         columns = self.variables.join(memory.cells)
         self.x, x_old1, x_old2, low, upp, best = (column.copy() for column in columns.T)
         self.state = MMAState(memory.mma_steps, x_old1, x_old2, low, upp, memory.multipliers)
-        self.best, self.progress = memory.best.with_variables(best), memory.progress
+        self.best, self.progress = replace(memory.best, x=best), memory.progress
         if self.scene.objective.gradient == "exact":  # which may follow one with frozen loads
             self.evaluator.use_gradient(memory.gradient)
         self.evaluator.solutions = memory.solutions

@@ -32,6 +32,7 @@ from dolfinopt.optimization.stopping import StopCode, conflicts, ending, stop_co
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import log
+from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates
 from dolfinopt.responses.response import needs
@@ -109,8 +110,10 @@ class _Run:
     ) -> None:
         self.evaluator, self.recorder, self.report = evaluator, recorder, report
         self.compared = compared  # whether to look at solid arms and bars
+        self.solid: tuple[Limit, ...] = ()  # what solid arms make of the limits
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
+        self.world = self.partition.world
         variables = evaluator.variables
         initial = variables.initial
         if x0 is not None:
@@ -167,9 +170,9 @@ class _Run:
         if not self.compared:
             return
         with self.profile.phase("comparison"):
-            limits = solid_limits(self.evaluator)
-        if limits and self.partition.world.rank == 0:
-            log.info(solid_sentence(limits))
+            self.solid = solid_limits(self.evaluator)
+        if self.solid and self.world.rank == 0:
+            log.info(solid_sentence(self.solid))
 
     def _bars(self, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
         """Evaluate straight solid bars of the same mass (collective)."""
@@ -214,16 +217,16 @@ class _Run:
         # simulated, what was found without stays, and the summary says what it misses.
         if not needs(self.scene, "motion"):
             return False
-        with together(self.partition.world):
+        with together(self.world):
             for k, arm in self.arms.items():
                 arm.set_design(self.iterate.nominal.x_phys[k])
         group = [self.scene, *pose_scenarios(self.scene)]
         if not reconsider_stiffening(group, self.partition, self.arms):
             return False
         if not self.iterate.begin_anew():
-            known = self.partition.world.bcast(stiffening_of(self.arms), root=0)
             for arm in self.arms.values():
-                arm.set_stiffening(replace(known, on=False))
+                assert arm.stiffening is not None
+                arm.set_stiffening(replace(arm.stiffening, on=False))
             self.iterate.evaluate_again()
             return False
         return self.iterate.iteration < self.scene.optimizer.max_iterations
@@ -261,7 +264,7 @@ class _Run:
             exact_from=self.exact_from,
             certificate=certificate,
             limits=one.problem.limits,
-            conflicts=conflicts(code, one.problem.limits),
+            conflicts=conflicts(code, one.problem.limits, self.solid),
             profile=self.profile,
             counts=counts,
             choice=final.selection,
@@ -273,8 +276,8 @@ class _Run:
     def _record(self) -> None:
         """Measure x and add a row to the history; collective, kept on the root."""
         row = self.iterate.measure()
-        with together(self.partition.world):
-            if self.partition.world.rank == 0:
+        with together(self.world):
+            if self.world.rank == 0:
                 problem, residual = self.iterate.problem, self.iterate.residual
                 first = self.history[0].objective if self.history else row.objective
                 row = replace(
@@ -294,7 +297,7 @@ class _Run:
     def _checkpoint(self, force: bool = False) -> None:
         """Save when due (collective: the root looks at the clock)."""
         due = force or time.perf_counter() - self.saved >= CHECKPOINT_SECONDS
-        if self.recorder is None or not self.partition.world.bcast(due, root=0):
+        if self.recorder is None or not self.world.bcast(due, root=0):
             return
         with self.profile.phase("checkpoint"):
             self.recorder.save(self._memory())
@@ -318,6 +321,6 @@ class _Run:
             if memory.stiffening is not None:
                 arm.set_stiffening(memory.stiffening)
         self.iterate.restore(memory)  # with the vectors of this order
-        self.history = memory.history if self.partition.world.rank == 0 else []
+        self.history = memory.history if self.world.rank == 0 else []
         self.initial_deviation = memory.initial_deviation
         self.seconds_before = memory.history[-1].seconds

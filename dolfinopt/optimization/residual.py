@@ -23,11 +23,6 @@ class Residual:
     multipliers: np.ndarray
     scale: float = 0.0
 
-    @classmethod
-    def unknown(cls) -> Residual:
-        """Return that of a design without gradients."""
-        return cls(np.nan, np.empty(0))
-
 
 def kkt_residual(
     x: np.ndarray,

@@ -111,10 +111,6 @@ class Best:
             return True, self.excess, self.objective
         return False, -np.inf if self.crisp else -self.beta, self.objective
 
-    def with_variables(self, x: np.ndarray) -> Best:
-        """Return it with these variables (n,)."""
-        return replace(self, x=x)
-
 
 @dataclass(frozen=True)
 class Progress:

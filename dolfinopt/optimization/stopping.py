@@ -72,15 +72,24 @@ def ending(
     return f"{reason}; {returned}" if returned else reason
 
 
-def conflicts(code: StopCode, limits: Sequence[Limit]) -> str:
+def conflicts(code: StopCode, limits: Sequence[Limit], solid: Sequence[Limit] = ()) -> str:
     """Say what holds back the limits that a design does not meet; "" if it meets all.
 
     Where no step lessens their violation any more, they conflict with those that are reached. All
     of the volume is no limit that could be relaxed, but that of a solid arm.
+
+    Args:
+        code: why the iterations ended.
+        limits: of the design.
+        solid: of solid arms, as far as they were looked at.
     """
-    if all(one.met for one in limits):
+    missed = {one.name for one in limits if not one.met}
+    if not missed:
         return ""
     if code is StopCode.ITERATIONS:
+        beyond = [one.usage for one in solid if not one.met and one.name in missed]
+        if beyond:
+            return f"solid arms do not keep it either ({', '.join(beyond)}): relax it"
         return "let the optimisation go on (optimizer.max_iterations)"
     *rest, last = sorted(
         one.bound

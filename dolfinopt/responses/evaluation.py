@@ -40,8 +40,6 @@ from dolfinopt.scene.load import Scene, pose_scenarios
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-Cells = Mapping[int, np.ndarray]
-
 
 @dataclass(frozen=True)
 class Motion:
@@ -91,7 +89,7 @@ def evaluate(
     scene: Scene,
     partition: Partition,
     arms: Mapping[int, Arm],
-    x_phys: Cells,
+    x_phys: Mapping[int, np.ndarray],
     profile: Profile,
     start: Sequence[Solution] = (),
     *,
@@ -150,8 +148,7 @@ def analysis_of(
 def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     """Add the responses that the scene asks for (collective)."""
     measured = [objective_of(analysis.scene).measure(analysis)]
-    constraints: list[float] = []
-    smooth_limits: list[float] = []
+    constraints, smooth_limits = list[float](), list[float]()
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
         limits = bound.smooth_limits(found)

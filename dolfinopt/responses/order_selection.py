@@ -124,7 +124,6 @@ class Comparison:
     ):
         """Take what `evaluate` does (collective)."""
         self.partition, self.profile = partition, profile
-        self.method = scene.reduction.method
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
         with together(partition.world):
             for k, arm in arms.items():
@@ -148,7 +147,7 @@ class Comparison:
             self.bases = self.reductions.reduced(RICHER_METHOD, richer)
             self.motion, self.richer = self._moved(self.bases), richer
         try:
-            bases = self.reductions.reduced(self.method, count)
+            bases = self.reductions.reduced(self.scenes[0].reduction.method, count)
             motion = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do

@@ -582,9 +582,9 @@ def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np
     return np.sqrt(np.maximum(largest, 0.0)), when
 
 
-def every(count: int, most: int = COARSE_INSTANTS) -> np.ndarray:
-    """Return at most about `most` instants of `count`, evenly spaced, and the last one."""
-    step = max(1, -(-count // most))
+def every(count: int) -> np.ndarray:
+    """Return about `COARSE_INSTANTS` of `count` at most, evenly spaced, and the last one."""
+    step = max(1, -(-count // COARSE_INSTANTS))
     return np.unique(np.append(np.arange(0, count, step), count - 1))
 
 

@@ -1,5 +1,7 @@
 """Limits of the motion, of mass and frequencies: met by true values, or said to conflict."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -98,6 +100,9 @@ def test_limits_that_conflict_are_named():
     # What has not been tried is no conflict.
     told = stopping.conflicts(StopCode.ITERATIONS, (missed, reached))
     assert told == "let the optimisation go on (optimizer.max_iterations)"
+    solid = (replace(missed, value=0.0085), replace(reached, value=3.0))
+    told = stopping.conflicts(StopCode.ITERATIONS, (missed, reached), solid)
+    assert told == "solid arms do not keep it either (deviation 8.5 of 8 mm: 106 %): relax it"
     assert stopping.conflicts(StopCode.SETTLED, (reached,)) == ""
 
 
