@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -156,9 +156,7 @@ class Evaluator:
         return self._by_variables(design, [gradient(*self._analysed)])[0]
 
     @property
-    def _analysed(
-        self,
-    ) -> tuple[Scene, Partition, Mapping[int, Arm], Trajectory | None, Profile]:
+    def _analysed(self) -> tuple[Any, Any, Any, Any, Any]:
         return self.scene, self.partition, self.arms, self.trajectory, self.profile
 
     def _by_variables(
