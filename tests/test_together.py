@@ -221,7 +221,7 @@ PLACES = [
     (evaluating, LONE, static, "static_response", TIP),
     (evaluating, LONE, design_state, "shape_integrals", PERIOD),
     (evaluating, LONE, design_state, "loaded_modes", FREQUENCY),
-    (evaluating, LONE, frequency, "squared_period", PERIOD),
+    (evaluating, LONE, frequency, "p_norm", PERIOD),
     (evaluating, 0, evaluation, "simulate"),
     (evaluating, 0, evaluation, "_motion"),
     (gradients, LONE, motion, "esl_gradient"),
@@ -235,7 +235,6 @@ PLACES = [
     (gradients, LONE, frequency, "period_gradient", FREQUENCY),
     (choosing, LONE, arm.Arm, "set_design"),
     (choosing, LONE, order_selection, "shape_integrals"),
-    (choosing, LONE, order_selection, "_leading"),
     (choosing, 0, coordinates, "_distance"),
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes
@@ -254,7 +253,7 @@ PLACES = [
     (writing_designs, 0, run_folder, "write_fields"),
     (writing_gradients, 0, design, "write_arrays"),
     (reading_designs, LONE, design, "_fit"),
-    (taylor, LONE, arm.Arm, "physical"),
+    (taylor, LONE, arm.Arm, "physical_designs"),
     (taylor, LONE, arm.Arm, "backward"),
 ]
 
