@@ -36,7 +36,7 @@ class Eigenfrequency(Response):
     With `objective.follow` that of the followed mode as objective; a limit is for all modes.
     """
 
-    def _squared_period(self, modes: LoadedModes) -> tuple[float, np.ndarray]:
+    def squared_period(self, modes: LoadedModes) -> tuple[float, np.ndarray]:
         """Return (sum_k T_k^(2 p))^(1/p) in s2, and its derivative by the eigenvalues (k,).
 
         At least the longest period squared, and smooth: a symmetric function of the eigenvalues has
@@ -55,7 +55,7 @@ class Eigenfrequency(Response):
         chain = _frozen(analysis)
         with together(partition.world):
             mine = {
-                place: (self._squared_period(one)[0], one.frequency)
+                place: (self.squared_period(one)[0], one.frequency)
                 for place, one in _modes(_by_place(scene, designs), chain).items()
             }
         found = on_all_ranks(partition, mine)
@@ -75,7 +75,7 @@ class Eigenfrequency(Response):
             modes = _modes(by_place, chain)
             own = {}
             for place, one in modes.items():
-                _, by_values = self._squared_period(one)
+                _, by_values = self.squared_period(one)
                 own[place] = period_gradient(by_place[place], one, by_values, analysis.by)
         by_carried = on_all_ranks(partition, {place: one[1] for place, one in own.items()})
         rows = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.modes import FrozenTree, LoadedModes, loaded_modes
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
-from dolfinopt.responses.frequency import squared_period
+from dolfinopt.responses.frequency import Eigenfrequency
 from dolfinopt.responses.sensitivity import period_gradient
 
 
@@ -181,7 +182,12 @@ def slopes_at(
     x = design_of(arm, symmetric)
     found = modes(x)
     _, by_values = squared_period(found, exponent, follow)
-    return modes, period_gradient(arm.current, found, by_values).own
+    return modes, period_gradient(arm.current, found, by_values)[0]
+
+
+def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
+    options = SimpleNamespace(exponent=exponent, follow=follow)
+    return Eigenfrequency(options).squared_period(modes)
 
 
 @pytest.mark.serial  # ranks: test_an_arm_cut_in_two

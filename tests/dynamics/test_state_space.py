@@ -342,7 +342,7 @@ def test_as_many_coordinates_as_there_are(monkeypatch) -> None:
     """Of few cells all poles are those of the finite elements; far too many are not tried."""
     few = two_arm("arms.cells=[8,2]", "arms.passive=0", "design.filter_radius=0")
     assert do.Model(scene_from_dict(few)).state_space(1.0, below=1e9).accurate_below == np.inf
-    monkeypatch.setattr("dolfinopt.responses.linearised_machine.POLE_COORDINATES_LIMIT", 6)
+    monkeypatch.setattr("dolfinopt.responses.linearised_machine.COORDINATES_LIMIT", 6)
     with pytest.raises(do.ConvergenceError, match=r"--below 1e.09: with 6 coordinates"):
         do.Model(scene_from_dict(few)).state_space(1.0, below=1e9)
 
