@@ -42,26 +42,27 @@ Say = Callable[[str], None]
 @click.argument("folder", metavar="DIR", type=PATH)
 @out_option("the files; default: DIR/part")
 @click.option(
-    "--tool-radius", type=float, metavar="M", help="of concave corners; default: a fifth of a cell"
+    "--tool-radius", type=float, metavar="M", help="least of concave corners; default: 0.003"
 )
 @click.option(
     "--tolerance",
     type=float,
     metavar="M",
-    help="largest distance of the curves from the outline; default: 0.1 mm or a tenth of a cell, "
-    "the smaller",
+    help="how far sides may lie from the outline of the densities; default: half a cell",
 )
 @click.option(
     "--curves",
     type=click.Choice(["splines", "arcs"]),
-    help="splines (default), or lines and arcs alone for machines that know no splines",
+    hidden=True,
+    help="without effect: parts have lines, arcs and circles",
 )
 @click.option(
     "--simplify/--no-simplify",
     default=None,
-    help="straight lines and fillets in place of splines, both sides of struts parallel; within "
-    "--tolerance of the outline, by default a quarter of a cell",
+    hidden=True,
+    help="without effect: sides are straight, with fillets between them",
 )
+@click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
 @click.option(
     "--check/--no-check",
     default=True,
@@ -97,6 +98,7 @@ def part(
     tolerance: float | None,
     curves: str | None,
     simplify: bool | None,
+    rounds: bool,
     check: bool,
     optimize: bool | None,
     iterations: int | None,
@@ -112,7 +114,7 @@ def part(
     tells what it does beside the densities, and beside these cut to solid and void.
 
     Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
-    STEP and DXF, too, for which --tool-radius, --tolerance and --curves are.
+    STEP and DXF, too, for which --tool-radius, --tolerance and --round are.
 
     Options go over the table [part] of the scene.
     """
@@ -130,8 +132,8 @@ def part(
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip
     asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
-    if asked.optimize and asked.curves == "arcs":  # at once: outlines and meshes take a while
-        raise InputError("--optimize: expected splines, not --curves arcs")
+    if world.rank == 0 and (asked.curves != "splines" or asked.simplify):
+        warn(["part.curves and part.simplify have no effect: parts have lines, arcs and circles"])
     if resume and not asked.optimize:
         raise InputError("--resume: goes on with --optimize, which is not asked for")
     names = [*file_names(scene), SHAPES]
@@ -140,9 +142,7 @@ def part(
     known = on_root(world, kept.read) if resume else ()
     with _stages(world) as say:
         say("outlines and surfaces")
-        # Splines are optimised, then simplified.
-        simple = asked.simplify and not asked.optimize
-        wanted = Curves(asked.tool_radius, asked.tolerance, asked.curves == "arcs", simple)
+        wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
         try:
             parts = make_parts(scene, folder, wanted, world)
         except PartsError as error:  # what there is of the others is of use
@@ -159,8 +159,6 @@ def part(
                 made = made.checked(folder, say) if check else made
                 if asked.optimize and made.meshes is not None:
                     made = made.optimized(folder, asked, check, say, kept.replace, known)
-                    if asked.simplify:
-                        made = made.simplified(folder, asked.tolerance, check, say)
                 say("files")
                 made.write(folder, target, plots)
                 if made.shape is None or not made.shape.interrupted:
@@ -259,18 +257,6 @@ class Made:
             found = optimize_parts(*given, keep, known)
         click.echo("\n".join(found.sentences))
         after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
-        return self._followed_by(after, run, check, say)
-
-    def simplified(self, run: Path, tolerance: float | None, check: bool, say: Say) -> Made:
-        """Return it with optimised shapes in straight lines and fillets."""
-        from dolfinopt.part.plane.part import PlanePart, simplified
-
-        parts = {
-            k: simplified(one, tolerance)
-            for k, one in self.parts.items()
-            if isinstance(one, PlanePart)
-        }
-        after = replace(self, parts=parts, meshes=_meshes(parts, check, say))
         return self._followed_by(after, run, check, say)
 
     def _followed_by(self, after: Made, run: Path, check: bool, say: Say) -> Made:

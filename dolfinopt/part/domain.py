@@ -476,6 +476,11 @@ class Domain(Filled):
         return float(np.sqrt(np.median(self.area)) * (1.0 if self.corners.shape[1] == 4 else 1.5))
 
     @property
+    def edges(self) -> list[Edge]:
+        """The curves of the arm's own outline, and around what stays solid or void."""
+        return [*self.outline.edges, *self.solid.edges, *self.void.edges]
+
+    @property
     def extent(self) -> float:
         """The larger side of the box around the arm, m."""
         return float(np.ptp(self.corners.reshape(-1, 2), axis=0).max())

@@ -29,7 +29,7 @@ from dolfinopt.part.merit import judge_step, merit
 from dolfinopt.part.part import Meshes, Part, PartMesh, mesh_parts
 from dolfinopt.part.plane.free_outline import FreeOutline, free_outline
 from dolfinopt.part.plane.layouts import Strut, struts_of, trusses_of, without
-from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.plane.part import PlanePart, with_splines
 from dolfinopt.part.solid.free_surface import free_form
 from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.part.stress import OutlineStress
@@ -213,7 +213,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
     one = scene.arms[k]
     sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
     if isinstance(part, PlanePart):
-        return free_outline(part, scene.design.minimum_gap, min([1.0, *sizes]))
+        return free_outline(with_splines(part), scene.design.minimum_gap, min([1.0, *sizes]))
     if not isinstance(part, SolidPart):
         raise InputError(
             f"--optimize: the wall of arm {part.name!r} is what dolfinopt optimize has moved "

@@ -31,16 +31,14 @@ class Curves:
     """What is asked of the curves of parts.
 
     Attributes:
-        tool_radius: of concave corners, m; None: a fifth of a cell.
-        tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
-        arcs: lines and arcs in place of splines.
-        simplify: straight lines and fillets within the tolerance.
+        tool_radius: least of concave corners, m; None: 3 mm.
+        tolerance: how far sides may lie from the densities' outline, m; None: half a cell.
+        rounds: whether radii are whole half millimetres.
     """
 
     tool_radius: float | None = None
     tolerance: float | None = None
-    arcs: bool = False
-    simplify: bool = False
+    rounds: bool = False
 
     @property
     def is_default(self) -> bool:
@@ -166,7 +164,7 @@ class Part(Protocol):
 
 
 def make_parts(
-    scene: Scene, folder: Path, curves: Curves = DEFAULTS, world: MPI.Comm | None = None
+    scene: Scene, folder: Path, curves: Curves | None = None, world: MPI.Comm | None = None
 ) -> dict[int, Part]:
     """Make the parts of the arms that have a design of their own (collective on `world`).
 
@@ -175,7 +173,7 @@ def make_parts(
     Args:
         scene: of the run.
         folder: with its design.npz.
-        curves: what is asked of the curves.
+        curves: what is asked of the curves; by default what the scene asks for.
         world: the ranks that share the arms; by default this one alone.
 
     Returns:
@@ -195,6 +193,7 @@ def make_parts(
     from dolfinopt.parallel import on_root, partition_arms, together
 
     world = MPI.COMM_SELF if world is None else world
+    curves = Curves(scene.part.tool_radius, scene.part.tolerance) if curves is None else curves
     on_root(world, _check, folder, curves)
     check_budget(world, scene)
     partition = partition_arms(world, scene.cell_counts, whole=True)

@@ -99,6 +99,28 @@ class Arc:
         # A multiple of four: a whole circle reaches its extremes.
         return np.linspace(0.0, 1.0, 4 * int(np.ceil(abs(self.sweep) / step / 4.0)) + 1)
 
+    def off(self, t: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far from the centre nodes at t (n,) stand, over the radius, and by the sweep.
+
+        Straight sides between the nodes then enclose the arc's area; the ends of an arc stay.
+
+        Args:
+            t: of the nodes.
+            count: of sides along the arc; 0: the nodes are on it.
+        """
+        share, slope = np.ones(len(t)), np.zeros(len(t))
+        if count < 2:
+            return share, slope
+        w, inner = abs(self.sweep) / count, (t > 0.0) & (t < 1.0)
+        if self.is_circle:
+            return np.full(len(t), np.sqrt(w / np.sin(w))), slope
+        # (count - 2) sin w x^2 + 2 sin w x = count w
+        a, b = (count - 2) * np.sin(w), 2.0 * np.sin(w)
+        x = 2.0 * count * w / (b + np.sqrt(b * b + 4.0 * a * count * w))
+        by_w = (count - (count - 2) * np.cos(w) * x * x - 2.0 * np.cos(w) * x) / (2.0 * a * x + b)
+        share[inner], slope[inner] = x, np.sign(self.sweep) * by_w / count
+        return share, slope
+
     @property
     def area(self) -> float:
         """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
@@ -386,6 +408,35 @@ def _piece_apart(piece: Piece) -> float:
     there = shapely.distance(shapely.points(points), run).max()
     back = shapely.distance(shapely.points(piece.run), line).max()
     return float(max(there, back))
+
+
+def projected(curve: Curve, point: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the point of a curve nearest to another one, and its parameter.
+
+    Lines and arcs may be left at their ends: they are cut to where the outline comes to them.
+    """
+    if isinstance(curve, Line):
+        d = curve.end - curve.start
+        t = float((point - curve.start) @ d / (d @ d))
+        return curve.start + t * d, t
+    if isinstance(curve, Arc):
+        away = point - curve.centre
+        angle = float(np.arctan2(away[1], away[0])) - curve.begin
+        middle = 0.5 * curve.sweep
+        angle = middle + (angle - middle + np.pi) % (2.0 * np.pi) - np.pi
+        place = curve.centre + curve.radius * away / np.linalg.norm(away)
+        return place, angle / curve.sweep
+    return _on_spline(curve, point)
+
+
+def _on_spline(curve: Spline, point: np.ndarray) -> tuple[np.ndarray, float]:
+    t = np.linspace(0.0, 1.0, 40 * len(curve.points) + 1)
+    best = float(t[np.argmin(np.linalg.norm(curve.at(t) - point, axis=1))])
+    for _ in range(8):
+        now = np.array([best])
+        d = curve.derivative(now)[0]
+        best = float(np.clip(best + (point - curve.at(now)[0]) @ d / (d @ d), 0.0, 1.0))
+    return curve.at(np.array([best]))[0], best
 
 
 # -- curves that go on smoothly as one spline ------------------------------------------------------

@@ -258,7 +258,7 @@ LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leav
 CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
 STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
 ROUGH = 0.01  # the same while a level is looked for roughly, cells
-TOOL = 0.2  # default radius of the tool, cells
+TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
 # Material along an interface that the design leaves void, in cells: the interface is rigid.
 STRIP = 0.5
 # Width of members that the design has and the level has not, in cells: solid cells that share a
@@ -333,7 +333,7 @@ def _rounding(tool: float, chord: float) -> float:
 
 def default_tool(domain: Domain) -> float:
     """Return the tool's radius where none is asked for, m."""
-    return TOOL * domain.cell
+    return min(TOOL, SLIM * domain.height)
 
 
 def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outline:

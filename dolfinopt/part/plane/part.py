@@ -16,6 +16,8 @@ from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
+from dolfinopt.part.plane.fit import distance, fitted_sides
+from dolfinopt.part.plane.limits import limits_of_part, rounded_radii
 from dolfinopt.part.plane.outline import (
     Outline,
     default_tool,
@@ -23,7 +25,7 @@ from dolfinopt.part.plane.outline import (
     polygons_of,
     rounded,
 )
-from dolfinopt.part.plane.simplify import simple_shape
+from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.plane.trace import make_shape
 from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
 from dolfinopt.part.widths import TightPlace, narrowest_within, thinnest_member, tight_places
@@ -45,12 +47,12 @@ if TYPE_CHECKING:
 
 
 TOLD = 5  # tight places that a sentence names
-SIMPLE = 0.25  # distance of simplified outlines by default, cells
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
 DISCS, ROUND = 20, 64  # that widen necks, at most; sides of a quarter of one
 ROUGH = 0.002  # distance of polygons in which necks are looked for, cells
 NARROW = 0.99  # share of the smallest member below which a neck is widened
-TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
+TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
+AWAY = 0.5  # cells that sides may lie from the outline by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +63,15 @@ class PlanePart:
         domain: the arm and its design.
         outline: its polygon.
         shape: its curves.
-        tolerance: of the curves, m.
-        kept_splines: whether no straight lines and fillets were found that were asked for.
+        tolerance: of the outline's polygon and of chords, m.
+        sides: whose curves these are; None of splines.
     """
 
     domain: Domain
     outline: Outline
     shape: Shape
     tolerance: float
-    kept_splines: bool = False
+    sides: Sides | None = None
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
@@ -133,11 +135,6 @@ class PlanePart:
             found.append(
                 f"arm {one.name!r}: {number} without a joint to both interfaces "
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
-            )
-        if self.kept_splines:
-            found.append(
-                f"arm {one.name!r}: --simplify: no straight lines and fillets without crossings; "
-                "splines instead; choose a smaller --tolerance"
             )
         if self.tight:
             listed = "; ".join(map(str, self.tight[:TOLD]))
@@ -232,24 +229,30 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
 
 def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     """Return the part of one arm, see `part.make_parts`."""
-    tool_radius, tolerance = curves.tool_radius, curves.tolerance
-    if tolerance is None:
-        tolerance = min(TOLERANCE, CELLS * domain.cell)
-    elif tolerance > domain.cell:
+    away = AWAY * domain.cell if curves.tolerance is None else curves.tolerance
+    if away > domain.cell:
         raise InputError(
-            f"--tolerance = {tolerance:g} m: expected at most a cell of arm {domain.name!r}, "
+            f"--tolerance = {away:g} m: expected at most a cell of arm {domain.name!r}, "
             f"{domain.cell:.3g} m"
         )
-    tool = default_tool(domain) if tool_radius is None else tool_radius
-    fine = min(tolerance, TOLERANCE, CELLS * domain.cell) if curves.simplify else tolerance
-    outline = draw_outline(domain, tool, fine)
-    if curves.simplify:
-        distance = SIMPLE * domain.cell if curves.tolerance is None else tolerance
-        shape = simple_shape(outline, distance, domain.volume)
-        if shape is not None:
-            return PlanePart(domain, outline, shape, fine)
-    shape = make_shape(outline, fine, curves.arcs)
-    return PlanePart(domain, outline, shape, fine, curves.simplify)
+    tool = default_tool(domain) if curves.tool_radius is None else curves.tool_radius
+    fine = min(away, TOLERANCE, CELLS * domain.cell)
+    outline, limits = draw_outline(domain, tool, fine), limits_of_part(domain, tool)
+    sides = fitted_sides(outline, limits, away, domain.volume)
+    if curves.rounds:
+        sides = rounded_radii(sides, limits)
+    return part_of(domain, outline, sides, fine)
+
+
+def part_of(domain: Domain, outline: Outline, sides: Sides, tolerance: float) -> PlanePart:
+    """Return the part with these sides; of the outline the distance is measured."""
+    shape = replace(sides.shape, apart=distance(sides, outline))
+    return PlanePart(domain, outline, shape, tolerance, sides)
+
+
+def with_splines(part: PlanePart) -> PlanePart:
+    """Return the part with splines along its outline."""
+    return replace(part, shape=make_shape(part.outline, part.tolerance), sides=None)
 
 
 def cut(outline: Outline, centres: Sequence[np.ndarray], least: float) -> Outline:
@@ -280,13 +283,6 @@ def cut(outline: Outline, centres: Sequence[np.ndarray], least: float) -> Outlin
     closed, new = rounded(polygon, outline.rounding, chord)
     polygon = max(polygons_of(closed.intersection(arm)), key=lambda one: one.area)
     return replace(outline, polygon=polygon, centres=np.vstack([*centres, new]))
-
-
-def simplified(part: PlanePart, tolerance: float | None = None) -> PlanePart:
-    """Return a part in straight lines and fillets, within a tolerance of it, m, if there are."""
-    distance = SIMPLE * part.domain.cell if tolerance is None else tolerance
-    shape = simple_shape(part.outline, distance, part.shape.area)
-    return replace(part, kept_splines=True) if shape is None else replace(part, shape=shape)
 
 
 def _count(number: int, name: str) -> str:

@@ -29,6 +29,7 @@ from dolfinopt.part.plane.curves import (
     direction,
     fit,
     joined,
+    projected,
     sampled,
     with_arcs,
 )
@@ -273,35 +274,6 @@ def heading(points: np.ndarray, reach: float, at_end: bool) -> np.ndarray:
     )
     d = 2.0 * b - 1.5 * a - 0.5 * c
     return d / np.linalg.norm(d)
-
-
-def projected(curve: Curve, point: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the point of a curve nearest to another one, and its parameter.
-
-    Lines and arcs may be left at their ends: they are cut to where the outline comes to them.
-    """
-    if isinstance(curve, Line):
-        d = curve.end - curve.start
-        t = float((point - curve.start) @ d / (d @ d))
-        return curve.start + t * d, t
-    if isinstance(curve, Arc):
-        away = point - curve.centre
-        angle = float(np.arctan2(away[1], away[0])) - curve.begin
-        middle = 0.5 * curve.sweep
-        angle = middle + (angle - middle + np.pi) % (2.0 * np.pi) - np.pi
-        place = curve.centre + curve.radius * away / np.linalg.norm(away)
-        return place, angle / curve.sweep
-    return _on_spline(curve, point)
-
-
-def _on_spline(curve: Spline, point: np.ndarray) -> tuple[np.ndarray, float]:
-    t = np.linspace(0.0, 1.0, 40 * len(curve.points) + 1)
-    best = float(t[np.argmin(np.linalg.norm(curve.at(t) - point, axis=1))])
-    for _ in range(8):
-        now = np.array([best])
-        d = curve.derivative(now)[0]
-        best = float(np.clip(best + (point - curve.at(now)[0]) @ d / (d @ d), 0.0, 1.0))
-    return curve.at(np.array([best]))[0], best
 
 
 TANGENT = 10.0  # distance of the tool's arc from a curve that it touches, at most, chords

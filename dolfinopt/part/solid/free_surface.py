@@ -36,6 +36,7 @@ from dolfinopt.part.plane.free_outline import (
     FreeOutline,
     free_outline,
 )
+from dolfinopt.part.plane.part import with_splines
 from dolfinopt.part.solid.part import SolidPart, plate_part
 from dolfinopt.part.solid.surface import (
     FURTHER,
@@ -415,7 +416,7 @@ class FreePlate:
 def free_form(part: SolidPart, coarser: float) -> FreePlate | FreeSurface:
     """Return what moves of a part: the outline of a plate, or a surface."""
     if part.flat is not None:
-        return FreePlate(part.domain, free_outline(part.flat))
+        return FreePlate(part.domain, free_outline(with_splines(part.flat)))
     return free_surface(part, part.mesh(coarser))
 
 

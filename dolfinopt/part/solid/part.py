@@ -306,7 +306,7 @@ def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart
         if not curves.is_default:
             raise InputError(
                 f"arm {domain.name!r}: its design varies over the thickness, so that its part has "
-                "no curves: leave out --tool-radius, --tolerance and --curves, or optimise with "
+                "no curves: leave out --tool-radius, --tolerance and --round, or optimise with "
                 "arms.extruded = true"
             )
         return _freeform_part(domain)
