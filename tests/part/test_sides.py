@@ -47,7 +47,7 @@ ARM, KEPT = shapely.box(-0.002, 0.0, 0.199, 0.1), shapely.box(0.08, 0.043, 0.1, 
 LIMITS = Limits(0.005, 0.004, 0.019, 0.008, ARM, KEPT)
 
 
-def differences(sides, value, step=1e-6):
+def differences(sides, value, step=1e-7):
     """Return the derivatives (m, n) by q of what is measured of sides, by central differences."""
     every = step * np.eye(sides.numbers[0])
     return np.array([(value(sides.moved(e)) - value(sides.moved(-e))) / (2.0 * step) for e in every]).T
@@ -108,7 +108,8 @@ def test_rounded_radii_are_whole_half_millimetres():
     made = rounded_radii(LIMITS.nearest(bracket())[0], LIMITS)
     radii = [one.piece.curve.radius for one in made.placed if one.piece.free and isinstance(one.piece.curve, Arc)]
     assert len(radii) == 5
-    np.testing.assert_allclose(np.array(radii) % 5e-4, 0.0, atol=1e-12)
+    steps = np.array(radii) / 5e-4
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
 
 
 def test_shortest_move_is_that_of_the_book():
