@@ -205,15 +205,25 @@ class OutlineStress(Stress):
 
     name = "outline_stress"
 
-    def __init__(self, options: Objective, parts: Mapping[int, Part]):
-        """Take the scene's options, and the parts by their place in the chain."""
+    def __init__(
+        self,
+        options: Objective,
+        parts: Mapping[int, Part],
+        nodes: Mapping[int, np.ndarray] | None = None,
+    ):
+        """Take the scene's options, and the parts by their place in the chain.
+
+        Of nodes only those count (n,), by the arms; of arms without an entry none.
+        """
         super().__init__(options, limited=True)
-        self._parts = parts
+        self._parts, self._nodes = parts, nodes
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> CornerStress:
         """Return the stress of an arm's design on its outline."""
         part = self._parts[index]
         found = part.stress(state, fields)
+        if self._nodes is not None:
+            return found.counted(self._nodes.get(index, np.zeros(len(found.places), dtype=bool)))
         return found.counted(part.regular(found.places, self.options.stress_margin))
 
 

@@ -389,7 +389,7 @@ class FreeOutline:
             mesh: along the curves of this outline.
             by_nodes: (n, 2) derivatives by the places of its nodes.
         """
-        by_outline = mesh.at_outline(by_nodes)
+        by_outline = mesh.at_outline(by_nodes[None])[0]
 
         def pull(number: int, curve: Spline) -> np.ndarray:
             here = np.flatnonzero(mesh.piece == number)
