@@ -477,8 +477,13 @@ class Domain(Filled):
 
     @property
     def edges(self) -> list[Edge]:
-        """The curves of the arm's own outline, and around what stays solid or void."""
-        return [*self.outline.edges, *self.solid.edges, *self.void.edges]
+        """The curves of the arm's own outline, and around what stays void or solid."""
+        return [*self.outline.edges, *self.void.edges, *self.solid.edges]
+
+    @property
+    def outer_edges(self) -> int:
+        """Number of the first of them that no material lies beyond."""
+        return len(self.outline.edges) + len(self.void.edges)
 
     @property
     def extent(self) -> float:

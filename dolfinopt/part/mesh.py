@@ -151,7 +151,9 @@ class BodyMesh:
         """Piece (k,) that the first node of every side belongs to: between two, to the arc."""
         before = np.empty(len(self.sides), dtype=int)
         order = np.argsort(self.sides[:, 0])
-        before[order[np.searchsorted(self.sides[order, 0], self.sides[:, 1])]] = np.arange(len(before))
+        before[order[np.searchsorted(self.sides[order, 0], self.sides[:, 1])]] = np.arange(
+            len(before)
+        )
         arc = np.array([isinstance(piece.curve, Arc) for piece in self.shape.pieces])
         ends = self.piece[before]
         joint = (self.span[:, 0] == 0.0) & arc[ends] & ~arc[self.piece]
@@ -361,17 +363,16 @@ def _divided(
     curve: Curve, t: np.ndarray, size: np.ndarray, turn: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters of nodes along a curve, ends included, and sizes at all but the last."""
-    # Nodes stand where curves were joined: without them sides on both sides of a neck may cross.
     step = np.linalg.norm(np.diff(curve.at(t), axis=0), axis=1)
     passed = np.append(0.0, np.cumsum(step * 0.5 * (1.0 / size[:-1] + 1.0 / size[1:])))
-    joints = curve.joints if isinstance(curve, Spline) else np.empty(0)
-    ends = np.concatenate([[0.0], np.interp(joints, t, passed), passed[-1:]])
-    least = 1 if isinstance(curve, Line) or len(joints) else 2
+    least = 1 if isinstance(curve, Line) else 2
     if isinstance(curve, Arc):
         least = max(least, int(np.ceil(abs(curve.sweep) / turn)))
-    counts = [max(int(np.ceil(b - a - 0.2)), least) for a, b in pairwise(ends)]
-    places = [np.linspace(a, b, n + 1)[:-1] for (a, b), n in zip(pairwise(ends), counts)]
-    at = np.interp(np.concatenate([*places, passed[-1:]]), passed, t)
+        # Evenly: the area is exact then, see `outline_places`.
+        at = np.linspace(0.0, 1.0, max(int(np.ceil(passed[-1] - 0.2)), least) + 1)
+    else:
+        count = max(int(np.ceil(passed[-1] - 0.2)), least)
+        at = np.interp(np.linspace(0.0, passed[-1], count + 1), passed, t)
     at[0], at[-1] = 0.0, 1.0
     return at, np.interp(at[:-1], t, size)
 

@@ -198,7 +198,6 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
     sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
     flat = part.flat if isinstance(part, SolidPart) else part
     if isinstance(flat, PlanePart):
-        assert flat.sides is not None
         limits = limits_of_part(
             flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
         )

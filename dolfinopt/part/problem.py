@@ -1,4 +1,4 @@
-"""What is minimised and limited in the optimisation of parts, and its derivatives by their forms."""
+"""What is minimised and limited in the optimisation of parts, with derivatives by their forms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matter
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
 NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
-ALLOWED = 0.05  # excess of a limit that a state may have for a better objective: a later step ends it
+ALLOWED = (
+    0.05  # excess of a limit that a state may have for a better objective: a later step ends it
+)
 LEAST_FINE, MOST_FINE = 0.9, 1.3  # stress of a place on a finer mesh over that on this one
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
@@ -255,18 +257,24 @@ class Problem:
         """Return the derivatives (n,) of `State.places` of some places."""
         found = []
         for key in keys:
-            nodes = {key[0]: state.owners[key[0]] == key[1]}
-            stress, analysis = self._outline_stress(
-                state.simulated, self.every(state.outlines), PLACE_EXPONENT, nodes
-            )
-            smooth = stress.measure(analysis).smooth[0]
+            stress, analysis = self._place_stress(state, key)
             (row,) = stress.gradients(analysis)
-            scale = (1.0 + state.places[key]) / smooth
+            scale = (1.0 + state.places[key]) / stress.measure(analysis).smooth[0]
             found.append(self._by_x(state, [{k: scale * g for k, g in row.items()}])[0])
         return found
 
+    def mean_stress(self, state: State, key: Place) -> float:
+        """Return the p-mean, Pa, that stands for the stress of a place in its derivatives."""
+        stress, analysis = self._place_stress(state, key)
+        return stress.measure(analysis).smooth[0]
+
+    def _place_stress(self, state: State, key: Place) -> tuple[OutlineStress, Analysis]:
+        nodes = {key[0]: state.owners[key[0]] == key[1]}
+        every = self.every(state.outlines)
+        return self._outline_stress(state.simulated, every, PLACE_EXPONENT, nodes)
+
     def calibrated(self, state: State) -> tuple[Problem, State]:
-        """Return a state on new meshes, and the problem that knows what finer ones say of stress."""
+        """Return the problem that knows what finer meshes say, and a state on new meshes."""
         plain = replace(self, local={})
         fresh = plain.evaluated(state.outlines, {}, state.solutions)
         hot = [key for key, value in fresh.places.items() if value > NEAR]

@@ -62,22 +62,31 @@ def solve(
             factor = cho_factor(K + 1e-13 * np.diag(np.diag(K)), check_finite=False)
         except LinAlgError:
             break
-
-        def direction(target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            right = -dual - C.T @ ((y * primal - target) / w)
-            dz = cho_solve(factor, right, check_finite=False)
-            dw = -primal - C @ dz
-            return dz, dw, (-target - y * dw) / w
-
-        _, dw, dy = direction(w * y)
+        at = C, factor, w, y, dual, primal
+        _, dw, dy = _direction(*at, w * y)
         reach = min(_reach(w, dw), _reach(y, dy))
         share = ((w + reach * dw) @ (y + reach * dy) / len(d) / mean) ** 3
-        dz, dw, dy = direction(w * y + dw * dy - share * mean)
+        dz, dw, dy = _direction(*at, w * y + dw * dy - share * mean)
         reach = TO_BOUNDARY * min(_reach(w, dw), _reach(y, dy))
         if not (np.isfinite(reach) and np.isfinite(dz).all()):
             break
         z, w, y = z + reach * dz, w + reach * dw, y + reach * dy
     return np.clip(z[:n], -1.0, 1.0), size * y[:m]
+
+
+def _direction(
+    C: np.ndarray,
+    factor: tuple[np.ndarray, bool],
+    w: np.ndarray,
+    y: np.ndarray,
+    dual: np.ndarray,
+    primal: np.ndarray,
+    target: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Newton's step of unknowns, slacks w and multipliers y, whose products shall fall."""
+    dz = cho_solve(factor, -dual - C.T @ ((y * primal - target) / w), check_finite=False)
+    dw = -primal - C @ dz
+    return dz, dw, (-target - y * dw) / w
 
 
 def _reach(v: np.ndarray, step: np.ndarray) -> float:

@@ -9,11 +9,11 @@ Source: Douglas & Peucker (1973), doi:10.3138/FM57-6770-U75U-7727.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count as counting
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,13 +36,19 @@ from dolfinopt.part.plane.sides import (
     unit,
 )
 
+if TYPE_CHECKING:
+    from shapely import Geometry
+
 MIDDLE = 0.7  # share of a portion that its line is fitted to
 LEAST = 0.3  # length of a side that is worth drawing, cells
 SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
 SMALLEST = 3.0  # area of a hole, squared cells or tool radii
-ATTEMPTS = (1.0, 0.6, 0.35, 0.2)  # shares of the tolerance, tried in turn
+ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
+THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
+CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
+SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
 ROOM = 0.45  # share of a side that a fillet at one of its ends may take
 
 
@@ -88,26 +94,33 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
-    best: Sides | None = None
-    for share in ATTEMPTS:
-        try:
-            drawn = _drawn(outline, limits, share * tolerance)
-            found = limits.nearest(drawn, area=area) or limits.nearest(drawn)
-        except BrokenError:
-            continue
-        if found is None:
-            continue
-        made = found[0]
-        if best is None or distance(made, outline) < distance(best, outline):
-            best = made
-        if distance(best, outline) <= tolerance:
+    thin = replace(limits, member=min(limits.member, THIN * limits.cell))
+    for kept in (limits, thin):  # what is thinner than asked for is told
+        best: Sides | None = None
+        for share in ATTEMPTS:
+            made = _made(outline, kept, share * tolerance, area)
+            if made is None:
+                continue
+            if best is None or distance(made, outline) < distance(best, outline):
+                best = made
+            if distance(best, outline) <= tolerance:
+                return best
+        if best is not None:
             return best
-    if best is None:
-        raise InputError(
-            f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
-            "the outline; choose another --tolerance or a smaller --tool-radius"
-        )
-    return best
+    raise InputError(
+        f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
+        "the outline; choose another --tolerance or a smaller --tool-radius"
+    )
+
+
+def _made(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
+    """Return sides along an outline that keep the limits; None: there are none."""
+    try:
+        drawn = _drawn(outline, limits, tolerance)
+    except BrokenError:
+        return None
+    found = limits.nearest(drawn, area=area) or limits.nearest(drawn)
+    return None if found is None else found[0]
 
 
 def distance(sides: Sides, outline: Outline) -> float:
@@ -131,7 +144,7 @@ def distance(sides: Sides, outline: Outline) -> float:
 
 
 def _rings(outline: Outline) -> Iterator[np.ndarray]:
-    """Yield the corners (n, 2) of all rings, material to the left; of the upper half by symmetry."""
+    """Yield the corners (n, 2) of all rings, material to the left; by symmetry of the upper half."""
     import shapely
 
     polygon: Any = outline.polygon
@@ -225,6 +238,13 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
     lines = [
         shapely.LineString(np.vstack([c.at(c.parameters(outline.chord)), c.end])) for c in curves
     ]
+    outer, boundary = domain.outer_edges, outline.polygon.boundary
+
+    def as_wide(_: int, place: np.ndarray, half: float) -> float:
+        """Return the radius of a fillet that touches the outline."""
+        gap = float(shapely.distance(shapely.Point(place), boundary))
+        return gap / (1.0 / np.cos(half) - 1.0)
+
     loops: list[Loop] = []
     circles: list[Circle] = []
     fixed: list[tuple[Piece, ...]] = []
@@ -241,10 +261,12 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
             drawn = [one for run in chain for one in _sides_along(run, edges, tolerance, closed)]
             drawn = _distinct([one.named(key=next(names)) for one in drawn], halved)
             drawn = _whole(drawn, names) if halved else drawn
-            if not (drawn := cleaned(drawn, limits)):
+            drawn = cornered(cleaned(drawn, limits), limits, boundary, tolerance)
+            if not drawn:
                 continue
             if _is_circle(drawn):
-                assert (curve := drawn[0].side.curve) is not None
+                curve = drawn[0].side.curve
+                assert curve is not None
                 piece = Piece(curve, drawn[0].side.label)
                 fixed += [(one,) for one in ([piece, _mirrored(piece)] if twins else [piece])]
                 continue
@@ -252,7 +274,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
             if twins:
                 pair[0] = [one.named(twin=next(names)) for one in drawn]
                 pair.append([one.mirrored() for one in reversed(pair[0])])
-            loops += [with_corners(some, limits, outline) for some in pair]
+            loops += [looped(some, limits, outer, as_wide) for some in pair]
     loops.sort(key=lambda loop: -loop.area)
     return Sides(tuple(loops), tuple(circles), tuple(fixed)).centred()
 
@@ -310,10 +332,9 @@ def _free_circle(chain: Sequence[Run], halved: bool, tolerance: float) -> Circle
     system = np.column_stack([2.0 * p, np.ones(len(p))])
     x, y, rest = np.linalg.lstsq(system, (p**2).sum(axis=1), rcond=None)[0]
     radius = float(np.sqrt(rest + x * x + y * y))
-    centre = middle + [x, 0.0 if halved else y]
+    centre = middle + np.array([x, 0.0 if halved else y])
     off = np.abs(np.linalg.norm(points - centre, axis=1) - radius).max()
-    inner = np.hypot(*(points - centre).T) @ np.ones(len(points))
-    if off > min(tolerance, 0.1 * radius) or inner == 0.0:
+    if off > min(tolerance, 0.1 * radius):
         return None
     return Circle(centre, radius)
 
@@ -464,6 +485,71 @@ def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
     return []
 
 
+def cornered(
+    drawn: list[Drawn], limits: Limits, boundary: Geometry, tolerance: float
+) -> list[Drawn]:
+    """Return sides without those in whose place a corner of their neighbours, rounded, will do.
+
+    Args:
+        drawn: the sides of a loop.
+        limits: of the part.
+        boundary: of the outline's polygon (shapely).
+        tolerance: distance from it up to which a corner will do, m.
+    """
+    done: set[int] = set()
+    while True:
+        order = sorted(drawn, key=lambda one: float(np.linalg.norm(one.end - one.start)))
+        found = next(
+            (
+                one
+                for one in order
+                if one.side.free
+                and one.side.key not in done
+                and len(drawn) > 2 + len(one.names)
+                and _corner_will_do(drawn, drawn.index(one), limits, boundary, tolerance)
+            ),
+            None,
+        )
+        if found is None:
+            return drawn
+        done |= found.names
+        left = cleaned([one for one in drawn if not one.names & found.names], limits)
+        drawn = left or drawn
+
+
+def _corner_will_do(
+    drawn: Sequence[Drawn], k: int, limits: Limits, boundary: Geometry, tolerance: float
+) -> bool:
+    """Return whether the sides beside side k meet near the outline, with a fillet that fits."""
+    import shapely
+
+    before, one, after = drawn[k - 1], drawn[k], drawn[(k + 1) % len(drawn)]
+    if one.side.key == one.side.twin and not {before.side.key, after.side.key} - one.names:
+        return False
+    try:
+        place = meet(before.side, after.side, 0.0, 0.5 * (one.start + one.end))
+    except BrokenError:
+        return False
+    a, b = before.side.foot(place)[1], after.side.foot(place)[1]
+    turn = turn_between(a, b)
+    ends = np.linalg.norm(one.start - place), np.linalg.norm(one.end - place)
+    if abs(turn) > CORNER or max(ends) > REACH * limits.cell:
+        return False
+    gap = float(shapely.distance(shapely.Point(place), boundary))
+    if turn > 0.0:
+        return gap <= tolerance
+    half = min(-turn / 2.0, 1.4)
+    radius = max(gap / (1.0 / np.cos(half) - 1.0), limits.tool) if half > 0.0 else np.inf
+    lengths = (np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
+    if radius * np.tan(half) > ROOM * min(lengths):
+        return False
+    out = -left(a) - left(b)
+    centre = place + radius / np.cos(half) * out / np.linalg.norm(out)
+    begin = angle_of(left(a))
+    arc = Arc(centre, radius, begin, turn).at(np.linspace(0.0, 1.0, 7))
+    return bool(shapely.distance(shapely.points(arc), boundary).max() <= tolerance)
+
+
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
     """Return the number of the side to leave out, and whether the one before takes its place."""
     places, turns = _vertices(drawn, REACH * limits.cell)
@@ -499,9 +585,7 @@ def _merged(drawn: list[Drawn], k: int) -> list[Drawn]:
     if side.twin == side.key:
         return drawn
     image = made.mirrored()
-    return [
-        made if s is before else image if s.side.key == side.twin else s for s in drawn
-    ]
+    return [made if s is before else image if s.side.key == side.twin else s for s in drawn]
 
 
 def is_rounded(a: Side, b: Side, turn: float, outer: int) -> bool:
@@ -515,23 +599,33 @@ def is_rounded(a: Side, b: Side, turn: float, outer: int) -> bool:
     return turn < 0.0 and not (0 <= a.edge < outer and 0 <= b.edge < outer)
 
 
-def with_corners(drawn: Sequence[Drawn], limits: Limits, outline: Outline) -> Loop:
-    """Return a loop: fillets at concave corners, as wide as the outline's."""
-    import shapely
+def looped(
+    drawn: Sequence[Drawn],
+    limits: Limits,
+    outer: int,
+    radius_at: Callable[[int, np.ndarray, float], float],
+) -> Loop:
+    """Return a loop of sides with fillets at its concave corners.
 
+    Args:
+        drawn: the sides.
+        limits: of the part; radii are within them, and leave room on the sides.
+        outer: number of the arm's own curves.
+        radius_at: returns the wanted radius, m, of the corner before a side of this number, at this
+            place (2,), half of whose turn is this angle.
+    """
     places, turns = _vertices(drawn, REACH * limits.cell)
-    outer, corners = len(outline.domain.outline.edges), []
+    corners = []
     for k, (place, turn) in enumerate(zip(places, turns, strict=True)):
         a, b = drawn[k - 1].side, drawn[k].side
         if not is_rounded(a, b, turn, outer):
             corners.append(Corner(place))
             continue
-        gap = shapely.distance(shapely.Point(place), outline.polygon.boundary)
         half = min(-turn / 2.0, 1.4)
         ends = (places[k - 1], places[(k + 1) % len(places)])
         room = ROOM * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
-        radius = min(float(gap) / (1.0 / np.cos(half) - 1.0), room, 0.9 * LARGEST * limits.cell)
-        radius = max(radius, limits.tool)
+        radius = min(radius_at(k, place, half), room, 0.9 * LARGEST * limits.cell)
+        radius = max(radius, limits.tool, SMALL * limits.cell)
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
         corners.append(Corner(near, radius))

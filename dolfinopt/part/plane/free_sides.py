@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
 from dolfinopt.part.plane.curves import Line
 from dolfinopt.part.plane.limits import Limits
-from dolfinopt.part.plane.part import PlanePart, part_of
+from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides, angle_of, left, unit
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
@@ -53,7 +54,7 @@ class FreeSides:
     @cached_property
     def plane(self) -> PlanePart:
         """The part in the plane with these sides."""
-        return part_of(self.part.domain, self.part.outline, self.sides, self.part.tolerance)
+        return replace(self.part, sides=self.sides)
 
     @property
     def current(self) -> PlanePart | SolidPart:
@@ -190,10 +191,7 @@ class FreeSides:
             names = int(edge), int(key), int(twin)
             sides.append(Side(np.array([x, y]), float(angle), curve, label, *names))
         ends = np.cumsum([0, *arrays["sizes"]])
-        loops = [
-            Loop(tuple(sides[a:b]), tuple(corners[a:b]))
-            for a, b in zip(ends[:-1], ends[1:], strict=True)
-        ]
+        loops = [Loop(tuple(sides[a:b]), tuple(corners[a:b])) for a, b in pairwise(ends)]
         circles = [
             Circle(row[:2], float(row[2]), int(row[3]), int(row[4])) for row in arrays["circles"]
         ]

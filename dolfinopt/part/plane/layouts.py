@@ -19,7 +19,7 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.plane.fit import fitted_sides
 from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import polygons_of
-from dolfinopt.part.plane.part import PlanePart, part_of
+from dolfinopt.part.plane.part import PlanePart
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -88,7 +88,7 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
         sides = fitted_sides(found, limits, CLOSE * domain.cell, area)
     except InputError as error:
         raise ConvergenceError(str(error)) from None
-    return part_of(domain, found, sides, part.tolerance)
+    return replace(part, outline=found, sides=sides)
 
 
 def _between_bores(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,8 @@ from scipy.spatial import cKDTree
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.plane.curves import Arc, Line, Piece, Spline, curvature, direction
 from dolfinopt.part.plane.sides import (
+    GAUSS,
+    WEIGHTS,
     ArcMoves,
     BrokenError,
     LineMoves,
@@ -41,6 +44,7 @@ FACING = 0.8  # cosine between a width and the normals at both of its ends, at l
 NEAR = 2.0  # least widths: distance up to which two pieces are looked at
 HALF = 5e-4  # m, of which rounded radii are multiples
 CHORD = 0.005  # distance of polygons from curves, cells
+EXACTLY = 0.01  # of it, up to which an area may be, over the slope
 KEPT = 2e-6  # m, up to which a limit may be missed
 FARTHEST = 0.5  # cells that a side moves in a step to the nearest outline
 STEPS = 20  # of them, at most
@@ -103,8 +107,10 @@ class Limits:
                 length = float((curve.end - curve.start) @ d)
                 yield SHORT * self.cell - length, -d @ (moves.end - moves.start)
             elif isinstance(moves, OwnMoves):
-                length = float(np.linalg.norm(curve.derivative(np.array([0.5]))))
-                yield SHORT * self.cell - length, -length * (moves.end - moves.start)
+                speed = np.linalg.norm(curve.derivative(GAUSS), axis=1)
+                ends = np.linalg.norm(curve.derivative(np.array([0.0, 1.0])), axis=1)
+                slope = ends[1] * moves.end - ends[0] * moves.start
+                yield SHORT * self.cell - float(WEIGHTS @ speed), -slope
 
     def _of_sharp_corners(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         placed = {(one.loop, one.side): one for one in sides.placed if not one.fillet}
@@ -150,7 +156,10 @@ class Limits:
                 far = same[np.argmax(np.abs(t[place[same]] - t[place[low]]))]
                 for k in {low, far}:
                     u, slope = v[k] / width[k], np.zeros(sides.numbers[0])
-                    for which, s, g in ((number[place[k]], t[place[k]], u), (other[k], where[k], -u)):
+                    for which, s, g in (
+                        (number[place[k]], t[place[k]], u),
+                        (other[k], where[k], -u),
+                    ):
                         if every[which].moves is not None:
                             slope = slope + every[which].pull(np.array([s]), g[None, None])[0]
                     yield least - width[k], slope
@@ -158,7 +167,8 @@ class Limits:
     # -- where material may be and must be --------------------------------------------------------
 
     def _places(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        moving = [one for one in sides.placed if one.piece.free]
+        # Fillets lie between their sides.
+        moving = [one for one in sides.placed if one.piece.free and not one.fillet]
         if not moving:
             return
         number, t, at, _ = _samples(moving, self.cell)
@@ -193,7 +203,7 @@ class Limits:
                 margin = np.full(len(g), 0.3 * KEPT)
                 if area is not None:
                     slope = sides.area_by_q() @ sides.ties
-                    whole_slope = np.abs(slope).sum() or 1.0
+                    whole_slope = EXACTLY * np.abs(slope).sum() or 1.0
                     missing = (area - sides.shape.area) / whole_slope * np.array([1.0, -1.0])
                     g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
                     A = np.vstack([A, np.outer([-1.0, 1.0], slope / whole_slope)])
@@ -291,7 +301,7 @@ def _chords(one: Placed, chord: float) -> list[Placed]:
     points = curve.at(curve.parameters(chord))
     return [
         Placed(Piece(Line(a, b), one.piece.label), None, one.loop, one.side)
-        for a, b in zip(points[:-1], points[1:])
+        for a, b in pairwise(points)
     ]
 
 

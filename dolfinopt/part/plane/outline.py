@@ -94,24 +94,22 @@ SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
 SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
 
 
-def rounded(whole: Geometry, radius: float, chord: float) -> tuple[Geometry, np.ndarray]:
+def rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
     """Return the polygons with all that a disc cannot reach from without added to them.
 
-    Elsewhere their sides stay what they are to the bit. With them points (n, 2), m, the centres of
-    all arcs of the disc among them.
+    Elsewhere their sides stay what they are to the bit.
     """
     import shapely
 
     tolerance = chord / CHORD
     quadrant = max(int(np.ceil(0.25 * np.pi / np.sqrt(2.0 * SAGITTA * tolerance / radius))), 6)
-    swept = whole.buffer(radius, quad_segs=quadrant)
-    closed = swept.buffer(-radius, quad_segs=quadrant)
+    closed = whole.buffer(radius, quad_segs=quadrant).buffer(-radius, quad_segs=quadrant)
     added = shapely.get_parts(closed.difference(whole))
     # The rounding of numbers, and every corner of the polygon, leave slivers all along.
     added = added[shapely.area(added) > (SHALLOW * tolerance) ** 2]
     deep = shapely.area(shapely.buffer(added, -0.5 * SHALLOW * tolerance, quad_segs=2)) > 0.0
     added = shapely.buffer(added[deep], 0.1 * chord, join_style="mitre")
-    return shapely.union_all([whole, *added]), shapely.get_coordinates(swept)
+    return shapely.union_all([whole, *added])
 
 
 def without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
@@ -270,7 +268,6 @@ NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must
 # Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
 # one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
 CHECKERED, FEW = 0.4, 100
-ROUNDING = 1.0  # by which concave corners are rounder than the tool, tolerances
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +283,6 @@ class Outline:
         chord: distance of its sides from the arm's own curves, m.
         islands, islands_area: number of pieces that join no interface and were dropped; m2.
         filled: number of holes narrower than the tool, closed.
-        centres: (n, 2) m, those of the tool's arcs on the polygon among them.
     """
 
     domain: Domain
@@ -298,17 +294,6 @@ class Outline:
     islands: int
     islands_area: float
     filled: int
-    centres: np.ndarray
-
-    @property
-    def tolerance(self) -> float:
-        """Of the part, m."""
-        return self.chord / CHORD
-
-    @property
-    def rounding(self) -> float:
-        """Radius of its concave corners, m: curves within the tolerance may turn sharper."""
-        return _rounding(self.tool_radius, self.chord)
 
     @property
     def area(self) -> float:
@@ -325,10 +310,6 @@ class _Given:
     links: Geometry  # along which the design hangs together
     inboard: Geometry  # lines of the interface
     outboard: Geometry  # lines of the interface
-
-
-def _rounding(tool: float, chord: float) -> float:
-    return tool + ROUNDING * chord / CHORD
 
 
 def default_tool(domain: Domain) -> float:
@@ -370,8 +351,7 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
 
     if target > given.arm.area * (1.0 - AREA):
         polygon = max(polygons_of(given.arm), key=lambda p: p.area)
-        chord, none = CHORD * tolerance, np.empty((0, 2))
-        return Outline(domain, polygon, 0.0, 0.0, tool_radius, chord, 0, 0.0, 0, none)
+        return Outline(domain, polygon, 0.0, 0.0, tool_radius, CHORD * tolerance, 0, 0.0, 0)
     if float(np.ptp(domain.field)) < UNIFORM:
         raise InputError(
             f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
@@ -453,10 +433,9 @@ def _at(
     import shapely
 
     whole = _material(given, raster, level, offset, STRAIGHT * chord / CHORD)
-    before, centres = polygons_of(whole), np.empty((0, 2))
+    before = polygons_of(whole)
     if tool > 0.0:
-        whole, centres = rounded(whole, _rounding(tool, chord), chord)
-        whole = whole.intersection(given.arm)
+        whole = rounded(whole, tool, chord).intersection(given.arm)
     whole = without_necks(whole, NECK * chord / CHORD, chord)
     parts = polygons_of(whole)
     near = 1e-6 * domain.extent
@@ -476,7 +455,6 @@ def _at(
         islands=len(dropped),
         islands_area=float(sum(p.area for p in dropped)),
         filled=max(closed - len(holes), 0),
-        centres=centres,
     )
 
 

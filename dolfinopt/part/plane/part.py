@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,17 +18,10 @@ from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
 from dolfinopt.part.plane.limits import limits_of_part, rounded_radii
-from dolfinopt.part.plane.outline import (
-    Outline,
-    default_tool,
-    draw_outline,
-    polygons_of,
-    rounded,
-)
+from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.sides import Sides
-from dolfinopt.part.plane.trace import make_shape
 from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
-from dolfinopt.part.widths import TightPlace, narrowest_within, thinnest_member, tight_places
+from dolfinopt.part.widths import TightPlace, thinnest_member, tight_places
 from dolfinopt.part.workshop_files import (
     MM,
     dxf_text,
@@ -48,9 +41,6 @@ if TYPE_CHECKING:
 
 TOLD = 5  # tight places that a sentence names
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
-DISCS, ROUND = 20, 64  # that widen necks, at most; sides of a quarter of one
-ROUGH = 0.002  # distance of polygons in which necks are looked for, cells
-NARROW = 0.99  # share of the smallest member below which a neck is widened
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
 AWAY = 0.5  # cells that sides may lie from the outline by default
 
@@ -62,16 +52,14 @@ class PlanePart:
     Attributes:
         domain: the arm and its design.
         outline: its polygon.
-        shape: its curves.
+        sides: its own outline.
         tolerance: of the outline's polygon and of chords, m.
-        sides: whose curves these are; None of splines.
     """
 
     domain: Domain
     outline: Outline
-    shape: Shape
+    sides: Sides
     tolerance: float
-    sides: Sides | None = None
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
@@ -81,6 +69,16 @@ class PlanePart:
     def name(self) -> str:
         """The arm's name."""
         return self.domain.name
+
+    @property
+    def shape(self) -> Shape:
+        """Its curves."""
+        return self.sides.shape
+
+    @cached_property
+    def distance(self) -> float:
+        """Largest distance of its curves from the outline of the densities, m."""
+        return distance(self.sides, self.outline)
 
     @cached_property
     def thinnest(self) -> float | None:
@@ -106,10 +104,10 @@ class PlanePart:
     def sentence(self) -> str:
         """Its size in words."""
         shape = self.shape
-        points = f" with {shape.control_points} control points" if shape.control_points else ""
         return (
-            f"{1e6 * shape.area:.6g} mm2, {len(shape.loops) - 1} holes, {len(shape.curves)} "
-            f"curves{points}, at most {1e3 * shape.distance:.2g} mm from the outline"
+            f"{1e6 * shape.area:.6g} mm2, {len(shape.loops) - 1} holes, {shape.entities}, at most "
+            f"{1e3 * self.distance:.2g} mm from the outline, tool radius "
+            f"{1e3 * self.outline.tool_radius:.3g} mm"
         )
 
     @property
@@ -164,10 +162,9 @@ class PlanePart:
             "mass": density * self.volume,
             "design_volume": one.volume * one.thickness,
             "level": self.outline.level,
-            "distance": shape.distance,
+            "distance": self.distance,
             "tolerance": self.tolerance,
             "curves": len(shape.curves),
-            "control_points": shape.control_points,
             "loops": len(shape.loops),
             "tool_radius": self.outline.tool_radius,
             "smallest_concave_radius": radius if math.isfinite(radius) else None,
@@ -241,48 +238,7 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     sides = fitted_sides(outline, limits, away, domain.volume)
     if curves.rounds:
         sides = rounded_radii(sides, limits)
-    return part_of(domain, outline, sides, fine)
-
-
-def part_of(domain: Domain, outline: Outline, sides: Sides, tolerance: float) -> PlanePart:
-    """Return the part with these sides; of the outline the distance is measured."""
-    shape = replace(sides.shape, apart=distance(sides, outline))
-    return PlanePart(domain, outline, shape, tolerance, sides)
-
-
-def with_splines(part: PlanePart) -> PlanePart:
-    """Return the part with splines along its outline."""
-    return replace(part, shape=make_shape(part.outline, part.tolerance), sides=None)
-
-
-def cut(outline: Outline, centres: Sequence[np.ndarray], least: float) -> Outline:
-    """Return an outline whose necks are wide enough, and its concave corners round, by material.
-
-    Necks get discs as wide as the smallest member, corners that the tool does not reach are filled.
-
-    Args:
-        outline: as drawn.
-        centres: of arcs of the tool that it has already, m.
-        least: smallest width of members, m.
-    """
-    import shapely
-
-    domain, chord = outline.domain, outline.chord
-    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
-    polygon, inner = outline.polygon, arm.buffer(-0.5 * least)
-    for _ in range(DISCS):
-        rough = polygon.simplify(ROUGH * domain.cell)
-        narrow = narrowest_within(rough, domain.cell, NARROW * least)
-        if narrow is None or inner.is_empty:
-            break
-        middle = shapely.shortest_line(inner, shapely.Point(narrow.place)).coords[0]
-        disc = shapely.Point(middle).buffer(0.5 * least, quad_segs=ROUND)
-        polygon = polygon.union(disc)
-        if domain.symmetric:
-            polygon = polygon.union(shapely.affinity.scale(disc, yfact=-1.0, origin=(0.0, 0.0)))
-    closed, new = rounded(polygon, outline.rounding, chord)
-    polygon = max(polygons_of(closed.intersection(arm)), key=lambda one: one.area)
-    return replace(outline, polygon=polygon, centres=np.vstack([*centres, new]))
+    return PlanePart(domain, outline, sides, fine)
 
 
 def _count(number: int, name: str) -> str:

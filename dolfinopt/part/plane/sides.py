@@ -425,7 +425,7 @@ class Sides:
                 middle = 0.5 * (curve.start + curve.end)
                 sides.append(replace(side, point=middle) if side.free else side)
                 arc = at.get((i, k, True))
-                place = curve.start if arc is None else arc.centre
+                place = arc.centre if isinstance(arc, Arc) else curve.start
                 corners.append(replace(corner, place=place))
             loops.append(Loop(tuple(sides), tuple(corners)))
         return replace(self, loops=tuple(loops))

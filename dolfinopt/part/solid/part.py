@@ -318,7 +318,7 @@ def plate_part(domain: SolidDomain, flat: PlanePart) -> SolidPart:
     outline, t = flat.outline, flat.domain.thickness
     surface = _prism(flat.shape, t, 0.5 * flat.tolerance)
     lost = t * outline.islands_area
-    far = flat.shape.distance
+    far = flat.distance
     return SolidPart(domain, surface, outline.level, far, outline.islands, lost, flat)
 
 
