@@ -38,6 +38,8 @@ FIRST = 0.75  # of them, before a finer mesh has judged
 ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
 HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
 START_STEPS = 40  # of Newton's to the first outline that keeps all limits
+TRIED, FEW = 3, 4  # struts that are left out in trial, the most promising; steps of each
+MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Tell = Callable[[str], None]
@@ -365,7 +367,41 @@ class Descent:
         ending = self.search.run(most - self.done, self._told, self.done)
         self.done, self.search.steps = self.done + self.search.steps, 0
         self.state = self.search.best
+        while self.best is None and self.done < most and self._without_struts(most):
+            pass
         return ending
+
+    def _without_struts(self, most: int) -> bool:
+        """Go on from the best state without a strut, if a few steps make one that is better."""
+        promised = []
+        plain = replace(self.problem, local={})
+        for k, one in self.state.outlines.items():
+            for other in one.without_struts() if isinstance(one, FreeSides) else ():
+                try:
+                    tried = plain.evaluated(
+                        {**self.state.outlines, k: other}, {}, self.state.solutions
+                    )
+                except (ConvergenceError, InputError):
+                    continue
+                missed = np.maximum(tried.values[1:], 0.0).max(initial=0.0)
+                promised.append((tried.values[0] + MISSED * abs(tried.values[0]) * missed, tried))
+        promised.sort(key=lambda one: one[0])
+        for _, tried in promised[:TRIED]:
+            search = SidesSearch(plain, tried)
+            search.run(min(FEW, most - self.done), lambda _: None, self.done)
+            self.done += search.steps
+            if search.best.rank[0] <= self.state.rank[0] and (
+                search.best.rank[1] < self.state.rank[1] - GAIN * abs(self.state.values[0])
+            ):
+                self.tell("better without a strut")
+                self.search = SidesSearch(search.problem, search.best)
+                self.search.run(most - self.done, self._told, self.done)
+                self.done, self.search.steps = self.done + self.search.steps, 0
+                self.state = self.search.best
+                return True
+            if self.done >= most:
+                return False
+        return False
 
     def _begun(self, state: State) -> SidesSearch | SurfaceSearch:
         if all(isinstance(one, FreeSides) for one in state.outlines.values()):

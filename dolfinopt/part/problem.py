@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -13,6 +13,8 @@ from scipy.spatial import cKDTree
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import BodyMesh, PlateMesh
 from dolfinopt.part.part import Part, PartMesh
+from dolfinopt.part.plane.free_sides import FreeSides
+from dolfinopt.part.solid.free_surface import FreeSurface
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
@@ -33,52 +35,7 @@ ALLOWED = (
 LEAST_FINE, MOST_FINE = 0.9, 1.3  # stress of a place on a finer mesh over that on this one
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
-
-
-class FreeForm(Protocol):
-    """The sides or the surface of one part as variables x, m."""
-
-    @property
-    def part(self) -> Any:
-        """That it was made of, with the domain of its arm."""
-
-    @property
-    def current(self) -> Part:
-        """The part with this form."""
-
-    @property
-    def made(self) -> Part:
-        """The part with this form, and what is measured of it."""
-
-    @property
-    def count(self) -> int:
-        """Number of variables."""
-
-    @property
-    def size(self) -> float:
-        """Area of a plate, m2, or volume, m3."""
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What `restored` makes it of."""
-
-    def restored(self, arrays: Mapping[str, np.ndarray]) -> Any:
-        """Return the form of these `arrays`, of one that this has become."""
-
-    def scaled(self, part: Any, factors: np.ndarray) -> Any:
-        """Return the form of an arm that repeats this one's design; factors of its sizes."""
-
-    def meshed(self, coarser: float, finer: Sequence[np.ndarray]) -> tuple[Any, PartMesh]:
-        """Return a new mesh of it, and it: variables may be others then."""
-
-    def followed(self, mesh: Any) -> PartMesh | None:
-        """Return the mesh of a form nearby, moved to this one; None where it folds."""
-
-    def by_x(self, mesh: Any, by_nodes: np.ndarray) -> np.ndarray:
-        """Return derivatives (m, count) by x from those (m, n, d) by the nodes of its mesh."""
-
-    def size_by_x(self) -> np.ndarray:
-        """Return the derivative (count,) of the size by x."""
+FreeForm = FreeSides | FreeSurface  # of one part: variables x, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +54,7 @@ class State:
     """
 
     outlines: Mapping[int, FreeForm]
-    bodies: Mapping[int, PartMesh]
+    bodies: Mapping[int, Any]
     simulated: Simulated
     limits: tuple[Limit, ...]
     smooth: np.ndarray
@@ -160,7 +117,7 @@ class Problem:
     """
 
     scene: Scene
-    parts: Mapping[int, Part]
+    parts: Mapping[int, Any]
     tightened: Mapping[str, float]
     hot: Mapping[int, list[np.ndarray]] = field(default_factory=dict)
     by_places: bool = False
@@ -208,7 +165,8 @@ class Problem:
         for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
-        limit, places, owners = self.scene.constraints.limit(STRESS), dict[Place, float](), {}
+        limit, owners = self.scene.constraints.limit(STRESS), dict[int, np.ndarray]()
+        places: dict[Place, float] = {}
         if limit is not None and self.by_places:
             places, owners = self._places(simulated, every, bodies, limit)
         elif limit is not None:
@@ -219,12 +177,12 @@ class Problem:
             rows.append((one, smooth, limit * smooth / true / self._factor(one)))
         known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
         shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
-        numbers = (np.array(one, dtype=float) for one in (smooths, held, shares))
-        if places:
+        smooth, most, areas = (np.array(one, dtype=float) for one in (smooths, held, shares))
+        if places and limit is not None:
             worst = max(places.values())
             true = (1.0 + worst) * limit / self._factor(Limit(STRESS, "", 0.0, limit, "Pa"))
             known = (*known, Limit(STRESS, "", true, limit, "Pa"))
-        return State(outlines, bodies, simulated, tuple(known), *numbers, places, owners)
+        return State(outlines, bodies, simulated, tuple(known), smooth, most, areas, places, owners)
 
     def _places(
         self,

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import cast
 
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.merit import judge_step
+from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.sides import BrokenError
 from dolfinopt.part.problem import Place, Problem, State
 from dolfinopt.part.program import solve
@@ -32,6 +33,7 @@ HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, step
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
 HARDLY = 1e-5  # relative fall that a step must promise
+SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
 PATIENCE = 3  # times that no step betters the parts on a mesh, before the search ends
 
 Tell = Callable[[str], None]
@@ -104,6 +106,11 @@ class Step:
     fall: float
 
 
+def sides_of(state: State) -> Mapping[int, FreeSides]:
+    """Return the forms of a state, all of which are sides."""
+    return cast(Mapping[int, FreeSides], state.outlines)
+
+
 class SidesSearch:
     """Steps within a trust region from one state on.
 
@@ -147,6 +154,8 @@ class SidesSearch:
 
     def _mesh_anew(self) -> None:
         """Go on with new meshes; the state on them may be the best one."""
+        if self.falls and len(self.falls) % SIMPLER == 0:
+            self._simplify()
         try:
             self.problem, self.state = self.problem.calibrated(self.state)
         except (ConvergenceError, InputError):  # sides that all but touch
@@ -159,6 +168,23 @@ class SidesSearch:
         if not self.falls or self.state.rank <= self.best.rank:
             self.best = self.state.released
         self.falls.append(self.best.values[0])
+
+    def _simplify(self) -> None:
+        """Go on without sides that have vanished and holes that close, if that costs little."""
+        for k, one in sides_of(self.state).items():
+            simpler, count = one.simplified()
+            if not count:
+                continue
+            plain = replace(self.problem, local={})
+            try:
+                found = plain.evaluated(
+                    {**self.state.outlines, k: simpler}, {}, self.state.solutions
+                )
+            except (ConvergenceError, InputError):
+                continue
+            cost = self._merit(found, found) - self._merit(self.state, self.state)
+            if cost < WORSE * np.sqrt(count) * abs(self.state.values[0]):
+                self.problem, self.state, self.before = plain, found, None
 
     def _settled(self) -> bool:
         if len(self.falls) < 3 or self.best.values[1:].max(initial=0.0) > 5.0 * EXCESS:
@@ -239,7 +265,7 @@ class SidesSearch:
     def _linear(self, state: State, slopes: np.ndarray) -> Linear:
         """Return the limits that a step of this radius can meet."""
         reach, far, A, b, first = self.radius * FAR, [], [], [], 0
-        for one in state.outlines.values():
+        for one in sides_of(state).values():
             g, own = one.rows()
             near = g > -reach * one.cell * np.abs(own).sum(axis=1) - 0.1 * one.cell
             wide = np.zeros((int(near.sum()), slopes.shape[1]))
@@ -325,9 +351,9 @@ class SidesSearch:
 
     def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
         """Return the state after a step, the whole step, and whether its meshes are new."""
-        first, after, whole = 0, dict[int, Any](), []
+        first, after, whole = 0, dict[int, FreeSides](), []
         try:
-            for k, one in state.outlines.items():
+            for k, one in sides_of(state).items():
                 part = x[first : first + one.count]
                 first += one.count
                 near = one.moved(part).nearest()
@@ -337,9 +363,9 @@ class SidesSearch:
                 whole.append(part + near[1])
             every = self.problem.every(after)
             bodies = {k: one.followed(state.bodies[k]) for k, one in every.items()}
-            anew = any(body is None for body in bodies.values())
-            given = {} if anew else bodies
-            found = self.problem.evaluated(after, given, state.solutions)
+            followed = {k: body for k, body in bodies.items() if body is not None}
+            anew = len(followed) < len(bodies)
+            found = self.problem.evaluated(after, {} if anew else followed, state.solutions)
         except (BrokenError, ConvergenceError, InputError):
             return None
         return found, np.concatenate(whole), anew

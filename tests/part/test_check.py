@@ -211,7 +211,7 @@ def test_parts_of_a_design(tmp_path):
         design[name] = 1.0 * ((np.abs(y) > 0.015) | (np.abs(x - 0.5) < 0.06))
     parts = model.make_parts(design, tmp_path / "parts", tolerance=1e-3)
     for part in parts.values():
-        assert part.shape.area == pytest.approx(part.domain.volume, rel=1e-6)
+        assert part.shape.area == pytest.approx(part.domain.volume, rel=1e-4)
         assert len(part.shape.loops) == 3
     assert (tmp_path / "parts" / "arm2.step").exists()
     with pytest.raises(InputError, match="holds results already"):

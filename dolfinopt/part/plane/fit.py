@@ -69,9 +69,11 @@ class Drawn:
         """Return the mirror image about y = 0, run through with the material to the left."""
         return Drawn(self.side.mirrored(), self.end * MIRROR, self.start * MIRROR)
 
-    def named(self, **names: int) -> Drawn:
-        """Return it with other names."""
-        return replace(self, side=replace(self.side, **names))
+    def named(self, key: int = -1, twin: int = -1) -> Drawn:
+        """Return it with other names where they are given."""
+        key = self.side.key if key < 0 else key
+        twin = self.side.twin if twin < 0 else twin
+        return replace(self, side=replace(self.side, key=key, twin=twin))
 
 
 @dataclass(frozen=True, eq=False)

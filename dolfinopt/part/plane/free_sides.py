@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -10,16 +10,20 @@ from itertools import pairwise
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
 from dolfinopt.part.plane.curves import Line
 from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides, angle_of, left, unit
+from dolfinopt.part.plane.simpler import simplifications, without_struts
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
+MOST = 40  # sides and holes that go at once, at most
+FAR_STEPS = 40  # of Newton's to an outline without a strut
 WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
-Mesh = BodyMesh | PlateMesh
+Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +84,25 @@ class FreeSides:
         """Return what must not be positive (m,), m, and its derivatives (m, count)."""
         return self.limits.rows(self.sides)
 
+    def simplified(self) -> tuple[FreeSides, int]:
+        """Return it without what its limits hold at its least, and how many such things went."""
+        made = self
+        for number in range(MOST):
+            for sides in simplifications(made.sides, self.limits, self.part.domain.outer_edges):
+                found = replace(made, sides=sides).nearest()
+                if found is not None and found[0].count < made.count:
+                    made = found[0]
+                    break
+            else:
+                return made, number
+        return made, MOST
+
+    def without_struts(self) -> Iterator[FreeSides]:
+        """Yield it without one of its struts, the thinnest first."""
+        for sides in without_struts(self.sides, self.limits, self.part.domain.outer_edges):
+            if (found := replace(self, sides=sides).nearest(FAR_STEPS)) is not None:
+                yield found[0]
+
     def moved(self, x: np.ndarray) -> FreeSides:
         """Return it after a step x.
 
@@ -104,6 +127,7 @@ class FreeSides:
             if not isinstance(face, BodyMesh):
                 return None
             return replace(extruded(face, mesh.thickness, mesh.layers), further=mesh.further)
+        assert isinstance(mesh, BodyMesh)
         if len(mesh.shape.pieces) != len(self.sides.shape.pieces):
             return None
         found = mesh.morphed(self.sides.shape)
@@ -114,6 +138,7 @@ class FreeSides:
         if isinstance(mesh, PlateMesh):
             flat = np.array([mesh.at_face(row) for row in by_nodes])
             return self.by_x(mesh.face, flat)
+        assert isinstance(mesh, BodyMesh)
         g = mesh.at_outline(by_nodes)
         found = np.zeros((len(g), self.sides.numbers[0]))
         for number, one in enumerate(self.sides.placed):

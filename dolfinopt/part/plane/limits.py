@@ -136,7 +136,11 @@ class Limits:
         place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
         apart = ~_together(every, sides)[number[place], other]
         place, other = place[apart], other[apart]
-        where, near, back = _closest([one.piece.curve for one in every], other, at[place])
+        where, near, back = _closest(
+            [one.piece.curve for one in every if not isinstance(one.piece.curve, Spline)],
+            other,
+            at[place],
+        )
         v = near - at[place]
         width = np.linalg.norm(v, axis=1)
         cosines = (v * out[place]).sum(axis=1), (v * back).sum(axis=1)

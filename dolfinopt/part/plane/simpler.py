@@ -57,7 +57,7 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
 def without_struts(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
     """Yield the outline without one of its thin struts, the thinnest first."""
     lines, done = _lines(sides), set[frozenset[int]]()
-    for width, a, b in facing(sides, SLENDER * limits.member):
+    for _, a, b in facing(sides, SLENDER * limits.member):
         (i, k), (j, m) = lines[a][:2], lines[b][:2]
         twins = {sides.loops[i].sides[k].twin, sides.loops[j].sides[m].twin}
         name = frozenset((a, b)) | twins
@@ -65,8 +65,9 @@ def without_struts(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
             continue
         done.add(name)
         found = _spliced(sides, a, b, limits, outer)
-        if found is not None and len(twins - {-1}) == 2 and twins != {a, b}:
-            found = _spliced(found, *twins, limits, outer)
+        one, other = twins if len(twins) == 2 else (-1, -1)
+        if found is not None and min(one, other) >= 0 and twins != {a, b}:
+            found = _spliced(found, one, other, limits, outer)
         if found is not None:
             yield found
 
@@ -106,7 +107,7 @@ def facing(sides: Sides, widest: float) -> list[tuple[float, int, int]]:
 
     The first of two is one that moves.
     """
-    found = {}
+    found = dict[frozenset[int], tuple[float, int, int]]()
     lines = _lines(sides)
     for a, (i, k, one) in lines.items():
         if not sides.loops[i].sides[k].free:

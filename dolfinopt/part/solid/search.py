@@ -7,6 +7,7 @@ f0 + c sum_i max(0, f_i), and is taken if the merit falls as promised, see `opti
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import cast
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from dolfinopt.optimization.measured import LIMIT_PRICE
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.part.merit import judge_step, merit
 from dolfinopt.part.problem import Problem, State
+from dolfinopt.part.solid.free_surface import FreeSurface
 from dolfinopt.responses.constraints import EXCESS
 
 FARTHEST = 0.2  # cells that a node moves in a step, at most
@@ -23,6 +25,11 @@ SETTLED, PATIENCE = 1e-3, 6  # relative fall of the objective in so many steps t
 FIRST, WIDEST = 0.5, 1.0  # first and largest distance of the asymptotes, ranges of a variable
 
 Tell = Callable[[str], None]
+
+
+def surfaces_of(state: State) -> Mapping[int, FreeSurface]:
+    """Return the forms of a state, all of which are surfaces."""
+    return cast(Mapping[int, FreeSurface], state.outlines)
 
 
 class SurfaceSearch:
@@ -98,7 +105,7 @@ class SurfaceSearch:
         self.state = self.state.released  # for the matrices of those that are tried
         before = self.state
         price = LIMIT_PRICE * (abs(before.values[0]) or 1.0)
-        room = {k: one.room() for k, one in before.outlines.items()}
+        room = {k: one.room() for k, one in surfaces_of(before).items()}
         while self.radius >= LEAST_RADIUS:
             x, after = self._proposed(slopes, price, room)
             tried = self._tried(x, room)
@@ -164,7 +171,7 @@ class SurfaceSearch:
     ) -> State | None:
         """Return what a step leads to; None where its outlines cannot be parts."""
         outlines, first = {}, 0
-        for k, one in self.state.outlines.items():
+        for k, one in surfaces_of(self.state).items():
             s = one.filtered(x[first : first + one.count] - self.x[first : first + one.count])
             first += one.count
             outlines[k] = one.moved(np.clip(s, -room[k][0], room[k][1]))
@@ -181,5 +188,5 @@ class SurfaceSearch:
 
     def _is_worn(self) -> bool:
         """Whether meshes have followed too many steps."""
-        forms, bodies = self.state.outlines, self.state.bodies
+        forms, bodies = surfaces_of(self.state), self.state.bodies
         return any(self.morphed >= o.STEPS or o.is_worn(bodies[k]) for k, o in forms.items())
