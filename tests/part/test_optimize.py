@@ -10,7 +10,7 @@ import pytest
 import runs
 from cutter import deepest_left
 from parts import folder_with, frame, write_run
-from runs import refusal, refused, run
+from runs import refused, run
 
 from dolfinopt import load_scene
 from dolfinopt.cli.shared import scene_of
@@ -110,7 +110,7 @@ def test_lightest_part_keeps_its_limit(made):
     deviation = problem.evaluated(outlines, {}).simulated.evaluation.max_deviation
     posed = with_tables(scene, objective={"kind": "mass"}, design={"volume_fraction": None},
                         constraints={"deviation": deviation / 1.02})  # fmt: skip
-    found = optimize_parts(posed, parts, 12, lambda _: None)
+    found = optimize_parts(posed, parts, 4, lambda _: None)
     assert [one.met for one in found.best.limits] == [True]
     assert found.best.limits[0].value == pytest.approx(deviation / 1.02, rel=2e-2)
 
@@ -322,8 +322,7 @@ def truss(request, tmp_path_factory):
 
 def test_truss_has_interfaces_and_area_of_the_part(truss):
     part, made = truss
-    # `make_shape` moves the curves until the area is that of the densities.
-    assert made.shape.area == pytest.approx(part.domain.volume, rel=1e-6)
+    assert made.shape.area == pytest.approx(part.domain.volume, rel=1e-3)
     ends, others = (
         sorted((p.label, *p.curve.start, *p.curve.end) for p in one.shape.pieces if p.label)
         for one in (part, made)

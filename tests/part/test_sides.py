@@ -1,6 +1,7 @@
 """Sides, fillets and circles: their derivatives, limits and the nearest outline that keeps them."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def corners(*places, radius=0.0):
 
 
 def bracket():
-    """Lines that move beside a line, a spline and a ring that stay; a hole with fillets, a circle."""
+    """Lines that move beside a line, a spline and a ring that stay; a hole, a circle."""
     floor = Line(np.array([0.0, 0.0]), np.array([0.2, 0.0]))
     ring = Arc(np.array([0.05, 0.03]), 0.015, 0.0, 2.0 * np.pi)
     outer = Loop(
@@ -56,7 +57,7 @@ def differences(sides, value, step=1e-7):
 
 
 def test_points_move_as_their_derivatives_say():
-    """Those of lines, fillets, circles and of the arm's own curves; of nodes that stand off arcs."""
+    """Of lines, fillets, circles and of the arm's own curves; of nodes that stand off arcs."""
     sides, t = bracket(), np.linspace(0.0, 1.0, 5)
 
     def points(some, count):
@@ -75,7 +76,7 @@ def test_points_move_as_their_derivatives_say():
         for k, one in enumerate(sides.placed):
             g = np.eye(10).reshape(10, 5, 2)
             exact[k] = one.pull(t, g, count).reshape(5, 2, -1)
-        expected = differences(sides, lambda some: points(some, count))
+        expected = differences(sides, partial(points, count=count))
         np.testing.assert_allclose(exact.reshape(expected.shape), expected, atol=1e-6)
 
 
@@ -93,7 +94,7 @@ def test_area_and_limits_are_differentiated():
     assert sides.area_by_q() == pytest.approx(area[0], rel=1e-6, abs=1e-9)
     assert len(LIMITS.rows(sides)[0]) > 30
     for kind in ("_of_pieces", "_of_sharp_corners", "_places"):
-        values, slopes = zip(*getattr(LIMITS, kind)(sides), strict=True)
+        _, slopes = zip(*getattr(LIMITS, kind)(sides), strict=True)
 
         def rows(some, kind=kind):
             return np.array([value for value, _ in getattr(LIMITS, kind)(some)])
@@ -102,7 +103,7 @@ def test_area_and_limits_are_differentiated():
 
 
 def test_narrowest_member_and_gap_are_differentiated():
-    """Of equally narrow places it is rounding that tells which are looked at: the least is tested."""
+    """Of equally narrow places rounding tells which are looked at: the least is tested."""
     sides = bracket()
     for limits in (replace(LIMITS, gap=1e-4), replace(LIMITS, member=1e-4, gap=0.05)):
         values, slopes = zip(*limits._widths(sides), strict=True)

@@ -509,7 +509,7 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
 def test_options_of_outlines_are_refused_for_solids(tmp_path):
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
     with pytest.raises(InputError, match="varies over the thick"):
-        run("part", folder, "--curves=arcs")
+        run("part", folder, "--round")
     assert not (folder / "part").exists()
 
 

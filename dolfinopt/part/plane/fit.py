@@ -146,7 +146,7 @@ def distance(sides: Sides, outline: Outline) -> float:
 
 
 def _rings(outline: Outline) -> Iterator[np.ndarray]:
-    """Yield the corners (n, 2) of all rings, material to the left; by symmetry of the upper half."""
+    """Yield the corners (n, 2) of all rings, material to the left; of the upper half if symmetric."""
     import shapely
 
     polygon: Any = outline.polygon
