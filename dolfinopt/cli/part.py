@@ -165,6 +165,8 @@ def part(
                     kept.remove()
     if world.rank == 0:
         made.tell(target)
+        if made.meshes is None:
+            raise ConvergenceError("a part cannot be meshed: there is no part.toml")
         if made.shape is not None and made.shape.interrupted:
             raise KeyboardInterrupt(
                 f"the best parts so far are in {target}; to go on, add --resume"

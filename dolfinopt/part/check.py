@@ -431,7 +431,8 @@ class Check:
         """What makes the figures doubtful, a sentence each."""
         found = []
         softer = _ratio(self.part.values["compliance"], self.density.values["compliance"]) - 1.0
-        if softer > LOST:
+        aimed = self.before is not None and bool(self.part.limits)
+        if softer > LOST and not (aimed and all(one.met for one in self.part.limits)):
             found.append(
                 f"the machine with the parts is {100.0 * softer:.2g} % softer than with the "
                 "densities; see part.png, and make the design crisp (design.projection) or its "

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.measured import GREY
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import BodyMesh, body_mesh
@@ -115,13 +114,7 @@ class PlanePart:
         """What the workshop or the designer should know, a sentence each."""
         one, outline = self.domain, self.outline
         found = []
-        if one.grayness > GREY:
-            found.append(
-                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
-                "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust" until '
-                "it is crisp"
-            )
+        found += one.gray_words
         if one.crisp:
             found.append(
                 f"arm {one.name!r}: design.npz does not tell what its densities were projected "

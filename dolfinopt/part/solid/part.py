@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
@@ -197,13 +196,7 @@ class SolidPart:
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
         one, found = self.domain, []
-        if one.grayness > GREY:
-            found.append(
-                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
-                "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust" until '
-                "it is crisp"
-            )
+        found += one.gray_words
         if self.pieces:
             pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
             share = 100.0 * self.pieces_volume / one.volume
