@@ -125,12 +125,15 @@ class SidesSearch:
         """Begin at a state."""
         self.problem, self.state, self.best = problem, state, state.released
         self.passed = [dict(state.outlines)]
-        self.steps, self.since, self.lost, self.spent = 0, FOLLOWED, 0, False
+        # Without stress there is nothing that a finer mesh of the first state would tell.
+        self.since, self.falls = FOLLOWED, list[float]()
+        if not state.places:
+            self.since, self.falls = 0, [float(self.best.values[0])]
+        self.steps, self.lost, self.spent = 0, 0, False
         self.radius, self.price = FIRST_RADIUS, PRICE
         self.H = np.zeros((0, 0))
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}
         self.before: tuple[Step, Linear] | None = None
-        self.falls: list[float] = []
 
     def run(self, iterations: int, tell: Tell, first: int) -> str:
         """Take so many steps at most; return why the search ended."""

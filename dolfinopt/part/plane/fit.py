@@ -45,6 +45,7 @@ SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
 SMALLEST = 3.0  # area of a hole, squared cells or tool radii
 ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
+SAME_AREA = 1e-3  # relative
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
 CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
@@ -98,17 +99,17 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     """
     thin = replace(limits, member=min(limits.member, THIN * limits.cell))
     for kept in (limits, thin):  # what is thinner than asked for is told
-        best: Sides | None = None
+        found = []
         for share in ATTEMPTS:
             made = _made(outline, kept, share * tolerance, area)
             if made is None:
                 continue
-            if best is None or distance(made, outline) < distance(best, outline):
-                best = made
-            if distance(best, outline) <= tolerance:
-                return best
-        if best is not None:
-            return best
+            off = abs(made.shape.area / area - 1.0)
+            found.append((off if off > SAME_AREA else 0.0, distance(made, outline), made))
+            if found[-1][0] == 0.0 and found[-1][1] <= tolerance:
+                break
+        if found:
+            return min(found, key=lambda one: one[:2])[2]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
@@ -556,7 +557,7 @@ def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
     """Return the number of the side to leave out, and whether the one before takes its place."""
     places, turns = _vertices(drawn, REACH * limits.cell)
     need = [limits.tool * np.tan(min(-turn / 2.0, 1.4)) if turn < 0.0 else 0.0 for turn in turns]
-    worst, least, merges = None, 0.0, False
+    worst, least, merges = None, np.inf, False
     for k, one in enumerate(drawn):
         j = (k + 1) % len(drawn)
         before, after = drawn[k - 1].side, drawn[j].side
@@ -564,17 +565,17 @@ def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
             continue
         step = places[j] - places[k]
         room = float(step @ unit(one.side.angle) if one.side.free else np.linalg.norm(step))
-        room -= need[k] + need[j]
-        room -= LEAST * limits.cell
-        if np.isnan([turns[k], turns[j]]).any():  # it does not meet its neighbour
-            room = min(room, -limits.cell)
-        if any(abs(turns[i]) > SPIKE for i in (k, j)):  # a strut that ends nowhere
-            room = min(room, -2.0 * limits.cell)
+        room -= need[k] + need[j] + LEAST * limits.cell
+        meets = not np.isnan([turns[k], turns[j]]).any()
+        is_end = any(turns[i] > SPIKE for i in (k, j))  # of a strut that ends nowhere
         both = before.free and one.side.free and one.side.twin != before.key
         straight = both and abs(turns[k]) < 2.0 * TURN
-        room = -np.inf if straight else room
-        if room < least:
-            worst, least, merges = k, float(room), straight
+        if room >= 0.0 and meets and not is_end and not straight:
+            continue
+        # The shortest one: where two sides do not meet well, a long one looks turned round.
+        size = 0.0 if straight else float(np.linalg.norm(one.end - one.start))
+        if size < least:
+            worst, least, merges = k, size, straight
     return worst, merges
 
 
