@@ -210,6 +210,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 TURN = 0.2  # of the outline along a side of a cell, rad
+PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
 WALL = 1.0  # side of a cell over the width of the member
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
@@ -221,7 +222,11 @@ OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
 def body_mesh(
-    shape: Shape, cell: float, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()
+    shape: Shape,
+    cell: float,
+    coarser: float = 1.0,
+    finer: Sequence[np.ndarray] = (),
+    turn: float = TURN,
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -230,14 +235,15 @@ def body_mesh(
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near each of which sides are halved, once for every array.
+        turn: of the outline along a side, rad.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = [coarser * size for size in _sizes(shape, samples, cell, finer)]
+    sizes = [coarser * size for size in _sizes(shape, samples, cell, finer, turn)]
     for _ in range(FINER):
-        outline = _outline(shape, samples, sizes, coarser * TURN)
+        outline = _outline(shape, samples, sizes, coarser * turn)
         if outline.is_simple:  # Gmsh would end the process
             points, triangles = _triangulated(outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
@@ -318,7 +324,11 @@ def _sampled(curve: Curve, spacing: float) -> np.ndarray:
 
 
 def _sizes(
-    shape: Shape, samples: Sequence[np.ndarray], cell: float, finer: Sequence[np.ndarray]
+    shape: Shape,
+    samples: Sequence[np.ndarray],
+    cell: float,
+    finer: Sequence[np.ndarray],
+    turn: float,
 ) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
@@ -327,7 +337,7 @@ def _sizes(
     bend = np.abs(np.concatenate([curvature(c, t) for c, t in zip(curves, samples, strict=True)]))
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
-    size = np.minimum(WALL * wall, TURN / np.maximum(bend, 1e-9 / cell))
+    size = np.minimum(WALL * wall, turn / np.maximum(bend, 1e-9 / cell))
     size = np.clip(size, SMALLEST * cell, LARGEST * cell)
     for places in finer:
         away = cKDTree(places).query(points)[0]
@@ -530,7 +540,8 @@ class PlateMesh(Tetrahedra):
 
 def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     thickness = flat.domain.thickness
-    return extruded(flat.mesh(size / flat.domain.cell), thickness, max(1, round(thickness / size)))
+    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell, turn=PLATE_TURN)
+    return extruded(face, thickness, max(1, round(thickness / size)))
 
 
 def extruded(face: BodyMesh, thickness: float, layers: int) -> PlateMesh:

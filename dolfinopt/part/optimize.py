@@ -10,6 +10,7 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, cast
@@ -20,6 +21,7 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import part_column, refined, simulate_parts
 from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
+from dolfinopt.part.plane.fit import fitted_sides
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
@@ -37,6 +39,7 @@ ITERATIONS = 80  # default, at most, from every start
 FIRST = 0.75  # of them, before a finer mesh has judged
 ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
 HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
+START = 0.8  # distance of the first sides from the densities' outline, cells
 START_STEPS = 40  # of Newton's to the first outline that keeps all limits
 TRIED, FEW = 3, 4  # struts that are left out in trial, the most promising; steps of each
 MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
@@ -204,7 +207,11 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
             flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
         )
         solid = part.domain if isinstance(part, SolidPart) else None
-        made = FreeSides(flat, flat.sides, limits, solid)
+        sides = flat.sides
+        with suppress(InputError):  # fewer sides than a drawing has: they will move anyway
+            away = START * flat.domain.cell
+            sides = fitted_sides(flat.outline, limits, away, flat.sides.shape.area)
+        made = FreeSides(flat, sides, limits, solid)
         found = made.nearest(START_STEPS)
         return made if found is None else found[0]
     if not isinstance(part, SolidPart):

@@ -66,7 +66,7 @@ def test_what_is_not_free_stays_and_symmetry_holds(made):
 
 
 def slopes_and_differences(problem, form, step):
-    """Return derivatives (1 + m, k) along a few directions, and differences on meshes that follow."""
+    """Return derivatives (1 + m, k) along some directions, and differences on such meshes."""
     state = problem.evaluated({0: form}, {})
     keys = sorted(state.places, key=lambda key: -state.places[key])[:2]
     slopes = np.vstack([problem.slopes(state), *problem.stress_slopes(state, keys)])

@@ -46,6 +46,7 @@ UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it th
 SMALLEST = 3.0  # area of a hole, squared cells or tool radii
 ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
 SAME_AREA = 1e-3  # relative
+WORTH = 0.8  # of a distance from the outline, below which more sides come into question
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
 CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
@@ -99,17 +100,20 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     """
     thin = replace(limits, member=min(limits.member, THIN * limits.cell))
     for kept in (limits, thin):  # what is thinner than asked for is told
-        found = []
+        best: tuple[float, float, Sides] | None = None
         for share in ATTEMPTS:
             made = _made(outline, kept, share * tolerance, area)
             if made is None:
                 continue
             off = abs(made.shape.area / area - 1.0)
-            found.append((off if off > SAME_AREA else 0.0, distance(made, outline), made))
-            if found[-1][0] == 0.0 and found[-1][1] <= tolerance:
+            one = off if off > SAME_AREA else 0.0, distance(made, outline), made
+            # More sides must be worth their number.
+            if best is None or (one[0], one[1]) < (best[0], WORTH * best[1]):
+                best = one
+            if best[0] == 0.0 and best[1] <= tolerance:
                 break
-        if found:
-            return min(found, key=lambda one: one[:2])[2]
+        if best is not None:
+            return best[2]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
@@ -147,7 +151,7 @@ def distance(sides: Sides, outline: Outline) -> float:
 
 
 def _rings(outline: Outline) -> Iterator[np.ndarray]:
-    """Yield the corners (n, 2) of all rings, material to the left; of the upper half if symmetric."""
+    """Yield the corners (n, 2) of all rings, material to the left; of upper halves by symmetry."""
     import shapely
 
     polygon: Any = outline.polygon
