@@ -431,8 +431,9 @@ class Filled:
             return []
         return [
             f"arm {self.name!r}: grayness {self.grayness:.2g}: {100.0 * self.gray_share:.0f} % of "
-            "the material is in cells that are neither solid nor void; the part is another design than "
-            'the optimised one; with design.projection = "robust", more iterations make it crisp'
+            "the material is in cells that are neither solid nor void; the part is another design "
+            'than the optimised one; with design.projection = "robust" more iterations make it '
+            "crisp"
         ]
 
 

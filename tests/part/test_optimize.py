@@ -110,8 +110,9 @@ def test_lightest_part_keeps_its_limit(made):
     deviation = problem.evaluated(outlines, {}).simulated.evaluation.max_deviation
     posed = with_tables(scene, objective={"kind": "mass"}, design={"volume_fraction": None},
                         constraints={"deviation": deviation / 1.02})  # fmt: skip
-    found = optimize_parts(posed, parts, 4, lambda _: None)
-    assert [one.met for one in found.best.limits] == [True]
+    lines = []
+    found = optimize_parts(posed, parts, 8, lines.append)
+    assert [one.met for one in found.best.limits] == [True], lines
     assert found.best.limits[0].value == pytest.approx(deviation / 1.02, rel=2e-2)
 
 
@@ -173,7 +174,8 @@ def test_killed_search_goes_on(made):
     assert end.done == STEPS and end.ending == found.best.ending
     lines.clear()
     known = optimize_parts(scene, parts, STEPS, lines.append, known=again[-1])
-    assert not lines and known.best.value == pytest.approx(found.best.value, rel=1e-9)
+    # Meshes are finer where the judge found stress to be largest.
+    assert not lines and known.best.value == pytest.approx(found.best.value, rel=1e-5)
 
 
 def test_command_goes_on(tmp_path, monkeypatch):

@@ -181,7 +181,8 @@ class FreeSides:
         for k in range(len(circles)):
             at = self.sides.of_circles + 3 * k
             ratio[at : at + 2] = factors
-        made = replace(self.sides, loops=tuple(loops), circles=circles).centred()
+        # Not centred: its sides turn about the images of the other's middles.
+        made = replace(self.sides, loops=tuple(loops), circles=circles)
         return replace(self, part=part, sides=made, repeated=ratio[:, None] * self.sides.ties)
 
     # -- what a killed search goes on from ---------------------------------------------------
