@@ -32,6 +32,7 @@ SETTLED = 2e-3  # relative fall of the objective on two new meshes that ends the
 HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, steps that rows hold
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
+FALLS = 0.8  # what is left of a missed limit after a step, above which its price doubles
 HARDLY = 1e-5  # relative fall that a step must promise
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
 PATIENCE = 3  # times that no step betters the parts on a mesh, before the search ends
@@ -238,8 +239,8 @@ class SidesSearch:
         dual /= abs(state.values[0])
         if dual < 0.5 * self.price:  # a price far above the multipliers makes steps short
             self.price = min(self.price, max(OVER * dual, 0.7 * self.price, LEAST_PRICE))
-        missed = step.state.values[1:].max(initial=0.0)
-        if missed > 5.0 * EXCESS and self.since + 1 >= FOLLOWED:
+        before, after = (one.values[1:].max(initial=0.0) for one in (state, step.state))
+        if after > max(5.0 * EXCESS, FALLS * before):  # it is worth more than it costs now
             self.price *= 2.0
         self.before = None if step.anew else (step, linear)
         self.since = 0 if step.anew else self.since + 1
