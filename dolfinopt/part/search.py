@@ -33,6 +33,7 @@ HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, step
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
 FALLS = 0.8  # what is left of a missed limit after a step, above which its price doubles
+ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
 HARDLY = 1e-5  # relative fall that a step must promise
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
 PATIENCE = 3  # times that no step betters the parts on a mesh, before the search ends
@@ -274,9 +275,16 @@ class SidesSearch:
             near = g > -reach * one.cell * np.abs(own).sum(axis=1) - 0.1 * one.cell
             wide = np.zeros((int(near.sum()), slopes.shape[1]))
             wide[:, first : first + one.count] = own[near]
-            first += one.count
             A.append(wide / one.cell)
             b.append(np.maximum(-g[near] / one.cell, 0.0))
+            # Corners that hardly turn go far where their sides do not.
+            ends = one.ends_by_x() / one.cell
+            ends = ends[np.abs(ends).sum(axis=1) * one.cell > ENDS]
+            wide = np.zeros((2 * len(ends), slopes.shape[1]))
+            wide[:, first : first + one.count] = np.vstack([ends, -ends])
+            first += one.count
+            A.append(wide)
+            b.append(np.full(len(wide), ENDS * reach))
             far.append(np.full(one.count, reach * one.cell))
         hot = {key: row for key, (row, _) in self.rows.items()}
         return Linear(slopes, hot, np.vstack(A), np.concatenate(b), np.concatenate(far))
