@@ -53,13 +53,11 @@ Say = Callable[[str], None]
 @click.option(
     "--curves",
     type=click.Choice(["splines", "arcs"]),
-    hidden=True,
     help="without effect: parts have lines, arcs and circles",
 )
 @click.option(
     "--simplify/--no-simplify",
     default=None,
-    hidden=True,
     help="without effect: sides are straight, with fillets between them",
 )
 @click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
