@@ -21,6 +21,7 @@ from mpi4py import MPI
 
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.output.design import ArmView, gather_views
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.folder import scene_data, toml_text
@@ -140,6 +141,9 @@ def _simulated(
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.order_selection import choose_coordinates
 
+    if scene.simulation.stiffening != "auto":  # nobody asks by how much
+        for arm in arms.values():
+            arm.set_stiffening(Stiffening(None, scene.simulation.stiffening))
     choose_coordinates(scene, partition, arms, x_phys, Profile())
     evaluation, trajectory = evaluate(scene, partition, arms, x_phys, Profile(), start)
     assert trajectory is not None  # on a single rank

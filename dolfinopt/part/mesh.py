@@ -226,7 +226,7 @@ def body_mesh(
     cell: float,
     coarser: float = 1.0,
     finer: Sequence[np.ndarray] = (),
-    turn: float = TURN,
+    turn: float | np.ndarray = TURN,
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -235,15 +235,16 @@ def body_mesh(
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near each of which sides are halved, once for every array.
-        turn: of the outline along a side, rad.
+        turn: of the outline along a side, rad; one for all pieces, or one each.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
+    turns = np.broadcast_to(turn, len(shape.pieces))
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = [coarser * size for size in _sizes(shape, samples, cell, finer, turn)]
+    sizes = [coarser * size for size in _sizes(shape, samples, cell, finer, turns)]
     for _ in range(FINER):
-        outline = _outline(shape, samples, sizes, coarser * turn)
+        outline = _outline(shape, samples, sizes, coarser * turns)
         if outline.is_simple:  # Gmsh would end the process
             points, triangles = _triangulated(outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
@@ -297,14 +298,14 @@ class _Outline:
 
 
 def _outline(
-    shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray], turn: float
+    shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray], turns: np.ndarray
 ) -> _Outline:
     loops, piece, span, spacing = [], [], [], []
     number = 0
     for loop in shape.loops:
         corners = []
         for one in loop:
-            t, h = _divided(one.curve, samples[number], sizes[number], turn)
+            t, h = _divided(one.curve, samples[number], sizes[number], turns[number])
             corners.append(one.curve.at(t[:-1]))
             piece.append(np.full(len(t) - 1, number))
             span.append(np.stack([t[:-1], t[1:]], axis=1))
@@ -328,7 +329,7 @@ def _sizes(
     samples: Sequence[np.ndarray],
     cell: float,
     finer: Sequence[np.ndarray],
-    turn: float,
+    turns: np.ndarray,
 ) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
@@ -337,6 +338,7 @@ def _sizes(
     bend = np.abs(np.concatenate([curvature(c, t) for c, t in zip(curves, samples, strict=True)]))
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
+    turn = np.repeat(turns, [len(t) for t in samples])
     size = np.minimum(WALL * wall, turn / np.maximum(bend, 1e-9 / cell))
     size = np.clip(size, SMALLEST * cell, LARGEST * cell)
     for places in finer:

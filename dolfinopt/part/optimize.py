@@ -17,6 +17,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import part_column, refined, simulate_parts
 from dolfinopt.part.folder import Forms, Saved
@@ -285,7 +286,9 @@ class Descent:
             problem = replace(problem, tightened=known.tightened)
             outlines, self.forms = _restored(outlines, known.forms), _restored(outlines, known.best)
             self.done = known.done
-        self.problem, self.state = problem, problem.evaluated(outlines, {})
+        self.state = problem.evaluated(outlines, {})
+        decided = stiffening_of(self.state.simulated.arms)
+        self.problem = replace(problem, stiffening=decided.on if decided else None)
         self.search = self._begun(self.state)
 
     def found(self, start: str) -> Found:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import BodyMesh, PlateMesh
 from dolfinopt.part.part import Part, PartMesh
-from dolfinopt.part.plane.free_sides import FreeSides
+from dolfinopt.part.plane.free_sides import COARSE, FreeSides
 from dolfinopt.part.solid.free_surface import FreeSurface
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
@@ -28,6 +28,7 @@ SIDES = 1.0  # of the triangles over those of the fine mesh
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
+FINE, FINEST = 0.2, 0.1  # rad, turn of the outline along a side of a mesh there
 NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
 ALLOWED = (
     0.05  # excess of a limit that a state may have for a better objective: a later step ends it
@@ -114,6 +115,8 @@ class Problem:
         hot: places of every part (n, 2), m, near which its mesh is finer, once for every array.
         by_places: whether stress is limited place by place.
         local: stress of a place on a finer mesh over that on this one.
+        turns: (n,) of all pieces of an arm's sides along a side of their mesh, rad.
+        stiffening: whether bodies have geometric stiffness; None: as the scene states.
     """
 
     scene: Scene
@@ -122,6 +125,8 @@ class Problem:
     hot: Mapping[int, list[np.ndarray]] = field(default_factory=dict)
     by_places: bool = False
     local: Mapping[Place, float] = field(default_factory=dict)
+    turns: Mapping[int, np.ndarray] = field(default_factory=dict)
+    stiffening: bool | None = None
 
     def every(self, outlines: Mapping[int, FreeForm]) -> dict[int, FreeForm]:
         """Return the outlines with those of arms that repeat them."""
@@ -151,12 +156,14 @@ class Problem:
         """
         every = self.every(outlines)
         if not bodies:
-            anew = {k: one.meshed(SIDES, self.hot.get(k, ())) for k, one in every.items()}
+            anew = {k: self._meshed(k, one) for k, one in every.items()}
             every = {k: one for k, (one, _) in anew.items()}
             outlines = {k: every[k] for k in outlines}
             bodies = {k: mesh for k, (_, mesh) in anew.items()}
         parts = {k: one.current for k, one in every.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
+        if self.stiffening is not None:
+            changes["simulation"] = {"stiffening": self.stiffening}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
         simulated = simulate_parts(self.scene, parts, bodies, *start, **changes)
@@ -231,28 +238,28 @@ class Problem:
         every = self.every(state.outlines)
         return self._outline_stress(state.simulated, every, PLACE_EXPONENT, nodes)
 
+    def _meshed(self, k: int, one: FreeForm) -> tuple[FreeForm, PartMesh]:
+        if isinstance(one, FreeSides):
+            return one.meshed(self.turns.get(k))
+        return one.meshed(SIDES, self.hot.get(k, ()))
+
     def calibrated(self, state: State) -> tuple[Problem, State]:
         """Return the problem that knows what finer meshes say, and a state on new meshes."""
-        plain = replace(self, local={})
+        plain = replace(self, local={}, turns=_turns(state, FINE))
         fresh = plain.evaluated(state.outlines, {}, state.solutions)
-        hot = [key for key, value in fresh.places.items() if value > NEAR]
-        if not hot:
+        if max(fresh.places.values(), default=-1.0) < NEAR:
             return plain, fresh
-        near: dict[int, list[np.ndarray]] = {k: [] for k in fresh.bodies}
-        for k, piece in hot:
-            face = _face(fresh.bodies[k])
-            near[k].append(face.points[face.sides[face.owners == piece, 0]])
-        finer = {k: [np.vstack(places)] if places else [] for k, places in near.items()}
-        fine = replace(plain, hot=finer).evaluated(state.outlines, {}, fresh.solutions).places
+        finest = replace(plain, turns=_turns(fresh, FINEST))
+        fine = finest.evaluated(state.outlines, {}, fresh.solutions).places
         local = {
-            key: min(max((1.0 + fine[key]) / (1.0 + fresh.places[key]), LEAST_FINE), MOST_FINE)
-            for key in hot
-            if key in fine
+            key: min(max((1.0 + fine[key]) / (1.0 + value), LEAST_FINE), MOST_FINE)
+            for key, value in fresh.places.items()
+            if value > NEAR and key in fine
         }
         places = {
             key: (1.0 + value) * local.get(key, 1.0) - 1.0 for key, value in fresh.places.items()
         }
-        return replace(self, local=local), replace(fresh, places=places)
+        return replace(plain, local=local), replace(fresh, places=places)
 
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0 + RESERVE)
@@ -334,6 +341,16 @@ class Problem:
             by_nodes = np.array([rows[number][k][order] for number in some])
             found[self.scene.patterns.get(k, k)][some] += every[k].by_x(body, by_nodes)
         return np.hstack([*found.values()])
+
+
+def _turns(state: State, fine: float) -> dict[int, np.ndarray]:
+    """Return the turns (n,) of all pieces along a side of a mesh, fine where stress is near."""
+    found = {}
+    for k, body in state.bodies.items():
+        found[k] = np.full(len(_face(body).shape.pieces), COARSE)
+        near = [piece for (j, piece), value in state.places.items() if j == k and value > NEAR]
+        found[k][near] = fine
+    return found
 
 
 def _face(mesh: Any) -> BodyMesh:

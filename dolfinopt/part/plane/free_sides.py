@@ -31,6 +31,7 @@ from dolfinopt.part.plane.sides import (
 from dolfinopt.part.plane.simpler import simplifications, without_struts
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
+COARSE = 0.6  # rad, turn of the outline along a side of a mesh where stress is far from its limit
 MOST = 40  # sides and holes that go at once, at most
 FAR_STEPS = 40  # of Newton's to an outline without a strut
 WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
@@ -136,9 +137,16 @@ class FreeSides:
         found = self.limits.nearest(self.sides, steps)
         return None if found is None else (replace(self, sides=found[0]), found[1])
 
-    def meshed(self, coarser: float, finer: Sequence[np.ndarray] = ()) -> tuple[FreeSides, Mesh]:
-        """Return it with a new mesh; variables stay."""
-        return self, self.current.mesh(coarser, finer)
+    def meshed(self, turns: np.ndarray | None = None) -> tuple[FreeSides, Mesh]:
+        """Return it with a new mesh; variables stay.
+
+        Args:
+            turns: (n,) of its pieces along a side of the mesh, rad; None: `COARSE`.
+        """
+        if self.solid is not None:
+            return self, self.current.mesh()
+        known = turns is not None and len(turns) == len(self.sides.shape.pieces)
+        return self, self.plane.mesh(turn=turns if known else COARSE)
 
     def followed(self, mesh: Mesh) -> Mesh | None:
         """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""

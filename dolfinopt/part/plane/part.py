@@ -12,7 +12,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.mesh import BodyMesh, body_mesh
+from dolfinopt.part.mesh import TURN, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
@@ -184,10 +184,15 @@ class PlanePart:
         yield ".svg", svg_text(shape, title)
         yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> BodyMesh:
-        """Return triangles along its curves, see `part.Part`."""
+    def mesh(
+        self,
+        coarser: float = 1.0,
+        finer: Sequence[np.ndarray] = (),
+        turn: float | np.ndarray = TURN,
+    ) -> BodyMesh:
+        """Return triangles along its curves, see `part.Part`; `turn` as of `body_mesh`."""
         try:
-            return body_mesh(self.shape, self.domain.cell, coarser, finer)
+            return body_mesh(self.shape, self.domain.cell, coarser, finer, turn)
         except InputError as error:
             raise InputError(f"arm {self.name!r}: {error}") from None
 
