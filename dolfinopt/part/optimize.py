@@ -10,7 +10,6 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import ceil
 from typing import Any, cast
@@ -22,10 +21,11 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import part_column, refined, simulate_parts
 from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
-from dolfinopt.part.plane.fit import fitted_sides
+from dolfinopt.part.plane.fit import rough_sides
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
+from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.problem import RESERVE, SIDES, FreeForm, Problem, State
 from dolfinopt.part.search import SidesSearch
@@ -40,7 +40,8 @@ ITERATIONS = 80  # default, at most, from every start
 FIRST = 0.75  # of them, before a finer mesh has judged
 ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
 HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
-START = 0.8  # distance of the first sides from the densities' outline, cells
+START = 1.2  # distance of the first sides from the densities' outline, cells
+STUB = 1.5  # width of members that go where they end nowhere, cells
 START_STEPS = 40  # of Newton's to the first outline that keeps all limits
 TRIED, FEW = 3, 4  # struts that are left out in trial, the most promising; steps of each
 MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
@@ -208,10 +209,10 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
             flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
         )
         solid = part.domain if isinstance(part, SolidPart) else None
-        sides = flat.sides
-        with suppress(InputError):  # fewer sides than a drawing has: they will move anyway
-            away = START * flat.domain.cell
-            sides = fitted_sides(flat.outline, limits, away, flat.sides.shape.area)
+        cell = flat.domain.cell
+        outline = without_stubs(flat.outline, STUB * cell)
+        rough = rough_sides(outline, limits, START * cell, flat.sides.shape.area)
+        sides = flat.sides if rough is None else rough
         made = FreeSides(flat, sides, limits, solid)
         found = made.nearest(START_STEPS)
         return made if found is None else found[0]

@@ -120,6 +120,12 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     )
 
 
+def rough_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
+    """Return few sides along an outline, which a search will move; None: there are none."""
+    made = (_made(outline, limits, share * tolerance, area) for share in ATTEMPTS)
+    return next((one for one in made if one is not None), None)
+
+
 def _made(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
     """Return sides along an outline that keep the limits; None: there are none."""
     try:
