@@ -212,7 +212,9 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
         cell = flat.domain.cell
         outline = without_stubs(flat.outline, STUB * cell)
         rough = rough_sides(outline, limits, START * cell, flat.sides.shape.area)
-        sides = flat.sides if rough is None else rough
+        sides = flat.sides
+        if rough is not None and rough.count < sides.count:
+            sides = rough
         made = FreeSides(flat, sides, limits, solid)
         found = made.nearest(START_STEPS)
         return made if found is None else found[0]

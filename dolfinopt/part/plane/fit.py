@@ -20,7 +20,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Edge
 from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece
-from dolfinopt.part.plane.limits import LARGEST, TURN, Limits
+from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, TURN, Limits
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.sides import (
     BrokenError,
@@ -50,6 +50,7 @@ WORTH = 0.8  # of a distance from the outline, below which more sides come into 
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
 CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
+STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
 SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
 ROOM = 0.45  # share of a side that a fillet at one of its ends may take
 
@@ -340,6 +341,7 @@ def _free_circle(chain: Sequence[Run], halved: bool, tolerance: float) -> Circle
     points = np.vstack([run.points for run in chain])
     if halved:
         points = np.vstack([points, (points * MIRROR)[::-1]])
+    points = np.vstack([points, 0.5 * (points[1:] + points[:-1])])  # the polygon's sides, too
     middle = points.mean(axis=0)
     p = points - middle
     system = np.column_stack([2.0 * p, np.ones(len(p))])
@@ -551,7 +553,7 @@ def _corner_will_do(
     gap = float(shapely.distance(shapely.Point(place), boundary))
     if turn > 0.0:
         return gap <= tolerance
-    half = min(-turn / 2.0, 1.4)
+    half = min(-turn / 2.0, STEEP)
     radius = max(gap / (1.0 / np.cos(half) - 1.0), limits.tool) if half > 0.0 else np.inf
     lengths = (np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
     if radius * np.tan(half) > ROOM * min(lengths):
@@ -566,7 +568,7 @@ def _corner_will_do(
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
     """Return the number of the side to leave out, and whether the one before takes its place."""
     places, turns = _vertices(drawn, REACH * limits.cell)
-    need = [limits.tool * np.tan(min(-turn / 2.0, 1.4)) if turn < 0.0 else 0.0 for turn in turns]
+    need = [limits.tool * np.tan(min(-turn / 2.0, STEEP)) if turn < 0.0 else 0.0 for turn in turns]
     worst, least, merges = None, np.inf, False
     for k, one in enumerate(drawn):
         j = (k + 1) % len(drawn)
@@ -634,7 +636,7 @@ def looped(
         if not is_rounded(a, b, turn, outer):
             corners.append(Corner(place))
             continue
-        half = min(-turn / 2.0, 1.4)
+        half = min(-turn / 2.0, STEEP)
         ends = (places[k - 1], places[(k + 1) % len(places)])
         room = ROOM * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
         radius = min(radius_at(k, place, half), room, 0.9 * LARGEST * limits.cell)

@@ -63,12 +63,15 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     arm, span = _between_bores(arm, stays, domain.cell)
     fillet = max(FILLET * domain.cell, drawn.tool_radius)
 
-    def polygon(flange: float) -> Polygon:
+    least = SMALLEST_HOLE * domain.cell**2
+
+    def rounded(hole: Geometry) -> Geometry:
+        return hole.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
+
+    def polygon(flange: float, rounds: bool = True) -> Polygon:
         widths = flange, max(STRUT * flange, domain.minimum_member)
-        holes = _windows(arm, stays, span, widths, slope, fewest, domain.symmetric)
-        rounded = holes.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
-        least = SMALLEST_HOLE * domain.cell**2
-        kept = [one for one in polygons_of(rounded) if one.area > least]
+        holes = polygons_of(_windows(arm, stays, span, widths, slope, fewest, domain.symmetric))
+        kept = [rounded(one) if rounds else one for one in holes if rounded(one).area > least]
         return max(polygons_of(arm.difference(shapely.union_all(kept))), key=lambda one: one.area)
 
     def missing(flange: float) -> float:
@@ -81,7 +84,9 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     excess, flange = missing(thin), thin
     if excess <= 0.0:
         flange = brentq(missing, thin, thick, xtol=AREA * domain.cell)
-    found = replace(drawn, polygon=polygon(flange), islands=0, islands_area=0.0, filled=0)
+    # Sides find their sharp corners, and are rounded there.
+    sharp = polygon(flange, rounds=False)
+    found = replace(drawn, polygon=sharp, islands=0, islands_area=0.0, filled=0)
     area = domain.volume * (1.0 + max(excess, 0.0))
     limits = limits_of_part(domain, drawn.tool_radius)
     try:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from shapely import Geometry
 
 SHORT = 0.05  # least length of a side, cells
-TURN, MOST_TURN = np.radians(4.0), np.radians(160.0)  # of the outline at a corner
+TURN, MOST_TURN = np.radians(4.0), np.radians(172.0)  # of the outline at a corner
 LARGEST = 8.0  # radius of a fillet, cells
 THIN = 1e-3  # m, least width of members unless the scene states one
 FACING = 0.8  # cosine between a width and the normals at both of its ends, at least

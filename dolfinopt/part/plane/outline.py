@@ -90,7 +90,10 @@ def _step(tried: list[tuple[float, float]], slope: float) -> float:
 
 
 NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
-SMALLEST_STUB, SPECK = 0.25, 8.0  # area of a stub at least, and of its thicker end at most, squared widths
+SMALLEST_STUB, SPECK = (
+    0.25,
+    8.0,
+)  # area of a stub at least, and of its thicker end at most, squared widths
 QUADRANT = 12  # sides of a quarter of a disc
 SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
 SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
@@ -530,13 +533,18 @@ def without_stubs(outline: Outline, width: float) -> Outline:
     dropped: list[Geometry] = []
     while True:
         whole = shapely.union_all(cores)
-        loose = [one for one in members if len(polygons_of(one.intersection(whole))) < 2]
+        loose = [
+            one
+            for one in members
+            if not one.interiors and len(polygons_of(one.intersection(whole))) == 1
+        ]
         members = [one for one in members if one not in loose]
-        ends = shapely.MultiPolygon(members)
+        ends = shapely.union_all(members)
         alone = [
             one
             for one in cores
-            if one is not core and len(polygons_of(ends.intersection(one))) < 2
+            if one is not core
+            and len(polygons_of(ends.intersection(one))) < 2
             and one.area < width * SPECK * width
         ]
         cores = [one for one in cores if one not in alone]
