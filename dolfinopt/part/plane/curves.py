@@ -354,7 +354,9 @@ class Shape:
         """Return whether no curve crosses another one, as polygons within a distance see it."""
         import shapely
 
-        outer, *holes = self.polygons(tolerance)
+        outer, *holes = loops = self.polygons(tolerance)
+        if min(len(loop) for loop in loops) < 3:  # a circle of no size
+            return False
         return bool(shapely.is_valid(shapely.Polygon(outer, holes)))
 
     def polygons(self, tolerance: float) -> list[np.ndarray]:

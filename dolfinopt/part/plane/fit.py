@@ -45,7 +45,7 @@ SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
 SMALLEST = 3.0  # area of a hole, squared cells or tool radii
 ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
-SAME_AREA = 1e-3  # relative
+SAME_AREA, ROUGHLY = 1e-3, 0.02  # relative; of few sides
 WORTH = 0.8  # of a distance from the outline, below which more sides come into question
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
@@ -124,7 +124,7 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
 def rough_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
     """Return few sides along an outline, which a search will move; None: there are none."""
     made = (_made(outline, limits, share * tolerance, area) for share in ATTEMPTS)
-    return next((one for one in made if one is not None), None)
+    return next((one for one in made if one and abs(one.shape.area / area - 1.0) < ROUGHLY), None)
 
 
 def _made(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
