@@ -10,10 +10,10 @@ Source: Williams (1952), doi:10.1115/1.4010553.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.part import Part
+    from dolfinopt.responses.response import Analysis
     from dolfinopt.scene.tables.objective import Objective
 
 HOT = 0.8  # of the largest stress, from which on a place is worth a finer mesh
@@ -217,6 +218,13 @@ class OutlineStress(Stress):
         """
         super().__init__(options, limited=True)
         self._parts, self._nodes = parts, nodes
+        self._known: dict[int, Any] = {}
+
+    def once(self, analysis: Analysis, find: Callable[[], Mapping[int, Any]]) -> dict[int, Any]:
+        """Return what is found of one machine; each place has its own, on this rank alone."""
+        if not self._known:
+            self._known = dict(find())
+        return self._known
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> CornerStress:
         """Return the stress of an arm's design on its outline."""
