@@ -314,12 +314,16 @@ class Descent:
 
     def _keep(self, ending: str = "") -> None:
         """Say where the search is."""
-        state = min(self.state, self.search.best, key=lambda one: one.rank)
+        state = self._best_state()
         forms, best = (
             {k: one.arrays for k, one in some.items()} for some in (state.outlines, self.forms)
         )
         done = self.done + self.search.steps
         self.keep(Saved(self.number, done, ending, self.problem.tightened, forms, best))
+
+    def _best_state(self) -> State:
+        """Return the best state so far, that of the last step among them."""
+        return min(self.state, self.search.best, self.search.state, key=lambda one: one.rank)
 
     def _told(self, line: str) -> None:
         """Tell of a step, which is kept first."""
@@ -328,7 +332,7 @@ class Descent:
 
     def so_far(self, start: str) -> Found:
         """Return the best so far of a search that was interrupted."""
-        self.state = min(self.state, self.search.best, key=lambda one: one.rank)
+        self.state = self._best_state()
         self.done += self.search.steps
         return replace(self._judged(start, "")[0], ending="interrupted")
 

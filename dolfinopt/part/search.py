@@ -32,6 +32,7 @@ SETTLED = 5e-3  # relative fall of the objective on two new meshes that ends the
 HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, steps that rows hold
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
+FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
 HARDLY = 1e-5  # relative fall that a step must promise
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
@@ -130,7 +131,7 @@ class SidesSearch:
         self.since, self.falls = FOLLOWED, list[float]()
         if not state.places:
             self.since, self.falls = 0, [float(self.best.values[0])]
-        self.steps, self.lost, self.missed, self.spent = 0, 0, 0, False
+        self.steps, self.lost, self.spent = 0, 0, False
         self.radius, self.price = FIRST_RADIUS, PRICE
         self.H = np.zeros((0, 0))
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}
@@ -169,10 +170,6 @@ class SidesSearch:
             self.radius *= 0.5
         self.since, self.before = 0, None
         self.passed = [dict(self.state.outlines)]
-        missed = self.state.values[1:].max(initial=0.0)
-        self.missed = self.missed + 1 if missed > 5.0 * EXCESS else 0
-        if self.missed > 1:  # on two meshes running: limits are worth more
-            self.price, self.missed = 2.0 * self.price, 0
         if not self.falls or self.state.rank <= self.best.rank:
             self.best = self.state.released
         self.falls.append(self.best.values[0])
@@ -243,6 +240,9 @@ class SidesSearch:
         dual /= abs(state.values[0])
         if dual < 0.5 * self.price:  # a price far above the multipliers makes steps short
             self.price = min(self.price, max(OVER * dual, 0.7 * self.price, LEAST_PRICE))
+        before, after = (one.values[1:].max(initial=0.0) for one in (state, step.state))
+        if after > max(5.0 * EXCESS, FALLS * before):  # it is worth more than it costs now
+            self.price *= 2.0
         self.before = None if step.anew else (step, linear)
         self.since = 0 if step.anew else self.since + 1
         self.state = step.state
