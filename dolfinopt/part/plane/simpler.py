@@ -23,7 +23,6 @@ VANISHING = 2.5  # of the least length, up to which a side vanishes
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
 PARALLEL = np.radians(9.0)  # angle between two sides that face each other, at most
 OVERLAP = 0.4  # share of the shorter one over which they do
-WIDE = 4.0  # distance of sides that stay parallel, cells, at most
 SLENDER = 1.6  # width of struts that may go, over the least width of members
 
 
@@ -70,36 +69,6 @@ def without_struts(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
             found = _spliced(found, one, other, limits, outer)
         if found is not None:
             yield found
-
-
-def parallel(sides: Sides, limits: Limits) -> Sides:
-    """Return the outline with sides that face each other over a member exactly parallel."""
-    lines, turns, used = _lines(sides), dict[int, float](), set[int]()
-    pairs = []
-    for _, a, b in facing(sides, WIDE * limits.cell):
-        sides_of = [sides.loops[lines[key][0]].sides[lines[key][1]] for key in (a, b)]
-        names = {name for side in sides_of for name in (side.key, side.twin)} - {-1}
-        if names & used or len(names) == 3 or sides_of[0].key == sides_of[0].twin:
-            continue
-        used |= names
-        off = turn_between(unit(sides_of[0].angle), -unit(sides_of[1].angle))
-        share = 0.5 if sides_of[1].free else 1.0
-        for side, turn in zip(sides_of, (share * off, -(1.0 - share) * off), strict=True):
-            turns[side.key] = turn
-            if side.twin >= 0 and side.twin not in (a, b):
-                turns[side.twin] = -turn
-        pairs.append((a, b))
-    loops = tuple(
-        replace(
-            loop,
-            sides=tuple(
-                replace(one, angle=one.angle + turns.get(one.key, 0.0)) if one.free else one
-                for one in loop.sides
-            ),
-        )
-        for loop in sides.loops
-    )
-    return replace(sides, loops=loops, pairs=tuple(pairs)).centred()
 
 
 def facing(sides: Sides, widest: float) -> list[tuple[float, int, int]]:
