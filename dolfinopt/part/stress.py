@@ -221,7 +221,9 @@ class OutlineStress(Stress):
         self._known: dict[int, Any] = {}
 
     def once(self, analysis: Analysis, find: Callable[[], Mapping[int, Any]]) -> dict[int, Any]:
-        """Return what is found of one machine; each place has its own, on this rank alone."""
+        """Return what is found of this rank's designs; of some nodes it is their own."""
+        if self._nodes is None:
+            return super().once(analysis, find)
         if not self._known:
             self._known = dict(find())
         return self._known
