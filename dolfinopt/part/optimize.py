@@ -383,7 +383,7 @@ class Descent:
         most = ceil(FIRST * self.iterations) if self.best is None else self.iterations
         ending = self.search.run(most - self.done, self._told, self.done)
         self.done, self.search.steps = self.done + self.search.steps, 0
-        self.state = self.search.best
+        self.state = self._best_state()
         while self.best is None and self.done < most and self._without_struts(most):
             pass
         return ending

@@ -244,7 +244,7 @@ class SidesSearch:
         if after > max(5.0 * EXCESS, FALLS * before):  # it is worth more than it costs now
             self.price *= 2.0
         self.before = None if step.anew else (step, linear)
-        self.since = 0 if step.anew else self.since + 1
+        self.since += 1
         self.state = step.state
         self.passed.append(dict(step.state.outlines))
 
