@@ -145,8 +145,9 @@ class FreeSides:
         """
         if self.solid is not None:
             return self, self.current.mesh()
-        known = turns is not None and len(turns) == len(self.sides.shape.pieces)
-        return self, self.plane.mesh(turn=turns if known else COARSE)
+        if turns is None or len(turns) != len(self.sides.shape.pieces):
+            return self, self.plane.mesh(turn=COARSE)
+        return self, self.plane.mesh(turn=turns)
 
     def followed(self, mesh: Mesh) -> Mesh | None:
         """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""
