@@ -110,6 +110,11 @@ def _free_all(world: MPI.Comm, key: int, known: dict[tuple[int, ...], MPI.Comm])
 _SPLITS = MPI.Comm.Create_keyval(delete_fn=_free_all)
 
 
+def total(comm: MPI.Comm, part: Any) -> Any:
+    """Return the sum of numbers or arrays over the ranks; on a single one what it is given."""
+    return part if comm.size == 1 else comm.allreduce(part)
+
+
 def sum_over_arms(partition: Partition, mine: Mapping[int, np.ndarray]) -> np.ndarray:
     """Return the sum of one array an arm, added in the arms' order: the same bits on all ranks.
 

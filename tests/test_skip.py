@@ -219,7 +219,7 @@ except SystemExit:
 print([name for name in names if name in sys.modules])
 """
 MAIN = "from dolfinopt.cli import main; main()"
-DRAW = {"pyvista", "vtkmodules", "matplotlib", "PIL"}
+DRAW = {"pyvista", "vtkmodules.vtkRenderingCore", "matplotlib", "PIL"}
 SOLVE = {"dolfinx", "ufl", "slepc4py", "scipy", "gmsh"}
 
 

@@ -31,6 +31,7 @@ from dolfinopt.fem.tensors import ElementTensors, element_of
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 from dolfinopt.motion.machine import rigid_link
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
@@ -50,9 +51,6 @@ FIELD_TOLERANCES = 1e-10, 1e-6  # bounds
 
 # Tables of a scene that do not change its motion: what was decided about stiffening stays.
 WITHOUT_MOTION = {"name", "reduction", "objective", "constraints", "design", "optimizer", "part"}
-
-# How far beyond [0, 1] a filtered density is cut off: by less it is rounding that left it.
-CLIPPED_DENSITY_LIMIT = 1e-10
 
 
 def field_tolerance(scene: scenes.Scene) -> float:
@@ -172,7 +170,7 @@ class Arm:
         x_filtered = self.smoothed(x)
         clipped = None
         if not self.filter.keeps_bounds:  # elsewhere bounds are left by rounding alone
-            beyond = CLIPPED_DENSITY_LIMIT
+            beyond = GRID_ROUNDING_SHARE  # by less it is rounding that left them
             clipped = (x_filtered < -beyond) | (x_filtered > 1.0 + beyond)
         x_phys = self.mesh.keep(np.clip(x_filtered, 0.0, 1.0))
         return PhysicalDesign(x_phys, None, clipped)

@@ -12,16 +12,12 @@ import scipy.sparse as sp
 from petsc4py import PETSc
 from scipy.spatial import cKDTree
 
-from dolfinopt.density.measured import (
-    COLUMN_PLACES,
-    FACET_SKEW_LIMIT,
-    LEAST_SIDE_DISTANCE,
-    MIRROR_DISTANCE_LIMIT,
-)
+from dolfinopt.density.measured import LEAST_SIDE_DISTANCE, MIRROR_DISTANCE_LIMIT
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
 from dolfinopt.mesh.checks import cell_centroids, facet_areas, facet_corners, facet_middles
+from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE
 from dolfinopt.scene.load import Arm
 from dolfinopt.solver import conjugate_gradients, direct_solver, obeying_options
 
@@ -68,7 +64,7 @@ class HelmholtzFilter:
         r = radius / (2.0 * np.sqrt(3.0))
         sides = _sides(mesh, open_edges)
         skew = mesh.comm.allgather(float(sides.skew.max(initial=0.0)))
-        self.keeps_bounds = max(skew) <= FACET_SKEW_LIMIT
+        self.keeps_bounds = max(skew) <= FILE_ROUNDING_SHARE
         self._scheme = (_TwoPoint if self.keeps_bounds else _Hybrid)(mesh, sides, r)
 
     def forward(self, x: np.ndarray) -> np.ndarray:
@@ -357,7 +353,9 @@ class Extrusion:
         first = sum(counts[: self.comm.rank])
         places = np.concatenate(self.comm.allgather(mesh.centroid[:, :2]))
         size = np.abs(places).max()
-        _, column = np.unique(np.rint(places / size * COLUMN_PLACES), axis=0, return_inverse=True)
+        _, column = np.unique(
+            np.rint(places / size / FILE_ROUNDING_SHARE), axis=0, return_inverse=True
+        )
         self._column = column.ravel()[first : first + mesh.num_cells]
         self._count = np.bincount(column.ravel())
 

@@ -5,10 +5,6 @@ Each stands with its unit, what it rules, and what was measured.
 
 # -- filter ----------------------------------------------------------------------------------
 
-# Distance of a facet's midpoint from the foot of the perpendicular through the cell's centroid, in
-# lengths of the facet, up to which a cell counts as a rectangle or an equilateral triangle. Gmsh
-# places points to 1e-9 of a slender cell.
-FACET_SKEW_LIMIT = 1e-6
 # Least distance of a centroid from a side, in areas over side lengths, in the stabilisation: 1/2 in
 # a parallelogram, 2/3 in a triangle; it may vanish in a quadrilateral that is hardly convex.
 LEAST_SIDE_DISTANCE = 0.05
@@ -16,14 +12,12 @@ LEAST_SIDE_DISTANCE = 0.05
 # space cubic roots of its volume. Meshes of symmetric geometries that were made without a thought
 # of symmetry: 0.7 to 1.0.
 MIRROR_DISTANCE_LIMIT = 1.25
-COLUMN_PLACES = 1e7  # across a mesh that are told apart, to find cells above one another
 
 # -- members ---------------------------------------------------------------------------------
 
 # Samples along a cell of the mean area, and in all: a width is known to a sample.
 CELL_SAMPLES = 4
 SAMPLES_LIMIT = 1_000_000
-SIDE_ROUNDING_SHARE = 1e-9  # of a sample, by which a middle may lie outside its cell
 # A piece that hangs on the rest by one end is a corner up to this length, in widths, and a member
 # beyond. Two straight edges that meet at less than 23 degrees make the longest corners.
 CORNER_LENGTH_RATIO = 2.0

@@ -8,13 +8,9 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage
 
-from dolfinopt.density.measured import (
-    CELL_SAMPLES,
-    CORNER_LENGTH_RATIO,
-    SAMPLES_LIMIT,
-    SIDE_ROUNDING_SHARE,
-)
+from dolfinopt.density.measured import CELL_SAMPLES, CORNER_LENGTH_RATIO, SAMPLES_LIMIT
 from dolfinopt.mesh.checks import cell_sizes, facet_areas, facet_corners
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 
 EIGHT = np.ones((3, 3), dtype=bool)
 
@@ -133,7 +129,7 @@ def _cells_at(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float
         inside = ((place >= 0) & (place < counts)).all(axis=1)
         for origin, normal in sides:
             height = np.einsum("ni,ni->n", normal, point - origin)
-            inside &= height >= -SIDE_ROUNDING_SHARE * h ** corners.shape[2]
+            inside &= height >= -GRID_ROUNDING_SHARE * h ** corners.shape[2]
         found[tuple(place[inside].T)] = np.flatnonzero(inside)
     return found
 

@@ -11,11 +11,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.fem.measured import (
-    FIELD_CHUNK_ENTRIES,
-    STRESS_CHUNK_CELLS,
-    STRESS_CHUNK_ENTRIES,
-)
+from dolfinopt.fem.measured import KERNEL_CHUNK_ENTRIES, STRESS_CHUNK_CELLS, STRESS_CHUNK_ENTRIES
 from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.profiling import Profile
 
@@ -154,6 +150,18 @@ def interior_entries(pattern: sp.csr_matrix, block: int, numbers: np.ndarray) ->
     return InteriorEntries(*(x.astype(PETSc.IntType) for x in (rows, table.indices, table.data)))
 
 
+def of_directions(entries: InteriorEntries, block: int) -> InteriorEntries:
+    """Return the entries of a matrix of nodes, the same in all directions.
+
+    Args:
+        entries: of a matrix of blocks over the same nodes.
+        block: b, its directions.
+    """
+    kept = (entries.source // block) % block == entries.source % block
+    source = entries.source[kept] // block**2
+    return InteriorEntries(entries.rows[kept], entries.columns[kept], source)
+
+
 class InteriorMatrix:
     """The interior rows and columns of a local matrix as a PETSc matrix."""
 
@@ -199,6 +207,20 @@ class InteriorMatrix:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setOption(PETSc.Mat.Option.SPD, True)
 
+    @cached_property
+    def _vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        return self.mat.createVecs()
+
+    def times(self, V: np.ndarray) -> np.ndarray:
+        """Return its product with the owned rows (rows, k) of columns (collective)."""
+        out = np.empty_like(V, order="F")
+        right, left = self._vectors
+        for source, target in zip(V.T, out.T, strict=True):
+            right.array = source
+            self.mat.mult(right, left)
+            target[:] = left.array_r
+        return out
+
 
 def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Return nodal fields (n_nodes, d, k) times coefficients (k, m), as one matrix product."""
@@ -208,7 +230,7 @@ def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 def runs_of_columns(field: np.ndarray) -> list[slice]:
     """Return runs of the columns of a nodal field (n_nodes, d, k): not all are copied at once."""
-    step = max(1, FIELD_CHUNK_ENTRIES * field.shape[2] // max(1, field.size))
+    step = max(1, KERNEL_CHUNK_ENTRIES * field.shape[2] // max(1, field.size))
     return [slice(k, k + step) for k in range(0, field.shape[2], step)]
 
 

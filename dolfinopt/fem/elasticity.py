@@ -22,8 +22,10 @@ from dolfinopt.fem.assembly import (
     AssembledMatrix,
     CellMatrix,
     Cells,
+    InteriorMatrix,
     NodePairs,
     of_cells,
+    of_directions,
 )
 from dolfinopt.fem.interface import (
     Connectivity,
@@ -47,7 +49,7 @@ from dolfinopt.fem.stress import stress_operator
 from dolfinopt.fem.tensors import ElementTensors, element_centre
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
-from dolfinopt.parallel import together
+from dolfinopt.parallel import together, total
 
 Columns = Callable[[np.ndarray], np.ndarray]
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
@@ -97,6 +99,7 @@ class Substructure:
         self.interior = LinearSystem(layout, profile, tolerance)
         self.extended = self._extended() if statics_alone and mesh.dim == 3 else None
         self._last: ElasticArm | None = None
+        self._interior_mass_of: AssembledMatrix | None = None
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> Substructure:
         """Return a solid arm's with its nodes elsewhere (collective).
@@ -117,7 +120,8 @@ class Substructure:
         other.cells = Cells(other.operators)
         other._stiffness = CellMatrix(self._pairs, other.cells.stiffness)
         other._mass = CellMatrix(self._pairs, other.cells.mass)
-        other.T, other._last = self.T.moved(points), None
+        other.T = self.T.moved(points)
+        other._last = other._interior_mass_of = None
         return other
 
     def _extended(self) -> LinearSystem:
@@ -127,6 +131,20 @@ class Substructure:
         entries = self.T.dim**2 * self._pairs.pattern.nnz
         layout = extended_layout(self.interior.layout, self.T, entries, self._near)
         return LinearSystem(layout, self.profile, min(self.interior.tolerance, STATICS_TOLERANCE))
+
+    def interior_mass(self, M: AssembledMatrix) -> InteriorMatrix:
+        """Return M_II of a design, until that of another one is asked for (collective)."""
+        matrix = self._interior_mass
+        if self._interior_mass_of is not M:
+            self._interior_mass_of = M
+            matrix.update(M.data)
+        return matrix
+
+    @cached_property
+    def _interior_mass(self) -> InteriorMatrix:
+        layout = self.interior.layout
+        entries = of_directions(layout.entries(), self.T.dim)
+        return InteriorMatrix(layout.comm, entries, layout.rows)
 
     @cached_property
     def connectivity(self) -> Connectivity:
@@ -270,6 +288,15 @@ class ElasticArm:
         flat = field.reshape(len(field), field.shape[1] * field.shape[2])
         return (self.M.matrix @ flat).reshape(field.shape)
 
+    @property
+    def interior_mass(self) -> InteriorMatrix:
+        """M_II."""
+        return self.substructure.interior_mass(self.M)
+
+    def interior_mass_times(self, V: np.ndarray) -> np.ndarray:
+        """Return M_II V of owned interior rows (num_interior, k)."""
+        return self.interior_mass.times(V)
+
     @cached_property
     def rigid_inertia(self) -> np.ndarray:
         """M [1, X] (n_nodes, d, 2), component by component, of this rank's cells; kg, kg m."""
@@ -283,7 +310,7 @@ class ElasticArm:
         modes, loses (length / cell)^3 in digits.
         """
         part = self.substructure.cells.energy_matrix(field, self.young)
-        energy = self.comm.allreduce(part)
+        energy = total(self.comm, part)
         return 0.5 * (energy + energy.T)
 
     def cell_stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -321,7 +348,7 @@ class ElasticArm:
         Raises:
             ConvergenceError: K_II is singular but for rounding.
         """
-        loaded = self.comm.allreduce(right.any(axis=0), op=np.logical_or)
+        loaded = total(self.comm, right.any(axis=0).astype(int)) > 0
         interior = self.substructure.interior
         if loaded.all():
             return interior.solve(self.K, right, tolerance, held)
@@ -349,7 +376,7 @@ class ElasticArm:
             inverse: in place of `solve`.
         """
         modes = self.constraint_modes()
-        lift = self.comm.allreduce(modes.interior.T @ interior)
+        lift = total(self.comm, modes.interior.T @ interior)
         tip = np.linalg.solve(modes.stiffness, outboard + lift)
         return (inverse or self.solve)(interior) + modes.interior @ tip, tip
 

@@ -23,12 +23,12 @@ from dolfinopt.fem.measured import (
     HARMLESS_CONTRAST,
     ROUNDING_ITERATIONS,
     ROUNDING_TRANSLATION_SHARE,
-    SAME_PLACE_SHARE,
     STIFFNESS_ROUNDING_LIMIT,
 )
 from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 from dolfinopt.parallel import on_root
 
 if TYPE_CHECKING:
@@ -283,7 +283,7 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray,
     """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
     # The narrower one; on the grid of a slender arm the first, row by row across it, which is half
     # as wide as the other one, which begins at a corner.
-    nearest = SAME_PLACE_SHARE * np.ptp(points[:, 0])
+    nearest = GRID_ROUNDING_SHARE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
     orders = (
         np.lexsort((*across, along)),

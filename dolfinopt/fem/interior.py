@@ -219,7 +219,7 @@ class BandSolver(Factor):
 
     def update(self, K: Stiffness) -> None:
         """See `Solver`."""
-        self._is_definite = self._band.factorise(K.data[self._source])
+        self._is_definite = self._band.factorise(K.data.take(self._source, mode="clip"))
         if not self._is_definite:
             self._indefinite.update(K)
 

@@ -148,6 +148,7 @@ def _compiled(form: ufl.Form | Expression, folder: Path) -> tuple[Any, Any, Any]
 def _locked(folder: Path) -> Iterator[Path]:
     """Hold the folder's lock, which ends with the process; none where it cannot be written."""
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         lock = open(folder / "dolfinopt.lock", "w")
     except OSError:
         yield folder

@@ -12,12 +12,12 @@ ALIKE_CELLS_ERROR = 1e-11
 # cells at a time, for more modes.
 STRESS_CHUNK_ENTRIES = 120_000
 STRESS_CHUNK_CELLS = 256
-FIELD_CHUNK_ENTRIES = 4_000_000  # of nodal fields that are copied at a time: 32 MB
-KERNEL_CHUNK_ENTRIES = 2_000_000  # cells, times cubes of their nodes, computed at a time: 100 MB
+# Cells, times cubes of their nodes, whose matrices are computed at a time: 100 MB; and entries of
+# nodal fields that are copied at a time.
+KERNEL_CHUNK_ENTRIES = 2_000_000
 
 # -- interface -------------------------------------------------------------------------------
 
-SAME_PLACE_SHARE = 1e-9  # of an arm's length: places no farther apart than this are one
 # Largest relative error that rounding may make in the stiffness of a design in which solids float:
 # a tenth of what an optimiser's step changes. Against long double errors are 0.03 to 0.35 of the
 # estimate.
@@ -67,11 +67,12 @@ TETRAHEDRA_BAND_WORK_LIMIT = 1e9
 # Bytes of MUMPS' factor of a solid: so many times the rows to this power, 0.7 GB of 50 000 rows.
 FACTOR_BYTES, FACTOR_EXPONENT = 3.8e3, 1.12
 
-# -- multigrid: conjugate gradients ----------------------------------------------------------
+# -- conjugate gradients: multigrid, adjoints of modes ----------------------------------------
 
 # Relative, in energy, where nobody says what is needed: stiffness is then right to its square, mass
 # and inertia to it, gradients of frozen loads to five times it, geometric stiffness to ten times.
-# Deflections of long arms by a factor have no more digits, either.
+# Deflections of long arms by a factor have no more digits, either. Modes without a factor and the
+# adjoints of modes are found to it, too: more than an optimiser can use.
 ENERGY_TOLERANCE = 1e-8
 # Part of the diagonally scaled matrix' spectrum, up to its end, that is smoothed: 23 steps for a
 # slender box beam of 73 599 rows, with 0.09 24, with 0.15 26.
@@ -80,6 +81,9 @@ SMOOTHED_SHARE = 0.05
 BOX_CHUNK_COLUMNS = 4096
 COARSEST_BAND_WORK = 3e8  # rows times bandwidth squared up to which a grid is the coarsest
 SOLVER_ITERATIONS = 500
-# Least tolerance, of the right side's own length; and least part of a direction's length that is
-# none of the others'.
+# Least tolerance, of the right side's own length; and least part of a direction's length or energy
+# that is none of the others': dependent ones leave 1e-16, independent ones have 1e-2. Relative
+# residual of eigenpairs and of what is to be right to nearly all digits: vectors are then right to
+# about 1e-10, which keeps designs equal to 1e-8 on any number of ranks; each further digit costs a
+# fraction of a step. Two rounds of Gram and Schmidt leave 1e-15 to 1e-14.
 ROUNDING_SHARE = 1e-12

@@ -29,10 +29,10 @@ from dolfinopt.fem.measured import (
     BOX_CHUNK_COLUMNS,
     COARSEST_BAND_WORK,
     ROUNDING_SHARE,
-    SAME_PLACE_SHARE,
     SMOOTHED_SHARE,
     SOLVER_ITERATIONS,
 )
+from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 from dolfinopt.parallel import on_root
 from dolfinopt.solver import BandCholesky
 
@@ -105,7 +105,7 @@ def box_of(T: InterfaceTransformation, cells: Cells, centroid: np.ndarray) -> Bo
         """Return the numbers of places on a grid, and whether they are there."""
         steps = (x - low) / edges - shift
         at = np.rint(steps)
-        there = np.abs(steps - at).max(initial=0.0) < SAME_PLACE_SHARE * counts.max()
+        there = np.abs(steps - at).max(initial=0.0) < GRID_ROUNDING_SHARE * counts.max()
         inside = (at >= 0).all() and (at < size).all()
         if not (there and inside):
             return np.zeros(len(x), dtype=int), False

@@ -15,10 +15,8 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.measured import (
     FILE_ROUNDING_SHARE,
-    FLAT_CELL_SHARE,
     FRAME_TOLERANCE,
-    FULL_TURN_ANGLE,
-    TOUCHING_AREA_SHARE,
+    GRID_ROUNDING_SHARE,
     UNIT_FACTOR,
 )
 from dolfinopt.scene.load import Arm
@@ -67,7 +65,7 @@ def _check_cells(flat: FlatMesh) -> None:
     corner = flat.points[flat.cells][:, :, :2]
     ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
     turn = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
-    least = FLAT_CELL_SHARE * np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
+    least = FILE_ROUNDING_SHARE * np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
     sound = (turn > least).all(axis=1) | (turn < -least).all(axis=1)
     _refuse(~sound, corner, "are folded or flat")
     angle = np.arctan2(np.abs(turn), (ahead * back).sum(axis=2))
@@ -88,7 +86,7 @@ def _covering(flat: FlatMesh, corner: np.ndarray, angle: np.ndarray) -> np.ndarr
     keys = facet_keys(flat.cells[:, order], 2)
     bad = _overlapping(corner[:, order], keys)
     total = np.bincount(flat.cells.ravel(), angle.ravel())
-    bad |= (total > FULL_TURN_ANGLE)[flat.cells].any(axis=1)
+    bad |= (total > 2.0 * np.pi + FILE_ROUNDING_SHARE)[flat.cells].any(axis=1)
     if not bad.any():
         _, first, count = np.unique(keys, return_index=True, return_counts=True)
         side, cell = np.divmod(first[count == 1], len(corner))
@@ -108,7 +106,7 @@ def _crossings(lines: np.ndarray) -> np.ndarray:
     reach = np.linalg.norm(b - a, axis=1).max()
     pairs = cKDTree(0.5 * (a + b)).query_pairs(reach, output_type="ndarray")
     i, j = pairs.T
-    tiny = TOUCHING_AREA_SHARE * reach * reach
+    tiny = GRID_ROUNDING_SHARE * reach * reach
     first = _twice_area(a[i], b[i], a[j]), _twice_area(a[i], b[i], b[j])
     second = _twice_area(a[j], b[j], a[i]), _twice_area(a[j], b[j], b[i])
     cross = np.minimum(*map(np.abs, first)) > tiny
@@ -203,9 +201,9 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     corners = points[cells]
     _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
     longest = np.ptp(corners, axis=1).max(axis=1)
-    _refuse(cell_sizes(corners) < FLAT_CELL_SHARE * longest**3, corners, "are flat")
+    _refuse(cell_sizes(corners) < FILE_ROUNDING_SHARE * longest**3, corners, "are flat")
     if cells.shape[1] == 8:
-        _refuse(_folded(corners, FLAT_CELL_SHARE * longest**3), corners, "are folded")
+        _refuse(_folded(corners, FILE_ROUNDING_SHARE * longest**3), corners, "are folded")
     _refuse(_overlapping(corners, facet_keys(cells, 3)), corners, OVERLAP.format("volumes"))
     _check_parts(cells, "volumes must share their faces")
 

@@ -94,13 +94,10 @@ def member(section: Section, length: float, sides: tuple[float, float], share: f
     layers = 1 + int(share * SECTION_CELLS)
     flat, quads = section.plane(*sides, share * section.largest_wall(*sides), layers)
     along = max(SECTION_LEAST_ALONG, round(length / (SECTION_ALONG_SHARE * max(sides))))
-    cell = length / along
-    ends = cell * np.array(SECTION_END_CELLS)
-    stations = np.concatenate([[0.0], ends, cell * np.arange(1, along), (length - ends)[::-1]])
-    stations = np.append(stations, length)
-    points = np.concatenate([np.column_stack([np.full(len(flat), x), flat]) for x in stations])
+    places = stations(length, along)
+    points = np.concatenate([np.column_stack([np.full(len(flat), x), flat]) for x in places])
     first = np.concatenate([quads, quads + len(flat)], axis=1)
-    last = len(stations) - 1
+    last = len(places) - 1
     cells = np.concatenate([first + k * len(flat) for k in range(last)])
     return Member(points, cells, quads[:, ::-1], quads + last * len(flat))
 

@@ -8,6 +8,11 @@ import math
 # -- several files ---------------------------------------------------------------------------
 
 # Of the arm's height, or of the extent of a model: coordinates in a file have seven digits or more.
+# So, too: sine of a corner's angle, and part of the cube of the longest edge, below which cells are
+# flat; what angles about a point exceed a full turn by, rad; cosine to z of a side face's normal,
+# and what is missing to 1 of an end face's; distance of a facet's midpoint from the foot of the
+# perpendicular through the cell's centroid, in lengths of the facet, up to which the filter takes a
+# cell for a rectangle or an equilateral triangle.
 FILE_ROUNDING_SHARE = 1e-6
 # How far an interface's middle may be off its joint axis and the mesh's height off `height`,
 # relative to `height`: far more than a polygon in place of a circle needs.
@@ -16,7 +21,8 @@ FRAME_TOLERANCE = 0.05
 # -- arm_mesh --------------------------------------------------------------------------------
 
 # Of a cell: a node is so near to its line of the grid by rounding; of an interface's radius, by
-# which sides may lie beyond it.
+# which sides may lie beyond it; of an arm's length, up to which places are one; of the longest line
+# squared, for lines that meet at an end; of a sample of widths, beyond its cell.
 GRID_ROUNDING_SHARE = 1e-9
 
 # -- hollow ----------------------------------------------------------------------------------
@@ -24,13 +30,6 @@ GRID_ROUNDING_SHARE = 1e-9
 # Of a hollow link's length: how far beside a station the surface is cut, so that no node lies in
 # the plane.
 RAY_SHIFT_SHARE = 1e-7
-
-# -- checks ----------------------------------------------------------------------------------
-
-# Sine of a corner's angle, and part of the cube of the longest edge, below which cells are flat.
-FLAT_CELL_SHARE = 1e-6
-FULL_TURN_ANGLE = 2.0 * math.pi + 1e-6  # rad about a point: rounding of at most some dozen angles
-TOUCHING_AREA_SHARE = 1e-9  # of the longest line squared: lines that meet at an end
 
 # -- budget ----------------------------------------------------------------------------------
 
@@ -60,9 +59,6 @@ FILE_CELL_BYTES = {
 UNIT_FACTOR = 2.0
 INP_BYTES_LIMIT = 2_000_000_000  # of a .inp file: 10 million nodes
 THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no closer
-# Cosine to z of a side face's normal, and what is missing to 1 of an end face's: rounding of
-# splines.
-FACE_COSINE = 1e-6
 
 # -- sections: incompatible hexahedra, against beam theory (test_uniform_members.py) -------------
 

@@ -18,11 +18,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import check_unit, remedy
 from dolfinopt.mesh.file_check import check_start, open_file
 from dolfinopt.mesh.gmsh_session import DESIGN, FURTHER, PASSIVE, mesh_surfaces, mesh_volumes
-from dolfinopt.mesh.measured import (
-    FACE_COSINE,
-    FILE_ROUNDING_SHARE,
-    THICKNESS_TOLERANCE,
-)
+from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE, THICKNESS_TOLERANCE
 from dolfinopt.mesh.solid_cells import (
     Entities,
     bores_of,
@@ -162,9 +158,9 @@ def _end_faces(model: Any, solid: Entity, arm: Arm) -> dict[Entity, float]:
     for face in model.getBoundary([solid], oriented=False):
         points, places = _sampled(model, face, 5)
         upright = np.abs(np.reshape(model.getNormal(face[1], places), (-1, 3))[:, 2])
-        if (upright > 1.0 - FACE_COSINE).all():
+        if (upright > 1.0 - FILE_ROUNDING_SHARE).all():
             found[face] = float(points[:, 2].mean())
-        elif not (upright < FACE_COSINE).all():
+        elif not (upright < FILE_ROUNDING_SHARE).all():
             x, y, z = model.occ.getCenterOfMass(*face)
             raise InputError(
                 f"it holds a solid whose face about ({x:.4g}, {y:.4g}, {z:.4g}) m is neither "

@@ -242,15 +242,15 @@ def body_mesh(
     """
     turns = np.broadcast_to(turn, len(shape.pieces))
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = [coarser * size for size in _sizes(shape, samples, cell, finer, turns)]
+    sizes = _sizes(shape, samples, cell, finer, turns)
     for _ in range(FINER):
-        outline = _outline(shape, samples, sizes, coarser * turns)
+        outline = _outline(shape, samples, [coarser * size for size in sizes], coarser * turns)
         if outline.is_simple:  # Gmsh would end the process
             points, triangles = _triangulated(outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
-        sizes = [0.5 * size for size in sizes]
+        coarser *= 0.5  # a mesh of twice the sides is no finer than one of them
     x, y = 1e3 * _nearest_sides(samples, shape)
     raise InputError(
         f"its outline cannot be meshed: curves nearly touch at ({x:.1f}, {y:.1f}) mm; choose "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,12 +10,9 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
-from dolfinopt.parallel import on_root
-from dolfinopt.reduction.measured import (
-    DEFLATION_SHARE,
-    EXACT_TOLERANCE,
-    ROUNDING_LENGTH_SHARE,
-)
+from dolfinopt.fem.measured import ROUNDING_SHARE
+from dolfinopt.parallel import on_root, total
+from dolfinopt.reduction.measured import DEFLATION_SHARE, KRYLOV_BLOCKS_LIMIT, ROUNDING_LENGTH_SHARE
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
     if arm.mesh.dim == 3:  # torsion has no mean, bending in z and in y may have the same
         y, z = (arm.points[:, 1:] / arm.mesh.outboard_point[0]).T
         weight += np.stack([0.3 * z, -7.0 * z, 1.3 + 7.0 * y], axis=1)
-    mean = arm.comm.allreduce(np.einsum("ni,nik->k", weight, MV))
+    mean = total(arm.comm, np.einsum("ni,nik->k", weight, MV))
     return np.where(mean < 0.0, -1.0, 1.0)
 
 
@@ -125,12 +121,9 @@ def by_frame_fields(by: np.ndarray) -> np.ndarray:
 def dot(arm: ElasticArm, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return left . right (k, l), summed over the ranks, one of them a product with K or M."""
     rows = left.shape[0] * left.shape[1]
-    return total(arm, left.reshape(rows, left.shape[2]).T @ right.reshape(rows, right.shape[2]))
-
-
-def total(arm: ElasticArm, part: Any) -> Any:
-    """Return the sum over the arm's ranks; without the detour through MPI on a single one."""
-    return part if arm.comm.size == 1 else arm.comm.allreduce(part)
+    return np.asarray(
+        total(arm.comm, left.reshape(rows, left.shape[2]).T @ right.reshape(rows, right.shape[2]))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +177,7 @@ def orthonormalise(
         MQ = arm.mass_times(Q)
         overlap = dot(arm, MQ, np.concatenate([V, Q], axis=2))
         goal = np.eye(V.shape[2] + len(kept))[V.shape[2] :]
-        if np.abs(overlap - goal).max(initial=0.0) <= EXACT_TOLERANCE:
+        if np.abs(overlap - goal).max(initial=0.0) <= ROUNDING_SHARE:
             return Expansion(Q, MQ, np.vstack([by_V, R]), kept)
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the vectors of the reduction do not become orthonormal; ask for "
@@ -203,11 +196,11 @@ def _qr(
     for j, w in enumerate(columns):
         n = len(kept)
         for _ in range(2):
-            h = total(arm, MQ[:n] @ w)
+            h = total(arm.comm, MQ[:n] @ w)
             w -= h @ Q[:n]
             R[:n, j] += h
         Mw = arm.mass_times(w.reshape(n_nodes, dim, 1)).ravel()
-        length = np.sqrt(max(total(arm, w @ Mw), 0.0))
+        length = np.sqrt(max(total(arm.comm, w @ Mw), 0.0))
         if length <= least[j]:
             continue
         Q[n], MQ[n], R[n, j] = w / length, Mw / length, length
@@ -228,11 +221,11 @@ class InverseSpace:
         start: (r_0, k) coefficients of the first fields in the first r_0 columns.
     """
 
-    def __init__(self, arm: ElasticArm, first: np.ndarray, deflation: float):
+    def __init__(self, arm: ElasticArm, first: np.ndarray):
         """Begin with the fields `first` (n_nodes, d, k)."""
-        self.arm, self.deflation = arm, deflation
+        self.arm = arm
         none = np.empty((*first.shape[:2], 0))
-        expansion = orthonormalise(arm, first, none, none, deflation)
+        expansion = orthonormalise(arm, first, none, none, ROUNDING_SHARE)
         self.V, self.MV, self.start = expansion.Q, expansion.MQ, expansion.coefficients
         self.H = np.empty((self.V.shape[2], 0))
 
@@ -242,7 +235,7 @@ class InverseSpace:
         if done == self.V.shape[2]:
             return
         W = self.arm.static_response(*self.arm.restrict(self.MV[:, :, done:]))
-        new = orthonormalise(self.arm, W, self.V, self.MV, self.deflation)
+        new = orthonormalise(self.arm, W, self.V, self.MV, ROUNDING_SHARE)
         self.V = np.concatenate([self.V, new.Q], axis=2)
         self.MV = np.concatenate([self.MV, new.MQ], axis=2)
         H = np.zeros((self.V.shape[2], done + W.shape[2]))
@@ -274,7 +267,7 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
         length = np.sqrt(np.diag(energy))
         try:
             shares = np.linalg.eigvalsh(energy / np.outer(length, length))
-            if not shares[0] > EXACT_TOLERANCE * shares[-1]:  # not a number included
+            if not shares[0] > ROUNDING_SHARE * shares[-1]:  # not a number included
                 raise dependent
             inverse = np.linalg.inv(np.linalg.cholesky(energy))
         except np.linalg.LinAlgError:
@@ -304,7 +297,7 @@ def interior_rows(arm: ElasticArm, field: np.ndarray) -> np.ndarray:
     return field[arm.interior_nodes].reshape(arm.num_interior, field.shape[2])
 
 
-def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most: int) -> np.ndarray:
+def solve_at(arm: ElasticArm, omega: float, right: Rows) -> np.ndarray:
     """Solve (T'KT - omega^2 T'MT) z = right for all columns at once; a field (n_nodes, d, k).
 
     Block GMRES preconditioned with the factor of K at hand, in the inner product of M. Above the
@@ -313,12 +306,12 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most:
     takes 5, 6, 8 and 10 solves. A factor LDL' of the interior of K - omega^2 M would be dearer, and
     its constraint modes are infinite at the natural frequencies of the arm held at both ends.
 
+    Residuals are relative, after multiplication by K^-1, in the norm of M.
+
     Args:
         arm: with its design set.
         omega: rad/s; 0 needs one solve.
         right: loads of interior and outboard rows.
-        tolerance: of the residual, relative, after multiplication by K^-1, norm of M.
-        most: steps.
 
     Raises:
         ConvergenceError: omega is too close to a natural frequency.
@@ -326,8 +319,8 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most:
     first = arm.static_response(*right)
     if omega == 0.0:
         return first
-    space = InverseSpace(arm, first, 1e-13)
-    for _ in range(most):
+    space = InverseSpace(arm, first)
+    for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()
         rows, columns = space.H.shape
         operator = np.eye(rows, columns) - omega**2 * space.H
@@ -335,7 +328,7 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows, tolerance: float, most:
         goal[: len(space.start)] = space.start
         y = np.linalg.lstsq(operator, goal, rcond=None)[0]
         residual = np.linalg.norm(operator @ y - goal, axis=0)
-        if (residual <= tolerance * np.linalg.norm(goal, axis=0)).all():
+        if (residual <= ROUNDING_SHARE * np.linalg.norm(goal, axis=0)).all():
             return combine(space.V[:, :, :columns], y)
         if rows == columns:
             break

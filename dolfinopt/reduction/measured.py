@@ -3,25 +3,13 @@
 Each stands with its unit, what it rules, and what was measured.
 """
 
-# -- all ---------------------------------------------------------------------------------------
-
-# Relative residual of solutions and eigenpairs that are to be right to nearly all digits. Vectors
-# are then right to about 1e-10, which keeps designs equal to 1e-8 on any number of ranks; each
-# further digit costs a fraction of a step. Two rounds of Gram and Schmidt leave 1e-15 to 1e-14.
-# Part of a length or energy, of the largest, below which what is left of a vector beside others is
-# rounding, too: that leaves 1e-16 of dependent ones, independent ones have 1e-2.
-EXACT_TOLERANCE = 1e-12
-# Relative, of what needs fewer digits: modes without a factor and the adjoints of modes, from
-# which gradients are right to it, more than an optimiser can use.
-VECTOR_TOLERANCE = 1e-8
-ITERATIONS_LIMIT = 500  # of conjugate gradients for the adjoints of modes
-
 # -- eigenproblem --------------------------------------------------------------------------------
 
 # Relative gap of eigenvalues up to which there may be more of the same: with the tolerance
 # above, vectors of values that close are known to 1e-6 of one another only.
 EIGENVALUE_GAP = 1e-6
-# Part of a nearby mode, in M, beyond which the modes that were found do not contain it.
+# Part of a nearby mode, in M, beyond which the modes that were found do not contain it. Relative
+# residual with which from cold the next mode beyond is looked for: 8 solves, 18 to all digits.
 LOST_MODE_SHARE = 1e-2
 # Part of a ramp without symmetry in an initial space of old modes, in norm: from 1e-8 on the search
 # finds modes of another symmetry, up to 1e-4 it is not slower.

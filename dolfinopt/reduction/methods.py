@@ -11,7 +11,7 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm, Rows
-from dolfinopt.parallel import on_root
+from dolfinopt.parallel import on_root, total
 from dolfinopt.reduction.basis import (
     AdjointFields,
     Basis,
@@ -31,7 +31,6 @@ from dolfinopt.reduction.basis import (
 from dolfinopt.reduction.eigenproblem import Pencil, complement_solve, lowest_eigenpairs
 from dolfinopt.reduction.measured import (
     DEFLATION_SHARE,
-    EXACT_TOLERANCE,
     KRYLOV_BLOCKS_LIMIT,
 )
 
@@ -192,7 +191,7 @@ def krylov_adjoint(
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
-    inner = arm.comm.allreduce(interior_rows(arm, basis.V).T @ interior)
+    inner = total(arm.comm, interior_rows(arm, basis.V).T @ interior)
     inner += basis.outboard.T @ outboard
     weighted = arm.restrict(basis.MV)
     interior = (interior - weighted[0] @ inner) @ turn.T
@@ -206,7 +205,7 @@ def krylov_adjoint(
         cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
         interior[:, old] -= cotangents[0] @ H[old].T
         outboard[:, old] -= cotangents[1] @ H[old].T
-        mu = solve_at(arm, block.omega, cotangents, EXACT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
+        mu = solve_at(arm, block.omega, cotangents)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired
@@ -270,7 +269,7 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 now, columns = np.split(columns, [options.coordinates - V.shape[2]])
                 right = group(arm) if group else arm.restrict(MV)
                 right = right[0][:, now], right[1][:, now]
-                raw = solve_at(arm, omega, right, EXACT_TOLERANCE, KRYLOV_BLOCKS_LIMIT)
+                raw = solve_at(arm, omega, right)
                 new = orthonormalise(arm, raw, V, MV)
                 blocks.append(_Block(omega, group, now, new))
                 V, MV = np.concatenate([V, new.Q], axis=2), np.concatenate([MV, new.MQ], axis=2)
@@ -309,7 +308,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     """
     arm.profile.counts.reductions += 1
     first = arm.static_response(*_inputs(arm))
-    space = InverseSpace(arm, first, EXACT_TOLERANCE)
+    space = InverseSpace(arm, first)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
     for _ in range(KRYLOV_BLOCKS_LIMIT):
         space.extend()

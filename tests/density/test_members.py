@@ -133,7 +133,7 @@ def toml(data):
 ROBUST = ("arms.arm2.rigid=true", "arms.length=0.28", "arms.cells=[84,18]", "motion.radius=0.15",
           "motion.joint_height=-0.2", "objective.kind=static", "design.projection=robust",
           "design.continuation=5", "design.sharpness=32",
-          "optimizer.max_iterations=60")  # fmt: skip
+          "optimizer.max_iterations=40")  # fmt: skip
 
 
 @pytest.mark.serial

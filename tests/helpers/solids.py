@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from dolfinx.mesh import CellType, create_box
+from dolfinx.mesh import CellType, create_box, create_rectangle
 from mpi4py import MPI
 from runs import ROOT
 from scipy.sparse import csr_matrix, lil_matrix
@@ -74,14 +74,22 @@ def sixths(corners: np.ndarray) -> np.ndarray:
 
 
 def tetrahedra(comm: MPI.Comm, name: str, size: Sequence[float], cells: Sequence[int]) -> ArmMesh:
-    """Return a box of hexahedra, length, height and thickness in m, each cut into six."""
-    low = np.array([0.0, -0.5, -0.5]) * size
-    mesh = create_box(comm, [low, low + size], list(cells), CellType.tetrahedron)
+    """Return a box of hexahedra, length, height and thickness in m, each cut into six.
+
+    In the plane a rectangle of quadrilaterals, each cut into two triangles.
+    """
+    low = np.array([0.0, -0.5, -0.5])[: len(size)] * size
+    plane = len(size) == 2
+    create, kind = (
+        (create_rectangle, CellType.triangle) if plane else (create_box, CellType.tetrahedron)
+    )
+    mesh = create(comm, [low, low + size], list(cells), kind)
     owned, _ = compat.local_cell_counts(mesh)
-    corners, none = compat.cell_coordinates(mesh, owned), np.zeros(owned, dtype=bool)
+    corners = compat.cell_coordinates(mesh, owned)[:, :, : len(size)]
+    none = np.zeros(owned, dtype=bool)
     ends = [compat.facets_on(mesh, x, 1e-9) for x in (0.0, size[0])]
     volume, centroid = cell_sizes(corners), corners.mean(axis=1)
-    point = np.array([size[0], 0.0, 0.0])
+    point = np.array([size[0], 0.0, 0.0])[: len(size)]
     return ArmMesh(name, comm, mesh, centroid, volume, none, none.copy(), *ends, point)
 
 
