@@ -24,7 +24,8 @@ LEFT = 300  # of the middle of a row, px
 def layers() -> list[list[str]]:
     """Return the rooms that are packages or hold the public class, row by row from the top."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    (contract,) = settings["tool"]["importlinter"]["contracts"]
+    contracts = settings["tool"]["importlinter"]["contracts"]
+    (contract,) = (one for one in contracts if one["type"] == "layers")
     rows = [[name.strip() for name in row.split("|")] for row in contract["layers"]]
     rows = [[name for name in row if _files(name)] for row in rows]
     return [row for row in rows if row]

@@ -225,7 +225,7 @@ PLACES = [
     (evaluating, 0, evaluation, "simulate"),
     (evaluating, 0, evaluation, "_motion"),
     (gradients, LONE, motion, "esl_gradient"),
-    (gradients, 0, motion.MotionResponse, "_over_scenarios"),
+    (gradients, 0, motion.MotionResponse, "_frozen_moments"),
     (gradients, LONE, motion, "exact_gradient", EXACT),
     (gradients, 0, motion.MotionResponse, "cotangents", EXACT),
     (gradients, LONE, static, "tip_gradient", STATIC),

@@ -8,9 +8,7 @@ the slow rows keep all of their slow columns,
     [ J_fs  p_ff ],
 each of them block lower bidiagonal over the steps. The residual itself stays exact, so that the
 matrix decides about the number of iterations alone; with every coordinate slow it is exact.
-Without J_fs, which costs a tenth of an iteration, it takes two to three times as many. The first
-matrix of an iteration has one tangent a step: a third of the cost, and one inverse in the
-eigenvectors of A (Hairer & Wanner 1996, IV.8).
+Without J_fs, which costs a tenth of an iteration, it takes two to three times as many.
 """
 
 from __future__ import annotations
@@ -195,7 +193,6 @@ def factorise(
     qd: np.ndarray,
     a: np.ndarray,
     slow: np.ndarray,
-    exact: bool = True,
 ) -> NewtonMatrix:
     """Return Newton's matrix at an iterate, inverted; nan where a block is singular.
 
@@ -203,15 +200,8 @@ def factorise(
         stages: n steps.
         q, qd, a: (n, s, N) at their stages.
         slow: coordinates that are treated densely.
-        exact: or simplified: the tangent of a step's middle stage serves at all of its stages.
     """
-    if exact:
-        return matrix_of(stages, tangent_at(stages, q, qd, a, slow), slow)
-    count = a.shape[1]
-    middle = count // 2
-    at_middle = stages.instants[middle::count]
-    tangent = at_middle.linearise(q[:, middle], qd[:, middle], a[:, middle], slow)
-    return matrix_of(stages, tangent, slow)
+    return matrix_of(stages, tangent_at(stages, q, qd, a, slow), slow)
 
 
 def matrix_of(stages: Stages, tangent: Tangent, slow: np.ndarray) -> NewtonMatrix:

@@ -14,10 +14,11 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.certificate import compared
 from dolfinopt.optimization.measured import (
+    FORCE_ROUNDING,
     INSIDE_MARGIN,
+    OBJECTIVE_ROUNDING,
     PASSING_RATE,
     STEP_RATIO,
-    VALUE_ROUNDING,
 )
 from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, on_root, together
@@ -113,12 +114,14 @@ def taylor_test(
         exact = _with(exact, tolerance=min(error / AIM, 0.1))
     value = _fixed_objective(exact, variables, arms, patterns, profile, base)
     here = value(inside)
+    of_forces = "effort_weights" in scene.objective.response.options
+    rounding = (FORCE_ROUNDING if of_forces else OBJECTIVE_ROUNDING) * abs(here)
     rows = []
     for name, parts in _directions(scene, variables.arms).items():
         d = variables.join(parts)
         along = float(slope @ d)
         remainders = tuple(abs(value(inside + h * d) - here - h * along) for h in STEPS)
-        rate = _rate(remainders, VALUE_ROUNDING * abs(here))
+        rate = _rate(remainders, rounding)
         beside = np.nan if frozen is None else float(frozen @ d)
         rows.append(TaylorRow(name, along, beside, remainders, rate))
     angle, ratio = (np.nan, np.nan) if frozen is None else compared(slope, frozen)

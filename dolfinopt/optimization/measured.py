@@ -71,7 +71,8 @@ COMPARED_ITERATIONS = 40  # least, of which two evaluations beside the run are a
 
 STEP_RATIO = 4.0  # of one step to the next: remainders of second order fall by 16
 INSIDE_MARGIN = 0.05  # design variables are moved this far inside [0, 1]: steps must not leave it
-VALUE_ROUNDING = 1e-9  # part of drive forces that Newton's tolerance leaves open; of others a tenth
+OBJECTIVE_ROUNDING = 1e-10  # part of the objective that Newton's tolerance leaves open
+FORCE_ROUNDING = 1e-9  # the same of drive forces, which are made of accelerations
 PASSING_RATE = 1.9  # least; 2 is exact, a wrong gradient has 1
 
 # -- Approximation and its dual (mma); what is Svanberg's stands there --

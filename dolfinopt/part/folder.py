@@ -19,6 +19,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.output.folders import PARTS_LIST, prepare_folder, record_of_parts, remove_stale
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import with_relative_paths
+from dolfinopt.scene.toml import toml_value
 from dolfinopt.version import NUMERICS, __version__
 
 if TYPE_CHECKING:
@@ -223,7 +224,7 @@ def toml_text(data: Mapping[str, Any]) -> str:
     lines: list[str] = []
 
     def rows(table: Mapping[str, Any]) -> list[str]:
-        return [f"{k} = {_value(v)}" for k, v in table.items() if v is not None]
+        return [f"{k} = {toml_value(v)}" for k, v in table.items() if v is not None]
 
     plain = {k: v for k, v in data.items() if not _is_table(v)}
     lines += rows(plain)
@@ -239,19 +240,6 @@ def _is_table(value: Any) -> bool:
     if isinstance(value, list):
         return bool(value) and all(isinstance(row, dict) for row in value)
     return isinstance(value, dict)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, list):
-        return "[" + ", ".join(_value(one) for one in value if one is not None) + "]"
-    if isinstance(value, dict):
-        inner = ", ".join(f"{k} = {_value(v)}" for k, v in value.items() if v is not None)
-        return f"{{ {inner} }}"
-    return repr(value)
 
 
 # -- shapes.npz: what a search over shapes leaves at every step, so that a killed one can go on --

@@ -538,9 +538,10 @@ def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys
     Raises:
         InputError: a stated duration is too short for the limits.
     """
+    measured = _measure_path(tree)  # by which the path's least duration is known
     timed = _time_motion(tree, source, changes)
     others = _count_coordinates(tree), _limit_volume(tree), _freeze_loads(tree)
-    return *_measure_path(tree), *timed, *(key for keys in others for key in keys)
+    return *measured, *timed, *(key for keys in others for key in keys)
 
 
 FILTERED = 1.0 / 8.0  # radius of the filter over the height of the lowest arm

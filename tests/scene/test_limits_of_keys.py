@@ -142,3 +142,19 @@ def test_loads_and_weights_at_their_limits():
         run(["objective.kind=static", f"objective.loads=[{load}]"])
     for weight in (1e-9, 1e9):
         run([f'scenarios=[{{changes = ["payload.mass=4"], weight = {weight}}}]'])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_least_duration_of_an_arc_that_follows_the_arms(scale: float) -> None:
+    """The radius that is not stated is half of the arms' length, and the path pi times that."""
+    scene = scene_from_dict({
+        "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
+        "arms": [
+            {"name": "arm1", "length": scale, "height": 0.06, "thickness": 0.01},
+            {"name": "arm2"},
+        ],
+        "motion": {"path": "arc", "max_speed": 2.0},
+        "payload": {"mass": 6.0},
+    })  # fmt: skip
+    # The quintic's largest speed is 15/8 of the mean.
+    assert scene.motion.duration == pytest.approx(15.0 / 8.0 * np.pi * scale / 2.0, rel=1e-6)
