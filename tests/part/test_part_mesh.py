@@ -62,11 +62,11 @@ def test_sides_are_short_where_the_outline_bends_and_members_are_thin(meshes):
 
 
 def test_a_coarser_mesh_is_no_finer():
-    """Where twice the sides cannot follow an outline, they are those of the mesh itself."""
+    """Beside a hole that nearly touches the edge, too."""
     hole = Piece(Arc(np.array([0.15, 0.02967]), 0.0003, 0.0, -2.0 * np.pi))
     near_edge = Shape((*strip().loops[:1], (hole,)))
     fine, coarse = (body_mesh(near_edge, 0.005, factor) for factor in (1.0, 2.0))
-    assert np.array_equal(fine.points, coarse.points)
+    assert len(coarse.triangles) <= len(fine.triangles)
 
 
 def test_mesh_follows_curves_that_move():

@@ -43,7 +43,7 @@ MIDDLE = 0.7  # share of a portion that its line is fitted to
 LEAST = 0.3  # length of a side that is worth drawing, cells
 SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-SMALLEST = 3.0  # area of a hole, squared cells or tool radii
+SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
 ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
 SAME_AREA, ROUGHLY = 1e-3, 0.02  # relative; of few sides
 WORTH = 0.8  # of a distance from the outline, below which more sides come into question
@@ -103,7 +103,7 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     for kept in (limits, thin):  # what is thinner than asked for is told
         best: tuple[float, float, Sides] | None = None
         for share in ATTEMPTS:
-            made = _made(outline, kept, share * tolerance, area)
+            made = _made(outline, kept, share * tolerance, area, np.pi * limits.tool**2)
             if made is None:
                 continue
             off = abs(made.shape.area / area - 1.0)
@@ -123,14 +123,17 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
 
 def rough_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
     """Return few sides along an outline, which a search will move; None: there are none."""
-    made = (_made(outline, limits, share * tolerance, area) for share in ATTEMPTS)
+    least = SMALLEST * max(limits.cell, limits.tool) ** 2
+    made = (_made(outline, limits, share * tolerance, area, least) for share in ATTEMPTS)
     return next((one for one in made if one and abs(one.shape.area / area - 1.0) < ROUGHLY), None)
 
 
-def _made(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
+def _made(
+    outline: Outline, limits: Limits, tolerance: float, area: float, hole: float
+) -> Sides | None:
     """Return sides along an outline that keep the limits; None: there are none."""
     try:
-        drawn = _drawn(outline, limits, tolerance)
+        drawn = _drawn(outline, limits, tolerance, hole)
     except BrokenError:
         return None
     found = limits.nearest(drawn, area=area) or limits.nearest(drawn)
@@ -240,8 +243,8 @@ def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarr
 # -- loops of sides -------------------------------------------------------------------------------
 
 
-def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
-    """Return sides along an outline before their limits are looked at."""
+def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> Sides:
+    """Return sides along an outline before their limits are looked at; no smaller holes, m2."""
     import shapely
 
     domain, names = outline.domain, counting()
@@ -265,7 +268,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
     for ring in _rings(outline):
         runs = _runs(ring, lines, outline.chord, tolerance)
         for chain, halved in _chains(runs, len(edges) if domain.symmetric else -2):
-            if _is_small(chain, halved, limits):
+            if _hole_area(chain, halved) < hole:
                 continue
             twins = domain.symmetric and not halved
             if (circle := _free_circle(chain, halved, tolerance)) is not None:
@@ -304,13 +307,12 @@ def _chains(runs: list[Run], axis: int) -> Iterator[tuple[list[Run], bool]]:
             yield chain, True
 
 
-def _is_small(chain: Sequence[Run], halved: bool, limits: Limits) -> bool:
-    """Return whether a free chain bounds a hole that is not worth its outline."""
+def _hole_area(chain: Sequence[Run], halved: bool) -> float:
+    """Return the area of the hole that a free chain bounds, m2; infinite where it is not free."""
     if any(run.edge >= 0 for run in chain):
-        return False
+        return float("inf")
     x, y = np.vstack([run.points for run in chain]).T
-    area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) * (1.0 + halved)
-    return area < SMALLEST * max(limits.cell, limits.tool) ** 2
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) * (1.0 + halved)
 
 
 def _is_circle(drawn: Sequence[Drawn]) -> bool:
