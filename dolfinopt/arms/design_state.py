@@ -194,6 +194,7 @@ class DesignState:
     stiffened: bool = False
     kept: dict[str, Any] = field(default_factory=dict, init=False)
     _loaded: dict[int, tuple[np.ndarray, LoadedModes]] = field(default_factory=dict, init=False)
+    _moved: tuple[np.ndarray, LoadFields] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.x_phys = self.x_phys.copy()
@@ -298,9 +299,12 @@ class DesignState:
         """
         if "load_fields" in self.__dict__:
             return self.load_fields
-        known = self.unit_loads if self.stiffened else None
-        with self.elastic.profile.phase("stress"):
-            return load_fields(self.elastic, self.basis.V, self.basis.MV, known, moving)
+        if self._moved is None or not np.array_equal(self._moved[0], moving):
+            known = self.unit_loads if self.stiffened else None
+            with self.elastic.profile.phase("stress"):
+                fields = load_fields(self.elastic, self.basis.V, self.basis.MV, known, moving)
+            self._moved = moving, fields
+        return self._moved[1]
 
     @cached_property
     def first_frequency(self) -> float:

@@ -27,6 +27,7 @@ from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.plane.simpler import without_teeth
 from dolfinopt.part.problem import RESERVE, SIDES, FreeForm, Problem, State
 from dolfinopt.part.search import SidesSearch
 from dolfinopt.part.solid.free_surface import free_surface
@@ -217,7 +218,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
             sides = rough
         made = FreeSides(flat, sides, limits, solid)
         found = made.nearest(START_STEPS)
-        return made if found is None else found[0]
+        return (made if found is None else found[0]).simplified(without_teeth)[0]
     if not isinstance(part, SolidPart):
         raise InputError(
             f"--optimize: the wall of arm {part.name!r} is what dolfinopt optimize has moved "
@@ -368,7 +369,10 @@ class Descent:
     def _tighten(self, limits: tuple[Limit, ...]) -> None:
         """Go on with meshes that are finer where stress is largest, and with tighter limits."""
         self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
-        loop = {one.name: one for one in self.state.limits}
+        problem, state = self.problem, self.state
+        if state.places:  # as the search judges them
+            problem, state = problem.calibrated(state)
+        loop = {one.name: one for one in problem.limits_of(state)}
         missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
         if not missing:
             return

@@ -46,11 +46,12 @@ class State:
     Attributes:
         outlines, bodies: by the arm's place in the chain.
         simulated: the machine.
-        limits: of the scene, but for the volume's.
+        limits: of the scene, but for the volume's, and that of the stress by places.
         smooth, held: (k,) smooth value of each of them, and its limit, tightened and scaled so that
             the true value is limited.
         shares: relative constraints of the volumes.
         places: relative constraint of the stress of every fillet and side; empty of surfaces.
+        means: p-mean, Pa, of the stress of each of them, which it follows while a mesh does.
         owners: (n,) number of the place of every node of the arms' meshes; -1: none.
     """
 
@@ -62,6 +63,7 @@ class State:
     held: np.ndarray
     shares: np.ndarray
     places: Mapping[Place, float] = field(default_factory=dict)
+    means: Mapping[Place, float] = field(default_factory=dict)
     owners: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -114,7 +116,7 @@ class Problem:
         tightened: factor by the name of a limit, by which its value counts more.
         hot: places of every part (n, 2), m, near which its mesh is finer, once for every array.
         by_places: whether stress is limited place by place.
-        local: stress of a place on a finer mesh over that on this one.
+        local: stress of a place on a finer mesh, over its limit, by the p-mean on this one, 1/Pa.
         turns: (n,) of all pieces of an arm's sides along a side of their mesh, rad.
         stiffening: whether bodies have geometric stiffness; None: as the scene states.
     """
@@ -173,9 +175,9 @@ class Problem:
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
         limit, owners = self.scene.constraints.limit(STRESS), dict[int, np.ndarray]()
-        places: dict[Place, float] = {}
+        places, means = dict[Place, float](), dict[Place, float]()
         if limit is not None and self.by_places:
-            places, owners = self._places(simulated, every, bodies, limit)
+            places, means, owners = self._places(simulated, every, bodies, limit)
         elif limit is not None:
             stress, analysis = self._outline_stress(simulated, every)
             measured = stress.measure(analysis)
@@ -185,11 +187,8 @@ class Problem:
         known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
         shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
         smooth, most, areas = (np.array(one, dtype=float) for one in (smooths, held, shares))
-        if places and limit is not None:
-            worst = max(places.values())
-            true = (1.0 + worst) * limit / self._factor(Limit(STRESS, "", 0.0, limit, "Pa"))
-            known = (*known, Limit(STRESS, "", true, limit, "Pa"))
-        return State(outlines, bodies, simulated, tuple(known), smooth, most, areas, places, owners)
+        given = outlines, bodies, simulated, tuple(known), smooth, most, areas
+        return State(*given, places, means, owners)
 
     def _places(
         self,
@@ -197,26 +196,28 @@ class Problem:
         every: Mapping[int, FreeForm],
         bodies: Mapping[int, Any],
         limit: float,
-    ) -> tuple[dict[Place, float], dict[int, np.ndarray]]:
-        """Return the relative constraint of every place, and the places of all nodes."""
-        scene, found, owners = simulated.scene, dict[Place, float](), {}
+    ) -> tuple[dict[Place, float], dict[Place, float], dict[int, np.ndarray]]:
+        """Return the relative constraint and p-mean of every place, and the places of all nodes."""
+        scene, found, means, owners = simulated.scene, dict[Place, float](), {}, {}
         motions = motions_of(simulated.trajectory)
         factor = self._factor(Limit(STRESS, "", 0.0, limit, "Pa")) / limit
         for k, loads in arm_loads(scene, motions).items():
             state, part = simulated.arms[k].current, every[k].current
             points = part.stress(state, state.load_fields_of(every_instant(loads)))
-            stress = np.zeros(len(points.places))
-            for one in loads:
-                at, _ = maxima(MPI.COMM_SELF, points.A, points.coefficients(one))
-                stress = np.maximum(stress, at)
+            motion = [points.coefficients(one) for one in loads]
+            each = [maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion]
+            stress = np.max(each, axis=0)
+            means_of = points.means(motion, self._exponent(PLACE_EXPONENT))
             face = _face(bodies[k])
             near = cKDTree(face.points[face.sides[:, 0]]).query(points.places[:, :2])[1]
             counts = part.regular(points.places, scene.objective.stress_margin)
             owners[k] = np.where(counts & (points.weights > 0.0), face.owners[near], -1)
             for piece in np.unique(owners[k][owners[k] >= 0]).tolist():
-                largest = float(stress[owners[k] == piece].max())
-                found[k, piece] = largest * factor * self.local.get((k, piece), 1.0) - 1.0
-        return found, owners
+                here, key = owners[k] == piece, (k, piece)
+                means[key] = means_of(here)
+                as_found = float(stress[here].max()) * factor / means[key]
+                found[key] = means[key] * self.local.get(key, as_found) - 1.0
+        return found, means, owners
 
     def stress_slopes(self, state: State, keys: Sequence[Place]) -> list[np.ndarray]:
         """Return the derivatives (n,) of `State.places` of some places."""
@@ -224,14 +225,9 @@ class Problem:
         for key in keys:
             stress, analysis = self._place_stress(state, key)
             (row,) = stress.gradients(analysis)
-            scale = (1.0 + state.places[key]) / stress.measure(analysis).smooth[0]
+            scale = (1.0 + state.places[key]) / state.means[key]
             found.append(self._by_x(state, [{k: scale * g for k, g in row.items()}])[0])
         return found
-
-    def mean_stress(self, state: State, key: Place) -> float:
-        """Return the p-mean, Pa, that stands for the stress of a place in its derivatives."""
-        stress, analysis = self._place_stress(state, key)
-        return stress.measure(analysis).smooth[0]
 
     def _place_stress(self, state: State, key: Place) -> tuple[OutlineStress, Analysis]:
         nodes = {key[0]: state.owners[key[0]] == key[1]}
@@ -251,15 +247,21 @@ class Problem:
             return plain, fresh
         finest = replace(plain, turns=_turns(fresh, FINEST))
         fine = finest.evaluated(state.outlines, {}, fresh.solutions).places
-        local = {
-            key: min(max((1.0 + fine[key]) / (1.0 + value), LEAST_FINE), MOST_FINE)
-            for key, value in fresh.places.items()
-            if value > NEAR and key in fine
-        }
-        places = {
-            key: (1.0 + value) * local.get(key, 1.0) - 1.0 for key, value in fresh.places.items()
-        }
+        places = {}
+        for key, value in fresh.places.items():
+            ratio = (1.0 + fine.get(key, value)) / (1.0 + value) if value > NEAR else 1.0
+            places[key] = (1.0 + value) * min(max(ratio, LEAST_FINE), MOST_FINE) - 1.0
+        local = {key: (1.0 + value) / fresh.means[key] for key, value in places.items()}
         return replace(plain, local=local), replace(fresh, places=places)
+
+    def limits_of(self, state: State) -> tuple[Limit, ...]:
+        """Return the scene's limits, but for the volume's, with what a state makes of them."""
+        limit = self.scene.constraints.limit(STRESS)
+        if limit is None or not state.places:
+            return state.limits
+        stress = Limit(STRESS, "", 0.0, limit, "Pa")
+        true = (1.0 + max(state.places.values())) * limit / self._factor(stress)
+        return (*state.limits, replace(stress, value=true))
 
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0 + RESERVE)
@@ -273,11 +275,13 @@ class Problem:
     ) -> tuple[OutlineStress, Analysis]:
         """Return the stress on the outlines as a response, and what it is computed from."""
         parts = {k: one.current for k, one in outlines.items()}
-        one = simulated
+        one, p = simulated, self._exponent(exponent)
         given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
-        p = max(one.scene.objective.stress_exponent, exponent)
         options = one.scene.objective.model_copy(update={"stress_exponent": p})
         return OutlineStress(options, parts, nodes), analysis_of(*given)
+
+    def _exponent(self, least: float) -> float:
+        return max(self.scene.objective.stress_exponent, least)
 
     def _volumes(
         self, outlines: Mapping[int, FreeForm]

@@ -143,7 +143,7 @@ class SidesSearch:
         while True:
             if self.since >= FOLLOWED or self.steps >= iterations:
                 self._mesh_anew()
-                if self._settled():
+                if self._settled() and not self._simplified():
                     return "settled"
             if self.steps >= iterations:
                 self.spent = True
@@ -151,6 +151,8 @@ class SidesSearch:
             if not self._step():
                 self.lost += 1
                 if self.since == 0 or self.lost > PATIENCE:
+                    if self._simplified():
+                        continue
                     return "no step betters the parts"
                 self.since, self.radius = FOLLOWED, max(self.radius, 0.1)
                 continue
@@ -160,7 +162,7 @@ class SidesSearch:
     def _mesh_anew(self) -> None:
         """Go on with new meshes; the state on them may be the best one."""
         if self.falls and len(self.falls) % SIMPLER == 0:
-            self._simplify()
+            self._simplified()
         try:
             self.problem, self.state = self.problem.calibrated(self.state)
         except (ConvergenceError, InputError):  # sides that all but touch
@@ -174,22 +176,23 @@ class SidesSearch:
             self.best = self.state.released
         self.falls.append(self.best.values[0])
 
-    def _simplify(self) -> None:
+    def _simplified(self) -> bool:
         """Go on without sides that have vanished and holes that close, if that costs little."""
-        for k, one in sides_of(self.state).items():
+        before = self.state
+        for k, one in sides_of(before).items():
             simpler, count = one.simplified()
             if not count:
                 continue
             plain = replace(self.problem, local={})
             try:
-                found = plain.evaluated(
-                    {**self.state.outlines, k: simpler}, {}, self.state.solutions
-                )
+                outlines = {**self.state.outlines, k: simpler}
+                found = plain.evaluated(outlines, {}, self.state.solutions)
             except (ConvergenceError, InputError):
                 continue
             cost = self._merit(found, found) - self._merit(self.state, self.state)
             if cost < WORSE * np.sqrt(count) * abs(self.state.values[0]):
                 self.problem, self.state, self.before = plain, found, None
+        return self.state is not before
 
     def _settled(self) -> bool:
         if len(self.falls) < 3 or self.best.values[1:].max(initial=0.0) > 5.0 * EXCESS:

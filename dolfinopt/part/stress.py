@@ -10,7 +10,7 @@ Source: Williams (1952), doi:10.1115/1.4010553.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,7 @@ from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.part.mesh import CORNER
 from dolfinopt.part.plane.curves import Shape, direction
 from dolfinopt.part.solid.surface import distance_to_faces
+from dolfinopt.responses.measured import P_MEAN_STRIDE
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
     PointStress,
@@ -138,6 +139,16 @@ class CornerStress(PointStress):
         largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
         place = tuple(map(float, self.places[chosen][largest.point]))
         return Peak(largest.largest, place, float(t[largest.instant]))
+
+    def means(
+        self, motions: Sequence[np.ndarray], exponent: float
+    ) -> Callable[[np.ndarray], float]:
+        """Return what gives the p-mean over some points (n,), and over motions a (k, m), Pa."""
+        summed = [a[every(len(a))[::P_MEAN_STRIDE]] for a in motions]
+        stress = np.sqrt(np.square(self.A @ np.concatenate(summed).T).sum(axis=0))
+        unit = float(stress.max(initial=1e-300))
+        powers = ((stress / unit) ** exponent).mean(axis=1)
+        return lambda some: float(unit * powers[some].mean() ** (1.0 / exponent))
 
     def counted(self, counts: np.ndarray) -> CornerStress:
         """Return it with the points (n,) of the outline that count alone."""

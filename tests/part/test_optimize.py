@@ -79,11 +79,8 @@ def slopes_and_differences(problem, form, step):
             every = problem.every({0: moved})
             bodies = {k: one.followed(state.bodies[k]) for k, one in every.items()}
             other = problem.evaluated({0: moved}, bodies, state.solutions)
-            stress = [
-                problem.mean_stress(other, key) / problem.mean_stress(state, key) for key in keys
-            ]
             scaled = [
-                (1.0 + state.places[key]) * one for key, one in zip(keys, stress, strict=True)
+                (1.0 + state.places[key]) * other.means[key] / state.means[key] for key in keys
             ]
             values.append(np.append(other.against(state.held), scaled))
         changes.append((values[0] - values[1]) / (2.0 * step))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -36,6 +36,7 @@ MOST = 40  # sides and holes that go at once, at most
 FAR_STEPS = 40  # of Newton's to an outline without a strut
 WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
 Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
+Fewer = Callable[[Sides, Limits, int], Iterator[Sides]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +106,15 @@ class FreeSides:
         ]
         return np.vstack([np.zeros((1, self.sides.numbers[0])), *found]) @ self.sides.ties
 
-    def simplified(self) -> tuple[FreeSides, int]:
-        """Return it without what its limits hold at its least, and how many such things went."""
+    def simplified(self, fewer: Fewer = simplifications) -> tuple[FreeSides, int]:
+        """Return it without what its limits hold at its least, and how many such things went.
+
+        Args:
+            fewer: yields outlines without one of such things.
+        """
         made = self
         for number in range(MOST):
-            for sides in simplifications(made.sides, self.limits, self.part.domain.outer_edges):
+            for sides in fewer(made.sides, self.limits, self.part.domain.outer_edges):
                 found = replace(made, sides=sides).nearest()
                 if found is not None and found[0].count < made.count:
                     made = found[0]
