@@ -573,6 +573,7 @@ class Model:
         *,
         tool_radius: float | None = None,
         tolerance: float | None = None,
+        optimize: bool | None = None,
     ) -> dict[str, Part]:
         """Make parts for the workshop of a design, as `dolfinopt part` does.
 
@@ -583,6 +584,7 @@ class Model:
                 solids for those alone whose design is the same over the thickness.
             tolerance: how far sides may lie from the densities' outline, m; None: the scene's, or
                 half a cell.
+            optimize: whether to optimise the parts' shape; None: as the scene's [part] says.
 
         Returns:
             The parts by the names of the arms with a design of their own; empty but on rank 0.
@@ -592,6 +594,7 @@ class Model:
         """
         from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
         from dolfinopt.part.folder import file_names, write_parts
+        from dolfinopt.part.optimize import optimize_parts
         from dolfinopt.part.part import make_parts, mesh_parts
 
         self.scene.check_designed()
@@ -603,9 +606,13 @@ class Model:
             self._design_file(x, place / "design.npz")
             curves = self._curves(tool_radius, tolerance)
             found = make_parts(self.scene, place, curves, self._world)
-        if out is not None:
-            with together(self._world):
-                if self._world.rank == 0:
+        asked = self.scene.part
+        with together(self._world):
+            if self._world.rank == 0:
+                if asked.optimize if optimize is None else optimize:
+                    given = self.scene, found, asked.iterations, lambda _: None, asked.starts
+                    found = optimize_parts(*given).best.parts
+                if out is not None:
                     prepare_folder(out)
                     meshes = mesh_parts(found, coarse=False).fine
                     write_parts(out, self.scene, found, meshes)

@@ -231,13 +231,17 @@ class Made:
     shape: Optimized | None = None
 
     def checked(self, run: Path, say: Say) -> Made:
-        """Return it with what the parts do, or a warning where that cannot be simulated."""
+        """Return it with what the parts do, or a warning where that cannot be simulated.
+
+        What is known is of the parts before, which stand beside these.
+        """
         from dolfinopt.part.check import check_parts
 
         if self.meshes is None:
             return self
         try:
-            return replace(self, check=check_parts(self.scene, run, self.parts, self.meshes, say))
+            given = self.scene, run, self.parts, self.meshes, say, self.check
+            return replace(self, check=check_parts(*given))
         except ConvergenceError as error:
             warn([f"the machine with the parts cannot be compared: {error}"])
             return replace(self, check=None)
@@ -254,19 +258,11 @@ class Made:
         say("shapes")
         with _ended_as_interrupted():
             given = self.scene, self.parts, asked.iterations, tell, asked.starts
-            found = optimize_parts(*given, keep, known)
+            before = None if self.check is None else self.check.part
+            found = optimize_parts(*given, keep, known, before)
         click.echo("\n".join(found.sentences))
         after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
-        return self._followed_by(after, run, check, say)
-
-    def _followed_by(self, after: Made, run: Path, check: bool, say: Say) -> Made:
-        """Return other parts with what they do, and that of the first ones beside it."""
-        after = replace(after, check=None)
-        after = after.checked(run, say) if check else after
-        if self.check is None or after.check is None:
-            return after
-        before = self.check.before or self.check.part
-        return replace(after, check=replace(after.check, before=before))
+        return after.checked(run, say) if check else after
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""

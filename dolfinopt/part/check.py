@@ -59,6 +59,7 @@ class Column:
 
     Attributes:
         values: by the table's rows.
+        objective: of the scene.
         stress: the largest, None where it is not known.
         stressed: name of the arm that has it.
         limits: the scene's constraints, without that of the volume, which all forms share.
@@ -67,6 +68,7 @@ class Column:
     """
 
     values: Mapping[str, float]
+    objective: float
     stress: Peak | None
     stressed: str
     limits: tuple[Limit, ...]
@@ -227,7 +229,8 @@ def column_of(
     values = dict(_values(one, float("nan") if peak is None else peak.value))
     if not any(arm.is_solid for arm in one.scene.arms):  # of densities it is not looked at
         values[BUCKLING] = float("nan") if buckling is None else buckling.factor
-    return Column(values, peak, arm, tuple(limits), one.trajectory, buckling)
+    objective = one.evaluation.objective
+    return Column(values, objective, peak, arm, tuple(limits), one.trajectory, buckling)
 
 
 def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
@@ -589,6 +592,7 @@ def check_parts(
     parts: Mapping[int, Part],
     meshes: Meshes,
     say: Callable[[str], None] = lambda _: None,
+    known: Check | None = None,
 ) -> Check:
     """Simulate the densities of a run, the crisp design and the parts, on this rank alone.
 
@@ -598,12 +602,16 @@ def check_parts(
         parts: by their place in the chain.
         meshes: what `mesh_parts` returned of them.
         say: is told what is done next.
+        known: of the parts before, of the same densities, which stand beside these.
 
     Raises:
         ConvergenceError: the motion of the densities or of the parts cannot be simulated.
     """
-    say("the machine with the densities")
-    density, crisp = design_columns(scene, folder)
+    if known is None:
+        say("the machine with the densities")
+        density, crisp = design_columns(scene, folder)
+    else:
+        density, crisp = known.density, known.crisp
     say("the machine with the parts, larger cells")
     coarse = None
     if meshes.coarse:
@@ -624,4 +632,5 @@ def check_parts(
         views=gather_views(fine.scene, fine.partition, fine.arms, fine.x_phys, cells),
         singular=worst if grows else None,
         singular_arm=at,
+        before=None if known is None else known.part,
     )

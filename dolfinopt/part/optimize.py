@@ -18,7 +18,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.part.check import part_column, refined, simulate_parts
+from dolfinopt.part.check import Column, part_column, refined, simulate_parts
 from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
 from dolfinopt.part.plane.fit import rough_sides
@@ -137,6 +137,7 @@ def optimize_parts(
     starts: int = 0,
     keep: Keep | None = None,
     known: Sequence[Saved] = (),
+    before: Column | None = None,
 ) -> Optimized:
     """Return parts that are better by the scene's objective and keep its limits.
 
@@ -152,14 +153,15 @@ def optimize_parts(
         starts: trusses from which to begin, besides the parts themselves.
         keep: is given where the searches are, after every step.
         known: where those of an earlier call were, with which they go on.
+        before: what the parts do; None: it is not known.
 
     Raises:
         ConvergenceError: the machine with the parts cannot be simulated.
         InputError: parts have no free curves.
     """
     owned = {k: part for k, part in parts.items() if k not in scene.patterns}
-    value, limits, _ = _judged(scene, dict(parts))
-    given = Found("the parts themselves", dict(parts), 0, value, limits, "as they were")
+    one = _judged(scene, dict(parts))[0] if before is None else before
+    given = Found("the parts themselves", dict(parts), 0, one.objective, one.limits, "as they were")
     outlines = {k: _free(scene, k, part) for k, part in owned.items()}
     if not any(one.count for one in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")
@@ -196,7 +198,7 @@ def optimize_parts(
             break
     best = min([given, *found], key=lambda one: _rank(scene, one.value, one.limits))
     others = tuple(one for one in found if one is not best)
-    return Optimized(best, others, mesh_parts(best.parts), value, interrupted)
+    return Optimized(best, others, mesh_parts(best.parts), given.value, interrupted)
 
 
 def _free(scene: Scene, k: int, part: Part) -> FreeForm:
@@ -240,22 +242,19 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-Judgement = tuple[float, tuple[Limit, ...], dict[int, list[np.ndarray]]]
-
-
-def _judged(scene: Scene, parts: dict[int, Part]) -> Judgement:
-    """Return objective, limits and the places of largest stress of parts on refined meshes."""
+def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[Column, dict[int, list[np.ndarray]]]:
+    """Return what parts do on refined meshes, and the places of largest stress."""
     refine = any(one.REFINEMENTS for one in parts.values())
     meshes, coarse = mesh_parts(parts, refine), None
     if meshes.coarse:  # by what it differs they are refined
         coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
-    state, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
+    _, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
     hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     for place, one in stress.items():
         owner = scene.owners[place]
         if scene.constraints.limit("stress") is not None and owner is not None and len(one.hot):
             hot[owner] += HALVED * [one.hot]
-    return state.evaluation.objective, column.limits, hot
+    return column, hot
 
 
 # -- from one start ----------------------------------------------------------------------------
@@ -344,7 +343,7 @@ class Descent:
         for outlines in (self.state.outlines, *reversed(self.search.passed)):
             scene, made = self.problem.scene, self.problem.parts_of(outlines)
             try:
-                value, limits, hot = _judged(scene, made)
+                column, hot = _judged(scene, made)
             except (ConvergenceError, InputError) as error:
                 problem = error
                 continue
@@ -356,6 +355,7 @@ class Descent:
                 raise problem
             return replace(self.best, iterations=self.done), self.best.limits
         self.problem = replace(self.problem, hot=hot)
+        value, limits = column.objective, column.limits
         found = Found(start, made, self.done, value, limits, ending)
         if self.best is not None:
             known = self.best

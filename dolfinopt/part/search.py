@@ -28,7 +28,7 @@ from dolfinopt.responses.constraints import EXCESS
 FAR = 0.6  # cells that a side's end, or a radius, moves in a step, at most
 FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.005  # of the trust region, of FAR
 FOLLOWED = 6  # steps that a mesh follows
-SETTLED = 5e-3  # relative fall of the objective on two new meshes that ends the search
+SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the search
 HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, steps that rows hold
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
