@@ -26,7 +26,7 @@ from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.part.mesh import CORNER
 from dolfinopt.part.plane.curves import Shape, direction
 from dolfinopt.part.solid.surface import distance_to_faces
-from dolfinopt.responses.measured import P_MEAN_STRIDE
+from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE, P_MEAN_STRIDE
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
     PointStress,
@@ -143,12 +143,22 @@ class CornerStress(PointStress):
     def means(
         self, motions: Sequence[np.ndarray], exponent: float
     ) -> Callable[[np.ndarray], float]:
-        """Return what gives the p-mean over some points (n,), and over motions a (k, m), Pa."""
+        """Return what gives the p-mean over some points (n,), and over motions a (k, m), Pa.
+
+        That of `OutlineStress` of these points, which leaves out instants of hardly any stress.
+        """
         summed = [a[every(len(a))[::P_MEAN_STRIDE]] for a in motions]
         stress = np.sqrt(np.square(self.A @ np.concatenate(summed).T).sum(axis=0))
-        unit = float(stress.max(initial=1e-300))
-        powers = ((stress / unit) ** exponent).mean(axis=1)
-        return lambda some: float(unit * powers[some].mean() ** (1.0 / exponent))
+
+        def mean(some: np.ndarray) -> float:
+            own = stress[some]
+            instants = own.max(axis=0)
+            unit = max(float(instants.max()), 1e-300)
+            kept = instants >= NEGLIGIBLE_POWER_SHARE ** (1.0 / exponent) * unit
+            total = float(((own[:, kept] / unit) ** exponent).sum())
+            return unit * (total / own.size) ** (1.0 / exponent)
+
+        return mean
 
     def counted(self, counts: np.ndarray) -> CornerStress:
         """Return it with the points (n,) of the outline that count alone."""
