@@ -90,6 +90,8 @@ def test_part_of_a_solid(domain_with, density):
     domain = domain_with(density)
     part = make_solid_part(domain)
     assert part.watertight
+    told = [one for one in part.warnings if "closed cavities at (250.0, " in one]
+    assert len(part.cavities) == len(told) == (density is hollow)
     assert part.volume == pytest.approx(domain.volume, rel=1e-4)
     assert 0.01 * domain.cell < part.distance <= 0.5 * domain.cell
     data = triangle_bytes(MM * part.surface.corners, "part, mm")

@@ -24,6 +24,7 @@ from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
     at_volume,
+    cavities,
     check_surface,
     crossings,
     distance_to_faces,
@@ -192,6 +193,11 @@ class SolidPart:
         """Whether every edge has two triangles, which run along it in opposite directions."""
         return not len(open_edges(self.surface))
 
+    @cached_property
+    def cavities(self) -> np.ndarray:
+        """Middles (k, 3) of its closed cavities, m."""
+        return cavities(self.surface) if self.flat is None else np.empty((0, 3))
+
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
@@ -203,6 +209,12 @@ class SolidPart:
             found.append(
                 f"arm {one.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
+            )
+        if len(self.cavities):
+            places = "; ".join("({:.1f}, {:.1f}, {:.1f})".format(*at) for at in 1e3 * self.cavities)
+            found.append(
+                f"arm {one.name!r}: closed cavities at {places} mm, which no tool and no powder "
+                "leaves; [[arms.regions]] keeps a way out void"
             )
         return found + self._narrow()
 
@@ -245,6 +257,7 @@ class SolidPart:
             "widths_to": self.widths.to,
             "filter_radius": self.domain.filter_radius,
             "pieces_left_out": self.pieces,
+            "cavities": self.cavities.tolist(),
             "grayness": self.domain.grayness,
             "warnings": self.warnings,
         }
