@@ -28,7 +28,7 @@ from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.simpler import without_teeth
-from dolfinopt.part.problem import RESERVE, SIDES, FreeForm, Problem, State
+from dolfinopt.part.problem import RESERVE, FreeForm, Problem, State
 from dolfinopt.part.search import SidesSearch
 from dolfinopt.part.solid.free_surface import free_surface
 from dolfinopt.part.solid.part import SolidPart
@@ -40,7 +40,6 @@ from dolfinopt.scene.load import Scene
 ITERATIONS = 80  # default, at most, from every start
 FIRST = 0.75  # of them, before a finer mesh has judged
 ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
-HALVED = 2  # times that sides are halved where the finer mesh found stress to be largest
 START = 1.2  # distance of the first sides from the densities' outline, cells
 STUB = 1.5  # width of members that go where they end nowhere, cells
 START_STEPS = 40  # of Newton's to the first outline that keeps all limits
@@ -160,7 +159,7 @@ def optimize_parts(
         InputError: parts have no free curves.
     """
     owned = {k: part for k, part in parts.items() if k not in scene.patterns}
-    one = _judged(scene, dict(parts))[0] if before is None else before
+    one = _judged(scene, dict(parts)) if before is None else before
     given = Found("the parts themselves", dict(parts), 0, one.objective, one.limits, "as they were")
     outlines = {k: _free(scene, k, part) for k, part in owned.items()}
     if not any(one.count for one in outlines.values()):
@@ -226,7 +225,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeForm:
             f"--optimize: the wall of arm {part.name!r} is what dolfinopt optimize has moved "
             "already (arms.hollow); leave it out"
         )
-    return free_surface(part, part.mesh(SIDES))
+    return free_surface(part, part.mesh())
 
 
 def _rank(scene: Scene, value: float, limits: tuple[Limit, ...]) -> tuple[float, float]:
@@ -242,19 +241,13 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
     return fine.value / coarse.value * (1.0 + RESERVE)
 
 
-def _judged(scene: Scene, parts: dict[int, Part]) -> tuple[Column, dict[int, list[np.ndarray]]]:
-    """Return what parts do on refined meshes, and the places of largest stress."""
+def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
+    """Return what parts do on refined meshes."""
     refine = any(one.REFINEMENTS for one in parts.values())
     meshes, coarse = mesh_parts(parts, refine), None
     if meshes.coarse:  # by what it differs they are refined
         coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
-    _, column, stress, *_ = refined(scene, parts, meshes.fine, coarse)
-    hot: dict[int, list[np.ndarray]] = {k: [] for k in parts}
-    for place, one in stress.items():
-        owner = scene.owners[place]
-        if scene.constraints.limit("stress") is not None and owner is not None and len(one.hot):
-            hot[owner] += HALVED * [one.hot]
-    return column, hot
+    return refined(scene, parts, meshes.fine, coarse)[1]
 
 
 # -- from one start ----------------------------------------------------------------------------
@@ -343,7 +336,7 @@ class Descent:
         for outlines in (self.state.outlines, *reversed(self.search.passed)):
             scene, made = self.problem.scene, self.problem.parts_of(outlines)
             try:
-                column, hot = _judged(scene, made)
+                column = _judged(scene, made)
             except (ConvergenceError, InputError) as error:
                 problem = error
                 continue
@@ -354,7 +347,6 @@ class Descent:
                 assert problem is not None
                 raise problem
             return replace(self.best, iterations=self.done), self.best.limits
-        self.problem = replace(self.problem, hot=hot)
         value, limits = column.objective, column.limits
         found = Found(start, made, self.done, value, limits, ending)
         if self.best is not None:
@@ -367,7 +359,7 @@ class Descent:
         return found, limits
 
     def _tighten(self, limits: tuple[Limit, ...]) -> None:
-        """Go on with meshes that are finer where stress is largest, and with tighter limits."""
+        """Go on with limits that are tighter by what the finer mesh shows."""
         self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
         problem, state = self.problem, self.state
         if state.places:  # as the search judges them

@@ -24,7 +24,6 @@ from dolfinopt.responses.response import Analysis, objective_of
 from dolfinopt.responses.stress import arm_loads, every_instant, maxima, motions_of
 from dolfinopt.scene.load import Scene
 
-SIDES = 1.0  # of the triangles over those of the fine mesh
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
@@ -114,7 +113,6 @@ class Problem:
         scene: of the run.
         parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
-        hot: places of every part (n, 2), m, near which its mesh is finer, once for every array.
         by_places: whether stress is limited place by place.
         local: stress of a place on a finer mesh, over its limit, by the p-mean on this one, 1/Pa.
         turns: (n,) of all pieces of an arm's sides along a side of their mesh, rad.
@@ -124,7 +122,6 @@ class Problem:
     scene: Scene
     parts: Mapping[int, Any]
     tightened: Mapping[str, float]
-    hot: Mapping[int, list[np.ndarray]] = field(default_factory=dict)
     by_places: bool = False
     local: Mapping[Place, float] = field(default_factory=dict)
     turns: Mapping[int, np.ndarray] = field(default_factory=dict)
@@ -235,9 +232,7 @@ class Problem:
         return self._outline_stress(state.simulated, every, PLACE_EXPONENT, nodes)
 
     def _meshed(self, k: int, one: FreeForm) -> tuple[FreeForm, PartMesh]:
-        if isinstance(one, FreeSides):
-            return one.meshed(self.turns.get(k))
-        return one.meshed(SIDES, self.hot.get(k, ()))
+        return one.meshed(self.turns.get(k))
 
     def calibrated(self, state: State) -> tuple[Problem, State]:
         """Return the problem that knows what finer meshes say, and a state on new meshes."""

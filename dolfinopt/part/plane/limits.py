@@ -315,7 +315,9 @@ def _samples(every: list[Placed], spacing: float) -> tuple[np.ndarray, ...]:
     for number, one in enumerate(every):
         curve = one.piece.curve
         is_line = isinstance(curve, Line)
-        length = np.linalg.norm(curve.derivative(np.array([0.5])))
+        length = float(np.linalg.norm(curve.derivative(np.array([0.5]))))
+        if not length > 0.0:
+            raise BrokenError("a side or a fillet vanishes")
         count = max(3 if is_line else 5, int(length / spacing) + 1)
         t = np.linspace(0.0, 1.0, count)
         d = curve.derivative(t)

@@ -13,7 +13,7 @@ Source: Lazarov & Sigmund (2011), doi:10.1002/nme.3072.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -91,11 +91,9 @@ class FreeSurface:
         """Raise InputError: arms that repeat a solid's design each have their own surface."""
         raise InputError(REPEATED.format(name=part.name))
 
-    def meshed(
-        self, coarser: float, finer: Sequence[np.ndarray] = ()
-    ) -> tuple[FreeSurface, Tetrahedra]:
+    def meshed(self, _: np.ndarray | None = None) -> tuple[FreeSurface, Tetrahedra]:
         """Return the surface with a new mesh, whose nodes are other variables."""
-        mesh = self.made.mesh(coarser)
+        mesh = self.made.mesh()
         return free_surface(self.made, mesh), mesh
 
     def followed(self, _: Tetrahedra) -> Tetrahedra:
