@@ -105,8 +105,7 @@ def simulate_parts(
     """
     # Matrices of the parts before hang in cycles with their meshes; Python's collector, which does
     # not see how large they are, would let many of them gather (17 GB of solids in a search).
-    if any(arm.is_solid for arm in scene.arms):
-        gc.collect()
+    gc.collect()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for arm, owner in zip(scene.arms, scene.owners, strict=True):

@@ -9,6 +9,7 @@ Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil
@@ -158,6 +159,8 @@ def optimize_parts(
         ConvergenceError: the machine with the parts cannot be simulated.
         InputError: parts have no free curves.
     """
+    gc.collect()
+    gc.freeze()  # what is there already need not be looked through after each evaluation
     owned = {k: part for k, part in parts.items() if k not in scene.patterns}
     one = _judged(scene, dict(parts)) if before is None else before
     given = Found("the parts themselves", dict(parts), 0, one.objective, one.limits, "as they were")
@@ -195,6 +198,7 @@ def optimize_parts(
                 tell("interrupted: the best so far is judged and kept; once more gives it up")
                 found.append(descent.so_far(name))
             break
+    gc.unfreeze()
     best = min([given, *found], key=lambda one: _rank(scene, one.value, one.limits))
     others = tuple(one for one in found if one is not best)
     return Optimized(best, others, mesh_parts(best.parts), given.value, interrupted)
