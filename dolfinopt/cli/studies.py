@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 PRESETS = ("payload", "flattening", "coordinates")
 # Preset by the command's word; members of uniform section are a study of their own.
 COMPARED = {"objectives": "objective", "reductions": "reduction"}
-SECTIONS = "sections"
+SECTIONS, MOTIONS = "sections", "motions"
 
 designs_option = click.option(
     "--design",
@@ -183,7 +183,7 @@ def sweep(
 
 @click.command()
 @scene_argument
-@click.argument("what", type=click.Choice([*COMPARED, SECTIONS]))
+@click.argument("what", type=click.Choice([*COMPARED, SECTIONS, MOTIONS]))
 @click.option(
     "--coordinates",
     multiple=True,
@@ -204,7 +204,7 @@ def sweep(
     multiple=True,
     metavar="FILE",
     type=PATH,
-    help="design.npz that sections are compared with; default: the optimised design",
+    help="design.npz for sections or motions; default: the optimised design",
 )
 @study_command
 def compare(
@@ -217,13 +217,14 @@ def compare(
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
 
     With sections: compare its design with straight tubes and bars, of the same mass and the
-    lightest that hold the limits.
+    lightest that hold the limits. With motions: compare joints on the rigid path, input shapers
+    and feed-forward, with the machine as it is and with other payloads, stiffness, damping.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
-    if designs and what != SECTIONS:
-        raise InputError("--design: expected only with compare SCENE sections")
+    if designs and what not in (SECTIONS, MOTIONS):
+        raise InputError("--design: expected only with compare SCENE sections or motions")
     if coordinates and what != "reductions":
         raise InputError("--coordinates: expected only with compare SCENE reductions")
     if kinds and what != "objectives":
@@ -232,6 +233,10 @@ def compare(
         from dolfinopt.study.sections import NAME, study_sections
 
         return NAME, designs, partial(study_sections, scene, designs), {}
+    if what == MOTIONS:
+        from dolfinopt.study.motions import study_motions
+
+        return MOTIONS, designs, partial(study_motions, scene, designs), {}
     from dolfinopt.study.studies import study
 
     preset: Any = COMPARED[what]

@@ -190,6 +190,7 @@ class Solution:
         error: estimated relative error of the elastic coordinates.
         iterations: Newton iterations spent.
         strategy: how it was found.
+        held: whether motions that start from it keep its steps, whatever their error.
     """
 
     time_grid: np.ndarray
@@ -200,6 +201,7 @@ class Solution:
     error: float
     iterations: int
     strategy: Strategy = Strategy.HORIZON
+    held: bool = False
 
     @property
     def is_marched(self) -> bool:

@@ -377,10 +377,22 @@ class MachineSystem:
 
         Its rigid coordinates are held; 0 of rigid arms.
         """
+        return self.slowest_vibration(0)[0]
+
+    def slowest_vibration(self, place: int) -> tuple[float, float]:
+        """Return w, rad/s, and damping ratio of the slowest vibration, rigid coordinates held.
+
+        Args:
+            place: of the undeformed mechanism in `rest_mass`: 0 at the beginning, 2 at the end.
+        """
         if self.mechanism.num_coordinates == 0:
-            return 0.0
-        squares = np.linalg.eigvals(np.linalg.solve(self.mechanism.stiffness(), self.rest_mass[0]))
-        return float(np.sqrt(1.0 / np.abs(squares).max()))
+            return 0.0, 0.0
+        K, M = self.mechanism.stiffness(), self.rest_mass[place]
+        squares, shapes = np.linalg.eig(np.linalg.solve(K, M))
+        slowest = int(np.abs(squares).argmax())
+        frequency, shape = np.sqrt(1.0 / np.abs(squares[slowest])), shapes[:, slowest].real
+        damping = shape @ self.mechanism.damping() @ shape / (shape @ K @ shape)
+        return float(frequency), float(0.5 * damping * frequency)
 
     def preconditioner(self) -> Preconditioner:
         """Return the arms' vibrations; simulation and adjoint ask for the same.

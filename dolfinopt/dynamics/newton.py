@@ -86,22 +86,23 @@ def newton(
         limits: of the iteration.
     """
     slow, at = slow_coordinates(stages), _point(stages, state, a)
-    matrix, step = None, None
+    matrix, step, exact = None, None, False
     for iteration in range(1, limits.iterations + 1):
         spend(float(len(stages.h)))
         fresh = step is None
         if step is None:
             if len(chunks(stages, slow)) > 1:  # no room
                 return Iterate(at.a, False, iteration)
-            matrix = factorise(stages, at.q, at.qd, at.a, slow)
+            exact = matrix is not None  # the first one is simplified
+            matrix = factorise(stages, at.q, at.qd, at.a, slow, exact)
             step = _step(matrix, at)
         assert matrix is not None
         share, there, following = _damped(matrix, state, at, step, tolerance, limits)
         if share == 0.0:
-            if fresh and len(slow) == a.shape[2]:
+            if fresh and exact and len(slow) == a.shape[2]:
                 settled = max(SETTLED_SHARE * tolerance, ROUNDING)  # nothing is left but that
                 return Iterate(at.a, step.length <= settled, iteration, matrix)
-            slow = slow_coordinates(stages, len(slow)) if fresh else slow
+            slow = slow_coordinates(stages, len(slow)) if fresh and exact else slow
             step = None
             continue
         at, rate = there, following.length / step.length if step.length > 0.0 else 0.0
@@ -110,7 +111,8 @@ def newton(
         if share == 1.0 and rate <= KEPT_CONTRACTION:
             step = following
             continue
-        if share == 1.0 and fresh and step.length < SETTLED_SHARE and len(slow) < a.shape[2]:
+        poor = share == 1.0 and fresh and exact and step.length < SETTLED_SHARE
+        if poor and len(slow) < a.shape[2]:
             slow = slow_coordinates(stages, len(slow))  # what contracts poorly is the matrix
         step = None
     return Iterate(at.a, False, limits.iterations)

@@ -58,7 +58,8 @@ def integrate(
         tolerance: relative error of the elastic coordinates, energy norm, largest in time.
         stages: 1 <= s.
         profile: counts Newton iterations.
-        guess: solution of a nearby system: gives steps and first guess.
+        guess: solution of a nearby system: gives steps and first guess; its steps are kept if it
+            is held.
 
     Raises:
         ConvergenceError: neither Newton's method over the whole horizon nor a march converges,
@@ -66,6 +67,8 @@ def integrate(
     """
     if system.num_coordinates == 0:
         return _prescribed(system, stages)
+    if guess is not None and guess.held:
+        return replace(on_grid(system, guess.time_grid, tolerance, stages, guess), held=True)
     preconditioner = system.preconditioner()
     grid = None
     if guess is not None and guess.a.shape[2] == system.num_coordinates:

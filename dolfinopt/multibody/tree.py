@@ -375,6 +375,10 @@ class Mechanism:
         """Return the block-diagonal stiffness (N, N)."""
         return np.asarray(block_diag(*(body.K for body in self.bodies)))
 
+    def damping(self) -> np.ndarray:
+        """Return the block-diagonal damping (N, N)."""
+        return np.asarray(block_diag(*(body.D for body in self.bodies)))
+
 
 # -- what is between a drive and its arm: bearings, friction ---------------------------------
 

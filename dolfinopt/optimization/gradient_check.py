@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.arms.arm import Patterns
-from dolfinopt.dynamics.measured import AIM
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.certificate import compared
@@ -91,7 +91,7 @@ def taylor_test(
         InputError: the scene's objective has no exact gradient.
     """
     check_exact(scene)
-    exact, variables = _with(scene, gradient="exact"), Variables(scene, partition, arms)
+    exact, variables = _with(scene, "exact"), Variables(scene, partition, arms)
     given = variables.join({k: x[k] for k in variables.arms})
     inside = INSIDE_MARGIN + (1.0 - 2.0 * INSIDE_MARGIN) * given
     patterns = Patterns(scene, partition, arms)
@@ -105,14 +105,13 @@ def taylor_test(
         return variables.join(by)
 
     x_phys = _physical(variables, patterns, inside)
-    evaluation, base = evaluate(exact, partition, arms, x_phys, profile, simulated=False)
+    start = held_steps(evaluate(exact, partition, arms, x_phys, profile, simulated=False)[1])
+    _, base = evaluate(exact, partition, arms, x_phys, profile, start, simulated=False)
     slope, frozen = slope_of(exact), None
     if needs(scene, "motion"):
         if scene.objective.has_esl_gradient:
-            frozen = slope_of(_with(scene, gradient="esl"))
-        error = max(one.error for one in (evaluation, *evaluation.scenarios))
-        exact = _with(exact, tolerance=min(error / AIM, 0.1))
-    value = _fixed_objective(exact, variables, arms, patterns, profile, base)
+            frozen = slope_of(_with(scene, "esl"))
+    value = _fixed_objective(exact, variables, arms, patterns, profile, base, start)
     here = value(inside)
     of_forces = "effort_weights" in scene.objective.response.options
     rounding = (FORCE_ROUNDING if of_forces else OBJECTIVE_ROUNDING) * abs(here)
@@ -128,6 +127,11 @@ def taylor_test(
     return TaylorTest(tuple(rows), angle, ratio)
 
 
+def held_steps(motion: Trajectory | None) -> list[Solution]:
+    """Return what motions begin with that are to have the time steps of this one."""
+    return [] if motion is None else [replace(one, held=True) for one in motion.solutions]
+
+
 def check_exact(scene: Scene) -> None:
     """Raise InputError, of one line, where the objective has no exact gradient to test."""
     if not needs(scene, "motion"):
@@ -141,14 +145,10 @@ def check_exact(scene: Scene) -> None:
         )
 
 
-def _with(scene: Scene, *, gradient: str | None = None, tolerance: float | None = None) -> Scene:
-    """Return the scene with another gradient or tolerance."""
-    update: dict[str, object] = {}
-    if gradient is not None:
-        update["objective"] = scene.objective.model_copy(update={"gradient": gradient})
-    if tolerance is not None:
-        update["simulation"] = scene.simulation.model_copy(update={"tolerance": tolerance})
-    return scene.model_copy(update=update)
+def _with(scene: Scene, gradient: str) -> Scene:
+    """Return the scene with another gradient."""
+    objective = scene.objective.model_copy(update={"gradient": gradient})
+    return scene.model_copy(update={"objective": objective})
 
 
 def _physical(variables: Variables, patterns: Patterns, x: np.ndarray) -> dict[int, np.ndarray]:
@@ -164,12 +164,10 @@ def _fixed_objective(
     patterns: Patterns,
     profile: Profile,
     base: Trajectory | None,
+    start: Sequence[Solution],
 ) -> Callable[[np.ndarray], float]:
-    """Return J(x), of a motion with the load cases and time steps of `base`."""
-    # Of the error that is aimed at, so that every scenario keeps its steps.
-    error, solutions = AIM * scene.simulation.tolerance, () if base is None else base.solutions
-    start, response = [replace(one, error=error) for one in solutions], objective_of(scene)
-    partition = variables.partition
+    """Return J(x), of a motion with the load cases of `base` and the time steps of `start`."""
+    partition, response = variables.partition, objective_of(scene)
 
     def value(x: np.ndarray) -> float:
         x_phys = _physical(variables, patterns, x)

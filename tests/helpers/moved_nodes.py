@@ -11,16 +11,15 @@ from mpi4py import MPI
 from remainders import Built, built_of
 from solids import tetrahedra
 
-from dolfinopt.dynamics.radau import AIM
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.checks import cell_sizes
-from dolfinopt.optimization.gradient_check import _at, _with
+from dolfinopt.optimization.gradient_check import _at, held_steps
 from dolfinopt.parallel import on_root, sum_over_arms
 from dolfinopt.responses.evaluation import analysis_of, evaluate
 from dolfinopt.responses.motion import MotionResponse
 from dolfinopt.responses.products import by_nodes
-from dolfinopt.responses.response import Response, needs, objective_of
+from dolfinopt.responses.response import Response, objective_of
 from dolfinopt.scene.load import Arm, Scene
 
 # From an arm's name and the places of its nodes (n, d), m, to their moves (n, d), m.
@@ -100,7 +99,8 @@ def node_test(
     regular: dict[str, np.ndarray] = {}
     built = built_with(scene, places(0.0), cut, regular)
     x = built.fields(design)
-    evaluation, base = built.evaluate(x)
+    start = held_steps(built.evaluate(x)[1])
+    _, base = evaluate(*built.place, x, built.profile, start, simulated=False)
     rows = response.gradients(
         analysis_of(scene, built.partition, built.arms, base, built.profile, by_nodes)
     )
@@ -112,14 +112,10 @@ def node_test(
         direction = moves(mesh.name, regular[mesh.name])
         parts[k] = np.array(size * np.sum(found[k][:owned] * direction[:owned]))
     slope = float(sum_over_arms(built.partition, parts))
-    fixed = scene
-    if needs(scene, "motion"):
-        fixed = _with(scene, tolerance=min(evaluation.error / AIM, 0.1))
 
     def value(h: float) -> float:
-        step = built_with(fixed, places(h), cut)
-        place = fixed, step.partition, step.arms
-        start = () if base is None else base.solutions
+        step = built_with(scene, places(h), cut)
+        place = scene, step.partition, step.arms
         _, trajectory = evaluate(*place, x, step.profile, start, simulated=False)
         if not isinstance(response, MotionResponse):
             return response.measure(analysis_of(*place, trajectory, step.profile)).total

@@ -1,0 +1,276 @@
+"""What joints can do about arms that bend: one machine on several motions, side by side.
+
+The joints on the rigid machine's path, the same command through input shapers, joints with
+feed-forward, and feed-forward with arms that were designed for it. Every motion is simulated with
+the machine that it was made for, and with machines that differ from it: payload, stiffness,
+damping.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from mpi4py import MPI
+
+from dolfinopt.arms.arm import chain_of
+from dolfinopt.disk import make_folder, write_text
+from dolfinopt.dynamics.build import build_system, desired_motion
+from dolfinopt.dynamics.simulation import simulate
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.output.design import arms_with_design
+from dolfinopt.parallel import on_root, together
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.study.cases import Case, Outcome, run_cases
+from dolfinopt.study.studies import DEVIATION, Design, deviation_panels, given_designs
+from dolfinopt.study.tables import LineFigure, Study, Table
+
+NAME = "motions"  # of the study's files, and of the folder of the shaped joints
+RIGID, FORWARD = "joints on the rigid path", "feed-forward"
+DESIGNED = "feed-forward, arms designed for it"
+SHAPERS: dict[ShaperKind, str] = {
+    "zv": "input shaper ZV",
+    "zvd": "input shaper ZVD",
+    "ei": "input shaper EI",
+}
+# Keys of [motion] that a table of joints keeps.
+KEPT = ("base", "base_position", "cart_mass", "joint_height", "gravity", "initial_joints")
+ROWS = 2000  # of a table of shaped joints
+TEN_PERCENT, FIVE_PERCENT = 1.1, 0.95
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine that a motion does not know: its name in the table, and what differs."""
+
+    label: str
+    change: str
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion in the table.
+
+    Attributes:
+        case: its simulation, labelled.
+        longer: by how much it takes longer than the scene's, s.
+        finer: deviation in a finer model, m; nan where there is none.
+    """
+
+    case: Case
+    longer: float = 0.0
+    finer: float = math.nan
+
+
+@dataclass(frozen=True)
+class Row:
+    """A motion and what came out."""
+
+    motion: Motion
+    outcome: Outcome
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return self.motion.case.label
+
+
+def study_motions(
+    scene: Scene, designs: Sequence[Path], folder: Path, world: MPI.Comm, *, shown: bool = True
+) -> Study:
+    """Compare motions of a scene's machine (collective).
+
+    Args:
+        scene: whose arms move.
+        designs: design.npz of the arms; none: they are optimised, for the rigid path and again for
+            feed-forward.
+        folder, world, shown: see `cases.run_cases`.
+
+    Raises:
+        InputError: the scene's motion cannot be corrected or shaped; nothing was computed.
+    """
+    design = on_root(world, _design, scene, designs)
+    searched = [design, Case(with_kind(scene, "tip"), "optimize", label=DESIGNED)]
+    searched = searched if isinstance(design, Case) else []
+    found = run_cases(searched, folder, world, shown=shown)
+    if found.failures:
+        failed = tuple(text for one in found.failures for text in one.failures)
+        return Study(NAME, (), (), failed, found.computed)
+    files = [found[one].design for one in searched] or [design]
+    motions = on_root(world, _motions, scene, files, folder / NAME)
+    done = run_cases([one.case for one in motions], folder, world, shown=shown)
+    rows = [Row(one, done[one.case]) for one in motions]
+    with together(world):
+        table, figure = report(scene, rows)
+    failed = tuple(text for row in rows for text in row.outcome.failures)
+    return Study(NAME, (table,), (figure,), failed, found.computed + done.computed)
+
+
+def _design(scene: Scene, designs: Sequence[Path]) -> Design:
+    """Return the arms' design; raise InputError where the motion has no feed-forward."""
+    if len(designs) > 1:
+        raise InputError(f"--design: expected one file with compare motions, found {len(designs)}")
+    with_kind(scene, "tip")
+    return [*given_designs(scene, designs).values()][-1]
+
+
+def with_kind(scene: Scene, kind: str) -> Scene:
+    """Return the scene with feed-forward of a kind, of its control, too."""
+    data = scene.to_tree()
+    data["feed_forward"] = data["feed_forward"] | {"kind": kind} if kind != "none" else {}
+    if scene.control is not None and scene.control.feed_forward in ("rigid", "tip"):
+        data["control"]["feed_forward"] = "tip" if kind == "tip" else "rigid"
+    return scene_from_dict(data, scene.source)
+
+
+def machines(scene: Scene) -> list[Machine]:
+    """Return the machines that motions do not know, those that differ from the scene's."""
+    found, material = [], scene.material
+    if scene.payload.mass > 0.0:
+        mass = TEN_PERCENT * scene.payload.mass
+        found.append(Machine("payload + 10 %", f"payload.mass={mass!r}"))
+    if isinstance(material.young_modulus, float):
+        young = FIVE_PERCENT * material.young_modulus
+        found.append(Machine("E - 5 %", f"material.young_modulus={young!r}"))
+    if scene.damping.stiffness_proportional > 0.0:
+        half = 0.5 * scene.damping.stiffness_proportional
+        found.append(Machine("half the damping", f"damping.stiffness_proportional={half!r}"))
+    return found
+
+
+def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list[Motion]:
+    """Return the motions with the first design, and feed-forward with the second (root only)."""
+    first, *second = designs
+    rigid, forward = _judged(with_kind(scene, "none")), _judged(with_kind(scene, "tip"))
+    found = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer_deviation(rigid, first))]
+    frequency, damping_ratio = vibration(rigid, first)
+    if frequency > 0.0 and scene.motion.table_ends == "rest":
+        for kind, label in SHAPERS.items():
+            shaper = input_shaper(kind, frequency, damping_ratio)
+            shaped = write_shaped(rigid, shaper, folder / f"{kind}.csv")
+            found.append(Motion(Case(shaped, "simulate", first, label), shaper.longer))
+    for label, design in zip((FORWARD, DESIGNED), (first, *second), strict=False):
+        case = Case(forward, "simulate", design, label)
+        found.append(Motion(case, 2.0 * forward.lead, finer_deviation(forward, design)))
+    return found
+
+
+def _judged(scene: Scene) -> Scene:
+    """Return the scene with the machines that it does not know as its scenarios."""
+    data = scene.to_tree()
+    data["scenarios"] = [{"changes": [one.change]} for one in machines(scene)]
+    return scene_from_dict(data, scene.source)
+
+
+def finer_deviation(scene: Scene, design: Path | None) -> float:
+    """Return the largest deviation in a finer model that moves with this one's corrections, m.
+
+    It has twice the elastic coordinates, and geometric stiffness; nan where it is not solved.
+    """
+    data = scene.to_tree() | {"scenarios": []}
+    here = scene_from_dict(data, scene.source)
+    count = here.reduction.coordinates
+    if isinstance(count, str):
+        return math.nan
+    data["reduction"]["coordinates"] = 2 * count
+    data["simulation"]["stiffening"] = True
+    there, profile = scene_from_dict(data, scene.source), Profile()
+    try:
+        held = None
+        if here.feed_forward.on:
+            held = simulate(here, _bodies(here, design), profile).feed_forward
+        moved = simulate(there, _bodies(there, design), profile, feed_forward=held)
+    except ConvergenceError:
+        return math.nan
+    return moved.max_deviation[0]
+
+
+def _bodies(scene: Scene, design: Path | None) -> list[ShapeIntegrals]:
+    """Return the reduced arms of a design, from the base outwards (this rank alone)."""
+    _, arms, x_phys = arms_with_design(MPI.COMM_SELF, scene, design, Profile())
+    return chain_of(scene, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
+
+
+def vibration(scene: Scene, design: Path | None) -> tuple[float, float]:
+    """Return frequency, rad/s, and damping ratio of the slowest vibration at the motion's end."""
+    return build_system(scene, _bodies(scene, design)).slowest_vibration(2)
+
+
+def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
+    """Write the joints of a scene's shaped motion as a table; return the scene that follows it."""
+    motion = desired_motion(scene)
+    joints = np.arange(scene.num_rigid)[scene.driven_columns]
+    end = scene.motion.duration + shaper.longer
+    t = np.linspace(0.0, end, ROWS)
+    rows = np.column_stack([t, shaper.shaped(lambda t: motion(t).q[:, joints], t)])
+    lines = [",".join(f"{x:.15g}" for x in row) for row in rows.tolist()]
+    make_folder(file.parent)
+    write_text(file, "\n".join([",".join(["t", *scene.driven]), *lines, ""]))
+    data = scene.to_tree()
+    kept = {key: data["motion"][key] for key in KEPT if key in data["motion"]}
+    horizon = scene.motion.horizon + shaper.longer
+    table = {"path": "joints", "file": str(file.absolute()), "duration": end, "horizon": horizon}
+    return scene_from_dict(data | {"motion": kept | table}, scene.source)
+
+
+# -- table, sentence, picture ----------------------------------------------------------------
+
+
+def report(scene: Scene, rows: Sequence[Row]) -> tuple[Table, LineFigure]:
+    """Return the table under a sentence, and the deviations over time."""
+    frame = pd.DataFrame([_cells(scene, row) for row in rows])
+    table = Table("", f"{_verdict(rows)} {NOTE}", frame)
+    shown = [row.outcome for row in rows if not row.outcome.failure]
+    title = "Deviation of the tip from the path of each motion"
+    return table, LineFigure("deviation", title, tuple(deviation_panels(shown)))
+
+
+NOTE = (
+    "Deviations are from the path that rigid arms would take with the same command; a shaped "
+    "command's own path is rounder and later than the scene's. Machines that a motion does not "
+    "know move with the same joints. The finer model has twice the coordinates and geometric "
+    "stiffness. The settling is the largest deviation after the motion."
+)
+
+
+def _verdict(rows: Sequence[Row]) -> str:
+    """Return how far the tip is off with the first motion and with the best."""
+    able = [row for row in rows if not row.outcome.failure]
+    if not able:
+        return "No motion can be simulated."
+    first, best = able[0], min(able, key=lambda row: row.outcome.max_deviation)
+    return (
+        f"With {first.name} the tip is off by {1e3 * first.outcome.max_deviation:.4g} mm, with "
+        f"{best.name} by {1e3 * best.outcome.max_deviation:.4g} mm."
+    )
+
+
+def _cells(scene: Scene, row: Row) -> dict[str, Any]:
+    """Return a row by column."""
+    outcome = row.outcome
+    summary = {} if outcome.failure else outcome.summary()
+    cells: dict[str, Any] = {
+        "motion": row.name,
+        "mass [kg]": summary.get("designed_mass", math.nan),
+        "longer by [s]": row.motion.longer,
+        DEVIATION: 1e3 * outcome.max_deviation,
+        "finer model [mm]": 1e3 * row.motion.finer,
+        "settling [mm]": 1e3 * summary.get("settling", math.nan),
+    }
+    for one, found in zip(machines(scene), summary.get("scenarios", ()), strict=False):
+        cells[f"{one.label} [mm]"] = 1e3 * found["max_deviation"]
+    units = scene.rigid_units
+    for name in scene.driven:
+        unit = "N" if units[name] == "m" else "N m"
+        cells[f"peak {name} [{unit}]"] = summary.get("drive_peak", {}).get(name, math.nan)
+    if outcome.failure:
+        cells["failed"] = outcome.failure
+    return cells
