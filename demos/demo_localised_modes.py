@@ -98,8 +98,8 @@ def spectrum(law: str, void: float, cells: tuple[int, int]) -> Spectrum:
     strain, kinetic = np.empty(MODES), np.empty(MODES)
     for k in range(MODES):
         mode = arm.basis.V[:, :, [k]]
-        stiff = arm.material.stiffness * arm.elastic.cell_stiffness_products(mode, mode)
-        heavy = arm.material.mass * arm.elastic.cell_mass_products(mode, mode)
+        stiff = arm.current.material.stiffness * arm.elastic.cell_stiffness_products(mode, mode)
+        heavy = arm.current.material.mass * arm.elastic.cell_mass_products(mode, mode)
         strain[k] = stiff[x_phys < SWITCH].sum() / stiff.sum()
         kinetic[k] = heavy[x_phys < SWITCH].sum() / heavy.sum()
     around = arm.elastic.operators.cells[:, [0, 1, 3, 2]]  # from the order of a tensor product

@@ -20,6 +20,7 @@ import dolfinopt
 from dolfinopt.bench.field import Value, read_cases
 from dolfinopt.cli import commands
 from dolfinopt.scene.load import describe_keys
+from dolfinopt.scene.old_words import OLD_WORDS
 
 ROOT = Path(__file__).parents[1]
 ARRAYS = ("arms", "arms.regions", "arms.interfaces", "joints", "closures", "scenarios")
@@ -103,11 +104,19 @@ def scene_reference() -> str:
             lines += [f"{TABLES.get(table, '')}\n"] if table else []
             lines += ["| key | meaning | unit | default | allowed |", "|---|---|---|---|---|"]
         meaning, unit = _with_unit(info.description)
+        meaning += "".join(f"; also of [[{other}]]" for other in info.also)
         default = f"`{info.default}`" if info.default else "required"
         default = "none" if info.default == "none" else default
         allowed = info.allowed.replace(" | ", " or ")
         lines.append(f"| `{key}` | {_cell(meaning)} | {unit} | {default} | {_cell(allowed)} |")
+    lines += ["\n## Older words {#older}\n", OLDER, "| older | now |", "|---|---|"]
+    lines += [f"| `{word.old}` | {_cell(word.new)} |" for word in OLD_WORDS]
     return "\n".join(lines) + "\n"
+
+
+OLDER = """Scenes of earlier versions are read, and so are the folders of their runs. A run tells in
+one line what it translated; `dolfinopt keys --upgrade SCENE` rewrites a file, with its comments.
+"""
 
 
 def _with_unit(description: str) -> tuple[str, str]:

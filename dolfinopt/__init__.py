@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.simulation import simulate
     from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.errors import ConvergenceError, InputError
+    from dolfinopt.loading import load_scene
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
     from dolfinopt.optimization.result import Result
     from dolfinopt.output.design import gather_views
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import Evaluation, evaluate, gradient
     from dolfinopt.responses.order_selection import choose_coordinates
-    from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
+    from dolfinopt.scene.load import Scene, scene_from_dict
 
 _HOME = {
     "Arm": "arms.arm",
@@ -64,7 +65,7 @@ _HOME = {
     "abort_together": "parallel",
     "partition_arms": "parallel",
     "Scene": "scene.load",
-    "load_scene": "scene.load",
+    "load_scene": "loading",
     "scene_from_dict": "scene.load",
     "Trajectory": "dynamics.trajectory",
     "simulate": "dynamics.simulation",

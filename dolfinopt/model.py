@@ -33,10 +33,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm, build_arms, fixed_body, uniform_design
+from dolfinopt.arms.arm import Arm, build_arms, uniform_design
 from dolfinopt.disk import write_arrays
-from dolfinopt.dynamics.build import check_forces, check_motion
 from dolfinopt.errors import InputError
+from dolfinopt.loading import load_scene
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.optimization.result import RankResult, Result
 from dolfinopt.optimization.state import HistoryRow, fields_of
@@ -49,7 +49,6 @@ from dolfinopt.output.design import (
     read_design,
 )
 from dolfinopt.output.folders import check_unused, working_alone
-from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
@@ -58,7 +57,7 @@ from dolfinopt.responses.evaluation import constraint_gradients, evaluate, gradi
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
-from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
+from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import GradientKind
 from dolfinopt.scene.toml import toml_value
 
@@ -407,8 +406,8 @@ class Model:
         scene = self.scene
         scene.check_designed()
         if kind is not None:
-            objective = scene.objective.model_copy(update={"gradient": kind})
-            scene = scene.model_copy(update={"objective": objective})
+            objective = scene.objective.unchecked_copy({"gradient": kind})
+            scene = scene.unchecked_copy({"objective": objective})
         partition, arms, x_phys = self._prepared(x)
         if needs(scene, "motion"):
             choose_coordinates(scene, partition, arms, x_phys, self._profile)
@@ -490,6 +489,8 @@ class Model:
                 neither `resume` nor `overwrite` is set; another run works there.
             ConvergenceError: a simulation failed.
         """
+        from dolfinopt.output.run_folder import optimize, write_result  # with the optimiser
+
         begun, place = time.perf_counter(), None if folder is None else Path(folder)
         partition, arms = self._arms()
         first = None if x0 is None else self._prepared(x0)[2]
@@ -518,6 +519,8 @@ class Model:
         self, result: SimulationResult, folder: str | Path, *, overwrite: bool = False
     ) -> None:
         """Write a result of this scene, see `SimulationResult.save` (collective)."""
+        from dolfinopt.output.run_folder import write_result  # with the optimiser
+
         begun, place = time.perf_counter(), Path(folder)
         check = None if overwrite else partial(check_unused, place)
         partition, arms, x_phys = self._prepared(result)
@@ -770,18 +773,9 @@ def _load(
 ) -> Scene:
     """Read and check a scene (root only)."""
     overrides = [text for one in changes for text in _texts(one)]
-    if isinstance(scene, Scene):
-        loaded = scene_from_dict(scene.to_tree(), scene.source, overrides) if overrides else scene
-    elif isinstance(scene, Mapping):
-        loaded = scene_from_dict(scene, overrides=overrides)
-    else:
-        loaded = load_scene(scene, overrides)
-    check_motion(loaded)
-    check_forces(loaded)
-    for index, arm in enumerate(loaded.arms):
-        if arm.sid is not None:
-            fixed_body(loaded, index)
-    return loaded
+    if isinstance(scene, Scene) and not overrides:
+        return scene
+    return load_scene(scene, overrides)
 
 
 def _model_of(scene: Scene, alone: bool) -> Model:

@@ -23,7 +23,7 @@ from dolfinopt.errors import InputError, OutputError
 from dolfinopt.mesh import compat
 from dolfinopt.output import checkpoint
 from dolfinopt.parallel import abort_together
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 from dolfinopt.study.cases import Case, run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
@@ -117,7 +117,7 @@ def test_a_full_disk_ends_a_run_in_one_line(after, tmp_path, monkeypatch, capsys
     assert not [one for one in tmp_path.iterdir() if one.name.startswith(".")]
     assert not (tmp_path / "summary.json").exists()
     if after > 0:
-        checkpoint.check(tmp_path, load_scene(paper_scene(), COARSE))
+        checkpoint.check(tmp_path, read_scene(paper_scene(), COARSE))
 
 
 @pytest.mark.serial  # it starts a process
@@ -157,7 +157,7 @@ def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
 def test_studies_without_locks(shared_tmp_path, monkeypatch, capsys):
     """It hung: a lock that is missing was taken for one that somebody holds."""
     monkeypatch.setattr(fcntl, "lockf", without(errno.ENOTSUP))
-    scene = load_scene(paper_scene(), COARSE)
+    scene = read_scene(paper_scene(), COARSE)
     outcomes = run_cases([Case(scene)], shared_tmp_path, COMM, shown=False)
     assert outcomes.computed == 1 and not outcomes.failures
     samples = sample_cases(scene, [(), ("payload.mass=5.0",), ("payload.mass=7.0",)], "", None)
@@ -168,7 +168,7 @@ def test_studies_without_locks(shared_tmp_path, monkeypatch, capsys):
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("name", "value"), [("NUMERICS", -1), ("__version__", "0.0.0")])
 def test_results_of_another_program_are_computed_anew(name, value, tmp_path, monkeypatch):
-    scene = load_scene(paper_scene(), COARSE)
+    scene = read_scene(paper_scene(), COARSE)
 
     def computed():
         samples = sample_cases(scene, [(), ("payload.mass=5.0",)], "", None)
@@ -258,7 +258,7 @@ def test_a_pipe_is_no_scene_and_a_device_no_folder_for_forms(tmp_path, monkeypat
     """Opening a pipe would wait for ever."""
     path = tmp_path / f"{COMM.rank}.toml"
     os.mkfifo(path)
-    refusal(lambda: load_scene(path), str(path), "no regular file")
+    refusal(lambda: read_scene(path), str(path), "no regular file")
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     compat.check_form_cache.cache_clear()
     refusal(compat.check_form_cache, "/dev/null", "XDG_CACHE_HOME")

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from remainders import built_of
 from runs import TWO_ARM
 
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 
@@ -30,7 +30,7 @@ LINEAR = "arms.element=linear"  # which two_arm_200x12.json is of
 
 def simulate(designs, *overrides):
     """Return a scene's arms, the physical densities of these designs, evaluation, trajectory."""
-    built = built_of(load_scene(TWO_ARM, overrides), MPI.COMM_SELF)
+    built = built_of(read_scene(TWO_ARM, overrides), MPI.COMM_SELF)
     x = {k: DESIGNS[designs[k]](*arm.mesh.centroid.T) for k, arm in built.arms.items()}
     return built, x, *built.evaluate(x)
 

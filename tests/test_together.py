@@ -24,7 +24,7 @@ from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, reductions, static
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 from dolfinopt.study import cases as computing
 from dolfinopt.study import studies as study
 from dolfinopt.study.cases import Case, run_cases
@@ -124,7 +124,7 @@ def test_an_abandoned_generator_does_not_meet_anybody():
 
 def coarse(*overrides):
     """Return the two-arm scene in few cells."""
-    return load_scene(TWO_ARM, (*COARSE, *overrides))
+    return read_scene(TWO_ARM, (*COARSE, *overrides))
 
 
 def fail_on(monkeypatch, rank, owner, name, after=0):

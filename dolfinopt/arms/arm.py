@@ -12,18 +12,15 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.design_state import DesignState, InitialVectors, kind_of, options, same_basis
-from dolfinopt.arms.modes import LoadedModes
+from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, options, same_basis
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
-    MIDDLE_THRESHOLD,
     HelmholtzFilter,
     Projected,
-    averages_of,
+    average_of,
     project,
     robust_thresholds,
 )
-from dolfinopt.density.interpolation import Interpolated
 from dolfinopt.errors import InputError
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.laws import law_of, stiffness_tensor
@@ -88,7 +85,7 @@ class Arm:
     Attributes:
         mesh: see `ArmMesh`.
         solid: the arm's solid material.
-        averages: over cells whose design is the same, applied before the filter.
+        average: over cells whose design is the same, applied before the filter; None of no such.
         substructure: finite elements whatever the design.
         kind: what physical designs are: densities, or the thickness of a wall.
         coordinates: number q of the basis; None until `set_order`, where the scene says "auto".
@@ -105,7 +102,7 @@ class Arm:
         self.solid = scene.material_of(index)
         with profile.phase("mesh"):
             self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
-            self.averages = averages_of(self.mesh, arm)
+            self.average = average_of(self.mesh, arm)
         self._check_widths(arm)
         with profile.phase("element operators"):
             try:
@@ -121,7 +118,7 @@ class Arm:
             radius = scene.filter_radius(index) if pattern is None else 0.0
             # A member along an edge would be half as thin if the filter mirrored it there.
             self.filter = HelmholtzFilter(self.mesh, radius, scene.design.controls_widths)
-        self.kind = kind_of(self.substructure, self.solid, scene.interpolation)
+        self.kind = Kind(self.substructure, self.solid, scene.interpolation)
         self.coordinates = scene.reduction.count or None
         # Of a mesh file known only now.
         if self.coordinates is not None and self.coordinates > self.substructure.T.num_dofs:
@@ -157,8 +154,8 @@ class Arm:
         """
         x = self.mesh.keep(x)
         with self.profile.phase("filter"):
-            for average in self.averages:
-                x = average.forward(x)
+            if self.average is not None:
+                x = self.average.forward(x)
             return self.filter.forward(x)
 
     def filtered(self, x: np.ndarray) -> PhysicalDesign:
@@ -196,7 +193,7 @@ class Arm:
         kind = self.scene.design.projection
         if not kind:
             return (filtered,)
-        thresholds: Sequence[float] = (MIDDLE_THRESHOLD,)
+        thresholds: Sequence[float] = (0.5,)
         if kind == "robust":
             eroded, nominal, dilated = robust_thresholds(*self.scene.design.erosions)
             thresholds = (eroded, dilated, nominal)
@@ -218,8 +215,8 @@ class Arm:
             gradient = np.where(design.clipped, 0.0, gradient)
         with self.profile.phase("filter"):
             gradient = self.filter.backward(self._active(gradient))
-            for average in reversed(self.averages):
-                gradient = average.backward(gradient)
+            if self.average is not None:
+                gradient = self.average.backward(gradient)
             return self._active(gradient)
 
     def _active(self, values: np.ndarray) -> np.ndarray:
@@ -276,11 +273,6 @@ class Arm:
         return self.state(x_phys).body
 
     @property
-    def material(self) -> Interpolated:
-        """Interpolated stiffness and mass of the current design."""
-        return self.current.material
-
-    @property
     def elastic(self) -> ElasticArm:
         """Stiffness and mass of the current design."""
         return self.current.elastic
@@ -290,10 +282,6 @@ class Arm:
         """The basis of the current design, or None where nobody has asked for one."""
         state = self._state
         return state.basis if state is not None and state.is_reduced else None
-
-    def loaded_modes(self, place: int, carried: np.ndarray) -> LoadedModes:
-        """Return those of the current design, see `DesignState.loaded_modes`."""
-        return self.current.loaded_modes(place, carried)
 
     def refusal(self, x_phys: np.ndarray) -> str:
         """Return why these cannot be physical densities of this rank's cells, "" if they can."""
@@ -519,7 +507,7 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     arm = scene.arms[index]
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
-        interfaces = tuple((one.name, one.point) for one in arm.interfaces)
+        interfaces = tuple((one.name, one.point) for one in arm.further_interfaces)
         body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body

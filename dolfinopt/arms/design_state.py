@@ -1,14 +1,13 @@
 """One design of one arm: what x_phys is, densities or wall thickness, and what follows from it.
 
-`Kind` tells the kinds apart, `kind_of` chooses; `responses.products` leads a gradient back to
-x_phys.
+`responses.products` leads a gradient back to x_phys.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.linalg import eigh
@@ -31,121 +30,69 @@ from dolfinopt.scene.schema import Material
 from dolfinopt.scene.tables.design import Interpolation
 
 
-class Kind(Protocol):
-    """A kind of design of one arm; arrays (n_cells,) over this rank's cells."""
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """What the designs x_phys of an arm are; arrays (n_cells,) over this rank's cells.
 
-    @property
-    def volume(self) -> np.ndarray:
-        """Areas, in space volumes, of the cells where x_phys is 1; m2, m3."""
+    The cells' densities. Or the thickness of the wall between its limits, which moves the inner
+    nodes of a mesh of the largest thickness: all cells are solid.
+
+    Attributes:
+        substructure: these cells.
+        solid: their material where x_phys is 1.
+        law: interpolates densities.
+    """
+
+    substructure: Substructure
+    solid: Material
+    law: Interpolation
 
     @property
     def wall(self) -> Wall | None:
         """What moves the nodes; None where they stay."""
-
-    def at(self, x_phys: np.ndarray) -> tuple[Interpolated, ElasticArm]:
-        """Return the cells' relative stiffness and mass, and the arm (collective on the arm)."""
-
-    def points(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return the places (n_nodes, d) of the elements' nodes, m (collective on the arm)."""
-
-    def share(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return how much of every cell is solid, in [0, 1]."""
-
-    def filled(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return the solid volume of every cell over `volume` (collective on the arm)."""
-
-
-class Densities:
-    """x_phys are the cells' densities; the mesh stays as it is."""
-
-    wall = None
-
-    def __init__(self, substructure: Substructure, solid: Material, law: Interpolation):
-        """Fill these cells with so much of a material."""
-        self._substructure, self._solid, self._law = substructure, solid, law
+        return self.substructure.mesh.wall
 
     @property
     def volume(self) -> np.ndarray:
-        """See `Kind`."""
-        return self._substructure.mesh.area
-
-    def at(self, x_phys: np.ndarray) -> tuple[Interpolated, ElasticArm]:
-        """Interpolate stiffness and mass, see `Kind`."""
-        law = self._law
-        material = interpolate(x_phys, law.law, law.penalty, law.floor)
-        return material, _elastic(self._substructure, self._solid, material)
-
-    def points(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return where they always are, see `Kind`."""
-        return self._substructure.operators.points
-
-    def share(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return x_phys, see `Kind`."""
-        return x_phys
-
-    def filled(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return x_phys, see `Kind`."""
-        return x_phys
-
-
-class WallThickness:
-    """x_phys is the thickness of the wall between its limits; all cells are solid.
-
-    Attributes:
-        wall: see `Kind`.
-    """
-
-    def __init__(self, substructure: Substructure, solid: Material, wall: Wall):
-        """Move the inner nodes of these cells, whose mesh has the largest thickness."""
-        self._substructure, self._solid, self.wall = substructure, solid, wall
-        self._nodes = substructure.mesh.mesh.geometry.x
-
-    @property
-    def volume(self) -> np.ndarray:
-        """See `Kind`."""
-        return self._substructure.mesh.area
+        """Areas, in space volumes, of the cells where x_phys is 1; m2, m3."""
+        return self.substructure.mesh.area
 
     @cached_property
     def _order(self) -> np.ndarray:
         """Nodes of the mesh by nodes of the elements, which are numbered otherwise."""
-        return np.asarray(cKDTree(self._nodes).query(self._substructure.operators.points)[1])
+        nodes = cKDTree(self.substructure.mesh.mesh.geometry.x)
+        return np.asarray(nodes.query(self.substructure.operators.points)[1])
+
+    def _moved(self, wall: Wall, x_phys: np.ndarray) -> ArmMesh:
+        mesh = self.substructure.mesh
+        return mesh.moved(wall.points(mesh.comm, x_phys))
 
     def at(self, x_phys: np.ndarray) -> tuple[Interpolated, ElasticArm]:
-        """Move the inner surface, see `Kind`."""
-        mesh = self._substructure.mesh
-        points = self.wall.points(mesh.comm, x_phys)
-        moved = self._substructure.moved(mesh.moved(points), points[self._order])
-        all_of_it, none = np.ones(len(x_phys)), np.zeros(len(x_phys))
-        material = Interpolated(all_of_it, none, all_of_it, none)
-        return material, _elastic(moved, self._solid, material)
+        """Return the cells' relative stiffness and mass, and the arm (collective on the arm)."""
+        arm, law = self.substructure, self.law
+        if self.wall is None:
+            material = interpolate(x_phys, law.law, law.penalty, law.floor)
+        else:
+            mesh = self._moved(self.wall, x_phys)
+            arm = arm.moved(mesh, mesh.mesh.geometry.x[self._order])
+            ones, none = np.ones_like(x_phys), np.zeros_like(x_phys)
+            material = Interpolated(ones, none, ones, none)
+        solid = self.solid
+        return material, arm.at(solid.modulus * material.stiffness, solid.density * material.mass)
 
     def points(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return where the wall's thickness puts them, see `Kind`."""
-        return self.wall.points(self._substructure.mesh.comm, x_phys)[self._order]
+        """Return the places (n_nodes, d) of the elements' nodes, m (collective on the arm)."""
+        if self.wall is None:
+            return self.substructure.operators.points
+        return self.wall.points(self.substructure.mesh.comm, x_phys)[self._order]
 
     def share(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return ones, see `Kind`."""
-        return np.ones_like(x_phys)
+        """Return how much of every cell is solid, in [0, 1]."""
+        return x_phys if self.wall is None else np.ones_like(x_phys)
 
     def filled(self, x_phys: np.ndarray) -> np.ndarray:
-        """Return the wall's volume over that of the thickest one, see `Kind`."""
-        mesh = self._substructure.mesh
-        return mesh.moved(self.wall.points(mesh.comm, x_phys)).area / mesh.area
-
-
-def kind_of(substructure: Substructure, solid: Material, law: Interpolation) -> Kind:
-    """Return what designs of an arm are."""
-    wall = substructure.mesh.wall
-    if wall is None:
-        return Densities(substructure, solid, law)
-    return WallThickness(substructure, solid, wall)
-
-
-def _elastic(arm: Substructure, solid: Material, material: Interpolated) -> ElasticArm:
-    return arm.at(solid.modulus * material.stiffness, solid.density * material.mass)
-
-
-# --
+        """Return the solid volume of every cell over `volume` (collective on the arm)."""
+        return x_phys if self.wall is None else self._moved(self.wall, x_phys).area / self.volume
 
 
 @dataclass(eq=False)
@@ -194,7 +141,6 @@ class DesignState:
     stiffened: bool = False
     kept: dict[str, Any] = field(default_factory=dict, init=False)
     _loaded: dict[int, tuple[np.ndarray, LoadedModes]] = field(default_factory=dict, init=False)
-    _moved: tuple[np.ndarray, LoadFields] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.x_phys = self.x_phys.copy()
@@ -289,22 +235,7 @@ class DesignState:
     def load_fields(self) -> LoadFields:
         """The static fields of all loads, those of the elastic motion's inertia included."""
         with self.elastic.profile.phase("stress"):
-            return load_fields(self.elastic, self.basis.V, self.basis.MV, self.unit_loads)
-
-    def load_fields_of(self, moving: np.ndarray) -> LoadFields:
-        """Return those that take part in a motion, or all where these are known (collective).
-
-        Args:
-            moving: coefficients of its instants, see `fem.stress.load_fields`.
-        """
-        if "load_fields" in self.__dict__:
-            return self.load_fields
-        if self._moved is None or not np.array_equal(self._moved[0], moving):
-            known = self.unit_loads if self.stiffened else None
-            with self.elastic.profile.phase("stress"):
-                fields = load_fields(self.elastic, self.basis.V, self.basis.MV, known, moving)
-            self._moved = moving, fields
-        return self._moved[1]
+            return load_fields(self.unit_loads, self.basis.V, self.basis.MV)
 
     @cached_property
     def first_frequency(self) -> float:

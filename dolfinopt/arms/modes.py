@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.fem.elasticity import ElasticArm
-from dolfinopt.fem.interface import rigid_motions
+from dolfinopt.fem.frames import rigid_motions
 from dolfinopt.fem.stress import Prestress
 from dolfinopt.multibody.dimension import DIMENSIONS, components
 from dolfinopt.multibody.newton_euler import outward_pass

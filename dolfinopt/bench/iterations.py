@@ -16,6 +16,7 @@ from dolfinx.fem import petsc
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.measure import Cells, Plan, arms_of, in_processes, mpirun, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
 from dolfinopt.data import template_folder
@@ -23,7 +24,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.interior import with_rigid_motions
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
-from dolfinopt.optimization.assessment import drawn
+from dolfinopt.optimization.assessment import across, filled
 from dolfinopt.output.run_folder import optimize
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -172,7 +173,7 @@ class PlainStatics:
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the compliance and its derivative (n_cells,) by x; in space energies of cells."""
         self.x.x.array[: self.count] = x if self.in_plane else self.modulus * (FLOOR + x**PENALTY)
-        compat.scatter_forward(self.x)
+        self.x.x.scatter_forward()
         self.K.zeroEntries()
         petsc.assemble_matrix(self.K, self._stiffness, bcs=[self._clamp])
         self.K.assemble()
@@ -185,7 +186,7 @@ class PlainStatics:
         self._ksp.setOperators(self.K)
         self._ksp.solve(self.load, self._solution)
         self.u.x.array[: len(self._solution.array)] = self._solution.array
-        compat.scatter_forward(self.u)
+        self.u.x.scatter_forward()
         gradient = petsc.assemble_vector(self._gradient).array_r.copy()
         return float(self.load.dot(self._solution)), gradient
 
@@ -282,6 +283,26 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
     asked = result.iterations, result.counts.simulations, result.counts.adjoints
     found = result.evaluation.objective, excess, result.best_iteration
     yield name, start, *asked, *found, seconds, result.stop_code.value
+
+
+def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
+    """Return the densities (n_cells,) of a straight solid member within an arm's box of cells.
+
+    Args:
+        arm: of cells along, over the height, and of solids over the thickness.
+        kind: "bar": the arm's section times `size`; "tube": walls of `size` half heights, in the
+            plane flanges; "truss": such flanges, and as thick diagonals of 45 degrees between them.
+        size: from 0 to 1.
+    """
+    off = across(arm)
+    away = np.abs(off).max(axis=1)
+    if kind != "truss":
+        return filled(arm, size - away if kind == "bar" else size - (1.0 - away))
+    phase = np.mod(arm.mesh.centroid[:, 0] / arm.scene.arms[arm.places[0]].height, 2.0)
+    diagonal = 1.0 - 2.0 * np.abs(phase - 1.0)
+    flanges = size - (1.0 - np.abs(off[:, 0]))
+    braces = 0.5 * size - np.abs(off[:, 0] - diagonal) / np.sqrt(2.0)
+    return filled(arm, np.maximum(flanges, braces))
 
 
 def drawn_by_hand(name: str, kind: str) -> Rows:

@@ -369,8 +369,8 @@ def _write_scene(
     folder: Path, overwrite: bool, scene: RobotScene, t: np.ndarray, rows: np.ndarray
 ) -> None:
     """Write scene, table and record, and say what they are."""
+    from dolfinopt.loading import load_scene
     from dolfinopt.output.folders import check_new, prepare_folder, write_new
-    from dolfinopt.scene.load import load_scene
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
     new = scene.files(folder, t, rows)

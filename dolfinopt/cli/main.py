@@ -83,7 +83,13 @@ def init(name: Path, template: str) -> None:
 @click.command()
 @click.argument("pattern", required=False)
 @click.option("--schema", is_flag=True, help="print the JSON schema of scene files, for editors")
-def keys(pattern: str | None, schema: bool) -> None:
+@click.option(
+    "--upgrade",
+    type=PATH,
+    metavar="SCENE",
+    help="rewrite the older words of a scene's file, which is kept as SCENE.old",
+)
+def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     """Explain the keys of a scene.
 
     Lists unit, allowed values, default and meaning of the keys that contain PATTERN (payload, mass)
@@ -93,13 +99,16 @@ def keys(pattern: str | None, schema: bool) -> None:
     from dolfinopt.scene.load import describe_keys
     from dolfinopt.scene.schema import scene_schema
 
+    if upgrade is not None:
+        _upgrade(upgrade)
+        return
     if schema:
         if pattern is not None:
             raise InputError(f"{pattern}: expected no PATTERN with --schema")
         click.echo(json.dumps(scene_schema(), indent=2))
         return
     known = describe_keys()
-    found = [info for info in known if _fits(info.key, pattern)]
+    found = [info for info in known if _fits(info, pattern)]
     materials = _materials(pattern, found)
     if not found and not materials:
         near = difflib.get_close_matches(str(pattern), [info.key for info in known], 3)
@@ -111,10 +120,31 @@ def keys(pattern: str | None, schema: bool) -> None:
     click.echo("\n".join([*map(_explained, found), *materials]))
 
 
-def _fits(key: str, pattern: str | None) -> bool:
+def _upgrade(scene: Path) -> None:
+    """Rewrite a scene's file in the words of now, and say what changed."""
+    from dolfinopt.disk import write_text
+    from dolfinopt.scene.upgrade import upgraded
+
+    text, told = upgraded(os.fspath(scene))
+    if not told:
+        click.echo(f"{scene}: no older words")
+        return
+    kept = scene.with_name(f"{scene.name}.old")
+    write_text(kept, scene.read_text(encoding="utf-8"))
+    write_text(scene, text)
+    for line in told:
+        click.echo(line.replace(" is read as ", " -> "))
+    click.echo(f"{scene}: rewritten; as it was: {kept}")
+
+
+def _fits(info: KeyInfo, pattern: str | None) -> bool:
     if pattern is None:
         return True
-    return fnmatchcase(key, pattern) if re.search(r"[*?\[]", pattern) else pattern in key
+    name = info.key.rpartition(".")[2]
+    paths = (info.key, *(f"{table}.{name}" for table in info.also))
+    if re.search(r"[*?\[]", pattern):
+        return any(fnmatchcase(path, pattern) for path in paths)
+    return any(pattern in path for path in paths)
 
 
 def _materials(pattern: str | None, found: list[KeyInfo]) -> list[str]:
@@ -145,10 +175,11 @@ def _in_units(value: float | tuple[float, ...] | None, unit: float) -> str:
 
 def _explained(info: KeyInfo) -> str:
     """Return a key, its unit and what is allowed, and below what it means."""
-    meaning, unit = info.description, ""
-    if match := re.fullmatch(r"(.*) \[([^\]]*)\]", info.description):
-        meaning, unit = match[1], "" if match[2] == "-" else f" [{match[2]}]"
+    meaning, _, unit = info.description.removesuffix("]").rpartition(" [")
+    unit = "" if unit == "-" else f" [{unit}]"
     default = "required" if not info.default else f"default {info.default}"
+    if info.also:
+        meaning += "; also of " + " and ".join(f"[[{table}]]" for table in info.also)
     rows = [f"{info.key}{unit}: {info.allowed}; {default}", meaning]
     return "\n".join(
         textwrap.fill(row, 92, initial_indent=indent, subsequent_indent="    ")
@@ -234,8 +265,12 @@ class _Commands(click.Group):
     no_args_is_help=False,
 )
 @click.version_option(__version__, prog_name="dolfinopt")
+@click.option("--plots/--no-plots", default=True, help="draw pictures, of every command that does")
+@click.option(
+    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
+)
 @click.pass_context
-def commands(ctx: click.Context) -> None:
+def commands(ctx: click.Context, plots: bool, verbose: bool) -> None:
     """Stiffen the flexible arms of a moving machine by topology optimisation.
 
     Every command also runs under mpirun, with the same result.

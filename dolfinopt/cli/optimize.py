@@ -27,6 +27,7 @@ from dolfinopt.cli.shared import (
     set_option,
     start,
     tell,
+    tell_assumed,
     verbose_option,
 )
 from dolfinopt.errors import ConvergenceError, InputError
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 @overwrite_option
 @set_option
 @plots_option
-@animation_option
+@click.option("--animation", is_flag=True, hidden=True)  # dolfinopt plot DIR --animation
 @verbose_option
 def optimize(
     scene: Path,
@@ -67,6 +68,7 @@ def optimize(
         raise InputError("--resume, --overwrite: expected only one of them")
     world, loaded = load(scene, overrides)
     loaded.check_designed()
+    tell_assumed(world, loaded)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
     from dolfinopt.output.folders import working_alone
@@ -77,6 +79,8 @@ def optimize(
         on_root(world, checkpoint.check, folder, loaded)
     else:
         claim(world, folder, overwrite, resume=checkpoint.NAME, scene=loaded)
+    if loaded.is_spatial and not resume:
+        _tell_ahead(world, loaded)
     with working_alone(world, folder):  # until all files of the run are written
         try:
             with progress(world, loaded) as report:
@@ -95,6 +99,20 @@ def optimize(
         _conclude(folder, result, plots, animation, verbose)
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
+
+
+def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
+    """Print what straight tubes and bars reach in place of solid links (collective)."""
+    from tempfile import TemporaryDirectory
+
+    from dolfinopt.parallel import together
+    from dolfinopt.study.sections import ahead
+
+    with TemporaryDirectory() as own:
+        lines = ahead(scene, Path(world.bcast(own, root=0)), world)
+        with together(world):  # until all ranks are done with the folder
+            for line in lines:
+                click.echo(line)
 
 
 def _conclude(
@@ -125,7 +143,7 @@ def _conclude(
 @overwrite_option
 @set_option
 @plots_option
-@animation_option
+@click.option("--animation", is_flag=True, hidden=True)
 @verbose_option
 def simulate(
     scene: Path,
@@ -142,6 +160,7 @@ def simulate(
     Writes the trajectory, and prints compliance and deviation.
     """
     world, loaded = load(scene, overrides)
+    tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.optimization.result import simulation_result
     from dolfinopt.output.design import arms_with_design

@@ -50,16 +50,8 @@ Say = Callable[[str], None]
     metavar="M",
     help="how far sides may lie from the outline of the densities; default: half a cell",
 )
-@click.option(
-    "--curves",
-    type=click.Choice(["splines", "arcs"]),
-    help="without effect: parts have lines, arcs and circles",
-)
-@click.option(
-    "--simplify/--no-simplify",
-    default=None,
-    help="without effect: sides are straight, with fillets between them",
-)
+@click.option("--curves", type=click.Choice(["splines", "arcs"]), hidden=True)  # no effect
+@click.option("--simplify/--no-simplify", default=None, hidden=True)  # no effect
 @click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
 @click.option(
     "--check/--no-check",
@@ -72,17 +64,10 @@ Say = Callable[[str], None]
     help="optimise the parts' free curves: the scene's objective within its limits, on a mesh of "
     "the parts themselves",
 )
+@click.option("--iterations", type=click.IntRange(1), hidden=True)
+@click.option("--starts", type=click.IntRange(0), hidden=True)
 @click.option(
-    "--iterations",
-    type=click.IntRange(1),
-    metavar="N",
-    help="of --optimize, from every start at most (80)",
-)
-@click.option(
-    "--starts",
-    type=click.IntRange(0),
-    metavar="N",
-    help="of --optimize: from N trusses, too; the best of all that keep the limits is kept (0)",
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a value of [part]"
 )
 @click.option(
     "--resume", is_flag=True, help="go on with the shapes of an --optimize that was interrupted"
@@ -101,6 +86,7 @@ def part(
     optimize: bool | None,
     iterations: int | None,
     starts: int | None,
+    overrides: tuple[str, ...],
     resume: bool,
     overwrite: bool,
     plots: bool,
@@ -114,8 +100,10 @@ def part(
     Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
     STEP and DXF, too, for which --tool-radius, --tolerance and --round are.
 
-    Options go over the table [part] of the scene.
+    Options go over the table [part] of the scene: "dolfinopt keys part" lists its keys.
     """
+    if other := [one for one in overrides if not one.startswith("part.")]:
+        raise InputError(f"--set {other[0]}: expected keys of [part], as part.starts=3")
     world = start()
     from dolfinopt.parallel import on_root, together
     from dolfinopt.part.folder import SHAPES, checkpoint_of_search, file_names
@@ -123,13 +111,13 @@ def part(
 
     if resume and overwrite:
         raise InputError("--resume, --overwrite: expected only one of them")
-    scene: Scene = on_root(world, scene_of, folder)
+    scene: Scene = on_root(world, scene_of, folder, overrides)
     target = out or folder / "part"
     scene.check_designed()
     given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip
-    asked = scene.part.model_copy(update={k: v for k, v in given.items() if v is not None})
+    asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})
     if world.rank == 0 and (asked.curves != "splines" or asked.simplify):
         warn(["part.curves and part.simplify have no effect: parts have lines, arcs and circles"])
     if resume and not asked.optimize:

@@ -56,22 +56,18 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
 
     A process alone finds a wrong key before MPI and the solvers are loaded.
     """
-    from dolfinopt.scene.load import load_scene
+    from dolfinopt.scene.load import read_scene
 
     if alone():
-        load_scene(path, overrides)
+        read_scene(path, overrides)
     world = start()
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
-        from dolfinopt.dynamics.build import check_forces, check_motion
-        from dolfinopt.scene.messages import implausible
+        from dolfinopt.loading import doubts, load_scene
 
         scene = load_scene(path, overrides)
-        check_motion(scene)
-        check_forces(scene)
-        warn(doubts_of_files(scene))
-        warn(implausible(scene))
+        warn(doubts(scene))
         if path.name == "part.toml" and (stale := stale_parts(path.parent)):
             warn([stale])
         return scene
@@ -81,33 +77,6 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     scene = on_root(world, load)
     check_budget(world, scene)
     return world, scene
-
-
-def doubts_of_files(scene: Scene) -> list[str]:
-    """Return what a body from a file lacks that its scene may need, a sentence each.
-
-    Raises:
-        InputError: a file holds no such body.
-    """
-    found = []
-    for index, arm in enumerate(scene.arms):
-        if arm.sid is None:
-            continue
-        from dolfinopt.arms.arm import fixed_body  # not of scenes without files
-
-        body = fixed_body(scene, index)
-        if scene.simulation.stiffening is True and not body.is_stiffened:
-            found.append(
-                f"{arm.sid} holds no geometric stiffness, which simulation.stiffening = true asks "
-                f"for: arm {arm.name!r} is linear"
-            )
-        out_of_plane = body.outboard[2:-1]  # no rows of plane bodies
-        if len(out_of_plane) and not out_of_plane.any():
-            found.append(
-                f"{arm.sid}: its outboard node moves in x and y and turns about z alone; out of "
-                f"that plane arm {arm.name!r} is rigid"
-            )
-    return found
 
 
 def claim(
@@ -148,7 +117,7 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
     on_root(world, prepare_folder, folder)
 
 
-def scene_of(folder: Path) -> Scene:
+def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
     """Return the scene of a run, with what "auto" came to: coordinates and stiffening."""
     from dolfinopt.scene.load import scene_from_dict
     from dolfinopt.scene.schema import found_again
@@ -167,7 +136,7 @@ def scene_of(folder: Path) -> Scene:
         raise InputError(
             f"{path}: cannot be read ({type(error).__name__}); {_instead(folder)}"
         ) from None
-    return scene_from_dict(data, source=str(path))
+    return scene_from_dict(data, str(path), overrides)
 
 
 def _instead(folder: Path) -> str:
@@ -223,6 +192,14 @@ def draw(
 def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
     if choice is not None and world.rank == 0:
         click.echo(chosen(choice.coordinates, choice.error))
+
+
+def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
+    """Print in one line what the scene does not state and its results depend on."""
+    from dolfinopt.scene.messages import assumed
+
+    if world.rank == 0 and (line := assumed(scene)):
+        click.echo(line)
 
 
 def chosen(coordinates: int, error: float) -> str:
@@ -292,16 +269,27 @@ set_option = click.option(
 design_option = click.option("--design", type=PATH, help="design.npz; default: the initial design")
 
 
-plots_option = click.option("--plots/--no-plots", default=True, help="draw pictures")
+def _given_before(name: str, usual: bool) -> Callable[[], bool]:
+    """Return what an option before the command says, `dolfinopt --no-plots optimize SCENE`."""
+
+    def value() -> bool:
+        before = click.get_current_context().find_root().params
+        return bool(before.get(name, usual))
+
+    return value
+
+
+# They stand before the command, and are read behind it, too.
+plots_option = click.option("--plots/--no-plots", default=_given_before("plots", True), hidden=True)
+
+
+verbose_option = click.option(
+    "--verbose", is_flag=True, default=_given_before("verbose", False), hidden=True
+)
 
 
 animation_option = click.option(
     "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
-)
-
-
-verbose_option = click.option(
-    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
 )
 
 

@@ -185,19 +185,14 @@ def sweep(
 @scene_argument
 @click.argument("what", type=click.Choice([*COMPARED, SECTIONS, MOTIONS]))
 @click.option(
-    "--coordinates",
+    "--only",
     multiple=True,
-    type=int,
-    metavar="N",
-    help="of the reductions, any number of times; default: 4 and 12",
+    metavar="WHAT",
+    help="any number of times: of the objectives a kind, by default all; of the reductions a "
+    "number of coordinates, by default 4 and 12",
 )
-@click.option(
-    "--kind",
-    "kinds",
-    multiple=True,
-    metavar="KIND",
-    help="of the objectives, any number of times; default: all",
-)
+@click.option("--coordinates", multiple=True, hidden=True)
+@click.option("--kind", "kinds", multiple=True, hidden=True)
 @click.option(
     "--design",
     "designs",
@@ -210,7 +205,8 @@ def sweep(
 def compare(
     scene: Scene,
     what: str,
-    coordinates: tuple[int, ...],
+    only: tuple[str, ...],
+    coordinates: tuple[str, ...],
     kinds: tuple[str, ...],
     designs: tuple[Path, ...],
 ) -> Question:
@@ -223,6 +219,10 @@ def compare(
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
+    if only and what in (SECTIONS, MOTIONS):
+        raise InputError("--only: expected only with compare SCENE objectives or reductions")
+    coordinates += only if what == "reductions" else ()
+    kinds += only if what == "objectives" else ()
     if designs and what not in (SECTIONS, MOTIONS):
         raise InputError("--design: expected only with compare SCENE sections or motions")
     if coordinates and what != "reductions":
@@ -294,12 +294,19 @@ def uncertainty(
     is_flag=True,
     help="100 x 6 cells, a filter of two of them and 60 iterations: a minute",
 )
+@click.option(
+    "--fitted",
+    is_flag=True,
+    help="a scene whose values that the paper does not state are fitted to its statements; default "
+    "folder: results/paper-fitted",
+)
 @set_option
 @plots_option
 def reproduce(
     out: Path | None,
     check: bool,
     coarse: bool,
+    fitted: bool,
     overrides: tuple[str, ...],
     plots: bool,
 ) -> None:
@@ -314,7 +321,8 @@ def reproduce(
     from dolfinopt.paper.reproduction import check_paper, failed_checks
     from dolfinopt.parallel import on_root
 
-    folder = out or Path("results") / "paper"
+    folder = out or Path("results") / ("paper-fitted" if fitted else "paper")
+    overrides = (*(paper.FITTED if fitted else ()), *overrides)
     scene = on_root(world, paper.load_paper, coarse, overrides)
     if world.rank == 0:
         warn(filter_warnings(scene, paper.cell_sizes(scene)))
@@ -324,8 +332,9 @@ def reproduce(
 
     def conclude() -> None:
         paper.write_report(plan, results, outcomes, checks, folder, plots=plots)
-        for check in checks:
-            click.echo(f"{check.name} (paper: {check.paper}). {check.sentence}")
+        for one in checks:
+            click.echo(f"{one.name} (paper: {one.paper}). {one.sentence}")
+        click.echo(f"{sum(one.holds for one in checks)} of {len(checks)} statements hold")
         page = " and report.html" if plots else ""
         click.echo(f"{outcomes.computed} cases computed; figures{page} in {folder}")
 
@@ -343,8 +352,14 @@ FIELD = "field"
 @click.argument("names", metavar="[DIAGRAM]...", nargs=-1)
 @out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
-@click.option("--case", "cases", metavar="NAME", multiple=True, help="of field: this case alone")
-@click.option("--all", "everything", is_flag=True, help="of field: the long cases, too")
+@click.option(
+    "--case",
+    "cases",
+    metavar="NAME",
+    multiple=True,
+    help='of field: this case alone; "all": the long ones, too',
+)
+@click.option("--all", "everything", is_flag=True, hidden=True)
 @click.option(
     "--records", type=PATH, metavar="DIR", help="of field: measured records that a case reads"
 )
@@ -371,6 +386,8 @@ def bench(
     measured records which cannot be copied: ur10e.
     """
     world = start()
+    if cases == ("all",):
+        cases, everything = (), True
     if FIELD in names:
         if len(names) > 1 or quick:
             other = "--quick" if quick else next(name for name in names if name != FIELD)
@@ -380,7 +397,7 @@ def bench(
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
     if cases or everything or records:
-        raise InputError("bench: --case, --all and --records belong to dolfinopt bench field")
+        raise InputError("bench: --case and --records belong to dolfinopt bench field")
     _measure(names, out, quick)
 
 
@@ -397,7 +414,7 @@ def _check_field(
     from dolfinopt.parallel import on_root
 
     if names and everything:
-        raise InputError("bench field: --case and --all: give one of them")
+        raise InputError('bench field: --case: expected names, or "all" alone')
     found = []
     for case in chosen_cases(names, everything, records is not None):
         checked = on_root(world, check, case, records)

@@ -6,6 +6,7 @@ Forward, and the exact transpose or derivative backward.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import scipy.sparse as sp
@@ -283,108 +284,88 @@ def _positive_definite(mat: PETSc.Mat) -> PETSc.Mat:
 # -- designs that are symmetric about an arm's axis or planes, or the same over its thickness ----
 
 
-class AxisSymmetry:
-    """Make a cell field symmetric about y = 0, or z = 0: y = (x + x[mirror]) / 2.
+class Average:
+    """y = A x over the cells of an arm that several ranks may share, and the transpose."""
+
+    def __init__(self, mesh: ArmMesh, matrix: sp.csr_matrix):
+        """Take A of all cells, ranks in order."""
+        self._comm = mesh.comm
+        first = sum(self._comm.allgather(mesh.num_cells)[: self._comm.rank])
+        own = slice(first, first + mesh.num_cells)
+        self._forward, self._backward = matrix[own], matrix.T.tocsr()[own]
+
+    def forward(self, x: np.ndarray) -> np.ndarray:
+        """Return the average of owned cells (n_cells,)."""
+        return self._forward @ self._all(x)
+
+    def backward(self, slope: np.ndarray) -> np.ndarray:
+        """Return the derivative with respect to x, given that with respect to the average."""
+        return self._backward @ self._all(slope)
+
+    def _all(self, values: np.ndarray) -> np.ndarray:
+        return values if self._comm.size == 1 else np.concatenate(self._comm.allgather(values))
+
+
+def average_of(mesh: ArmMesh, arm: Arm) -> Average | None:
+    """Return the average that an arm's keys ask for (collective on the arm).
+
+    Raises:
+        InputError: the mesh is not symmetric enough; on all ranks of the arm.
+    """
+    parts = [mirrored(mesh, 1)] if arm.symmetric_about[0] else []
+    parts += [mirrored(mesh, 2)] if arm.symmetric_about[1] else []
+    parts += [extruded(mesh)] if arm.extruded else []
+    return Average(mesh, reduce(lambda first, then: then @ first, parts)) if parts else None
+
+
+def mirrored(mesh: ArmMesh, axis: int = 1) -> sp.csr_matrix:
+    """Return what makes a cell field symmetric about y = 0, or z = 0: y = (x + x[mirror]) / 2.
 
     The mirror of a cell is the cell with the centroid nearest to the mirror image of its own. On
     a mesh that is its own mirror image these are pairs, and y is symmetric to the last bit; on
-    others y is as symmetric as the mesh. Works on arms shared by several ranks.
+    others y is as symmetric as the mesh. Collective on the arm.
+
+    Args:
+        mesh: the arm.
+        axis: 1 for y = 0, 2 for z = 0.
+
+    Raises:
+        InputError: the mesh is not symmetric enough; on all ranks of the arm.
     """
-
-    def __init__(self, mesh: ArmMesh, axis: int = 1):
-        """Pair the cells (collective on the arm).
-
-        Args:
-            mesh: the arm.
-            axis: 1 for y = 0, 2 for z = 0.
-
-        Raises:
-            InputError: the mesh is not symmetric enough; on all ranks of the arm.
-        """
-        self.comm = mesh.comm
-        counts = self.comm.allgather(mesh.num_cells)
-        first = sum(counts[: self.comm.rank])
-        self._own = slice(first, first + mesh.num_cells)
-        everywhere = np.concatenate(self.comm.allgather(mesh.centroid))
-        area = np.concatenate(self.comm.allgather(mesh.area))
-        sign = np.ones(mesh.dim)
-        sign[axis] = -1.0
-        distance, mirror = cKDTree(everywhere).query(everywhere * sign)
-        size = np.sqrt(area) if mesh.dim == 2 else np.cbrt(area)
-        off = distance / size[mirror]
-        worst = int(np.argmax(off))
-        if off[worst] > MIRROR_DISTANCE_LIMIT:
-            place = ", ".join(f"{x:.4g}" for x in everywhere[worst])
-            key, name = ("symmetric", "y") if axis == 1 else ("symmetric_z", "z")
-            raise InputError(
-                f"arm {mesh.name!r}: {key} = true, but the mesh is not symmetric about {name} = 0: "
-                f"the cell at ({place}) m has no mirror image: that of its middle is farther than "
-                f"{MIRROR_DISTANCE_LIMIT:g} cell sizes from all others; correct the geometry, or "
-                "mesh one half and mirror it"
-            )
-        self.mirror = mirror
-
-    def forward(self, x: np.ndarray) -> np.ndarray:
-        """Return the symmetric field of owned cells (n_cells,)."""
-        return 0.5 * (x + self._all(x)[self.mirror[self._own]])
-
-    def backward(self, slope: np.ndarray) -> np.ndarray:
-        """Return the derivative with respect to x, given that with respect to the symmetric x."""
-        everywhere = self._all(slope)
-        mirrored = np.bincount(self.mirror, everywhere, len(everywhere))
-        return 0.5 * (slope + mirrored[self._own])
-
-    def _all(self, values: np.ndarray) -> np.ndarray:
-        """Return the field of all ranks' cells, ranks in order."""
-        return values if self.comm.size == 1 else np.concatenate(self.comm.allgather(values))
-
-
-class Extrusion:
-    """Make a cell field the same over the thickness: the mean of the cells above one another.
-
-    Its own transpose on a grid, whose cells are equally large. Works on arms shared by several
-    ranks.
-    """
-
-    def __init__(self, mesh: ArmMesh):
-        """Number the columns of cells (collective on the arm)."""
-        self.comm = mesh.comm
-        counts = self.comm.allgather(mesh.num_cells)
-        first = sum(counts[: self.comm.rank])
-        places = np.concatenate(self.comm.allgather(mesh.centroid[:, :2]))
-        size = np.abs(places).max()
-        _, column = np.unique(
-            np.rint(places / size / FILE_ROUNDING_SHARE), axis=0, return_inverse=True
+    everywhere = np.concatenate(mesh.comm.allgather(mesh.centroid))
+    size = np.concatenate(mesh.comm.allgather(mesh.area)) ** (1.0 / mesh.dim)
+    sign = np.ones(mesh.dim)
+    sign[axis] = -1.0
+    distance, mirror = cKDTree(everywhere).query(everywhere * sign)
+    off = distance / size[mirror]
+    worst = int(np.argmax(off))
+    if off[worst] > MIRROR_DISTANCE_LIMIT:
+        place = ", ".join(f"{x:.4g}" for x in everywhere[worst])
+        name = "y" if axis == 1 else "z"
+        raise InputError(
+            f"arm {mesh.name!r}: symmetric, but the mesh is not symmetric about {name} = 0: "
+            f"the cell at ({place}) m has no mirror image: that of its middle is farther than "
+            f"{MIRROR_DISTANCE_LIMIT:g} cell sizes from all others; correct the geometry, or "
+            "mesh one half and mirror it"
         )
-        self._column = column.ravel()[first : first + mesh.num_cells]
-        self._count = np.bincount(column.ravel())
-
-    def forward(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean field of owned cells (n_cells,)."""
-        total = np.bincount(self._column, x, len(self._count))
-        if self.comm.size > 1:
-            total = self.comm.allreduce(total)
-        return np.asarray((total / self._count)[self._column])
-
-    backward = forward
+    unit = sp.eye(len(mirror), format="csr")
+    return 0.5 * (unit + unit[mirror])
 
 
-def averages_of(mesh: ArmMesh, arm: Arm) -> list[AxisSymmetry | Extrusion]:
-    """Return the averages that an arm's keys ask for (collective on the arm)."""
-    found: list[AxisSymmetry | Extrusion] = []
-    if arm.symmetric:
-        found.append(AxisSymmetry(mesh))
-    if arm.symmetric_z:
-        found.append(AxisSymmetry(mesh, axis=2))
-    if arm.extruded:
-        found.append(Extrusion(mesh))
-    return found
+def extruded(mesh: ArmMesh) -> sp.csr_matrix:
+    """Return what makes a cell field the same over the thickness (collective on the arm).
+
+    The mean of the cells above one another, which are equally large.
+    """
+    places = np.concatenate(mesh.comm.allgather(mesh.centroid[:, :2]))
+    grid = np.rint(places / np.abs(places).max() / FILE_ROUNDING_SHARE)
+    _, column, count = np.unique(grid, axis=0, return_inverse=True, return_counts=True)
+    column = column.ravel()
+    sums = sp.csr_matrix((np.ones(len(column)), (column, np.arange(len(column)))))
+    return sums.T.tocsr() @ sp.diags(1.0 / count) @ sums
 
 
 # -- Heaviside projection of filtered designs: crisp at a threshold, with its exact derivative -
-
-
-MIDDLE_THRESHOLD = 0.5  # of the nominal design
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,4 +417,4 @@ def robust_thresholds(erosion: float, dilation: float) -> tuple[float, float, fl
 
     Source: Wang, Lazarov & Sigmund (2011), doi:10.1007/s00158-010-0602-y.
     """
-    return MIDDLE_THRESHOLD + erosion, MIDDLE_THRESHOLD, MIDDLE_THRESHOLD - dilation
+    return 0.5 + erosion, 0.5, 0.5 - dilation

@@ -30,7 +30,7 @@ from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.scene.csv_table import TIME, read_table
 from dolfinopt.scene.duration import file_stamp, stamp
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import interface_number
+from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
 
 
@@ -160,8 +160,8 @@ def _drives(scene: Scene) -> Drives:
     control = scene.control
     if control is not None:
         free[driven] = True
-        stiffness[driven] = control.stiffness_factor * np.array(control.stiffness)
-        damping[driven] = control.damping_factor * np.array(control.damping)
+        stiffness[driven] = control.stiffness
+        damping[driven] = control.damping
         if control.limits is not None:
             limits[driven] = control.limits
     rows = np.flatnonzero(free)
@@ -225,16 +225,15 @@ def _among(instants: tuple[float, ...], more: Iterable[float], horizon: float) -
 
 def forces_of(scene: Scene) -> tuple[AppliedForce, ...]:
     """Return where the scene's forces act; their values: `loads_of`."""
-    names = [arm.name for arm in scene.arms]
     return tuple(
         AppliedForce(
-            site=(k, interface_number(scene.arms[k], force.interface) or 0),
+            site=place,
             column=column,
             in_world=force.frame == "world",
             known=force.feed_forward,
         )
         for column, force in enumerate(scene.forces)
-        for k in [names.index(force.arm)]
+        if (place := place_of(scene, force.arm)) is not None
     )
 
 

@@ -51,7 +51,7 @@ def simulate(
     with profile.phase("simulation"):
         own = scene.feed_forward.on and feed_forward is None
         if own:
-            plain = build_system(scene.model_copy(update={"control": None}), bodies)
+            plain = build_system(scene.unchecked_copy({"control": None}), bodies)
             feed_forward = feed_forward_of(plain, scene, profile, start)
         if feed_forward is not None:
             problem = corrected(problem, feed_forward.corrections)

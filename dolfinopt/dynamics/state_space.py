@@ -86,7 +86,7 @@ def free_machine(scene: Scene, known: MachineSystem, t: float, rates: Rates) -> 
     # Drives on all driven coordinates, whose forces nothing asks for.
     none = (0.0,) * len(scene.driven)
     control = Control(feed_forward="none", stiffness=none, damping=none)
-    system = build_system(scene.model_copy(update={"control": control}), bodies)
+    system = build_system(scene.unchecked_copy({"control": control}), bodies)
     # Drives that nothing controls are where the motion has them; so are motors before springs.
     every = np.zeros((3, 1, system.num_coordinates))
     free = np.searchsorted(system.drives.free, known.drives.free)

@@ -274,15 +274,6 @@ class Cells:
             shape=(len(operators.points), count),
         )
 
-    def values(self, field: np.ndarray) -> np.ndarray:
-        """Return the cells' nodal values (n, d, k, n_cells) of a field (n_nodes, d, k)."""
-        nodes, columns = self._corners, field.shape[1] * field.shape[2]
-        flat = np.ascontiguousarray(field.reshape(len(field), columns).T)
-        out = np.empty((len(nodes), columns, nodes.shape[1]))
-        for corner, found in zip(nodes, out, strict=True):
-            np.take(flat, corner, axis=1, out=found, mode="clip")
-        return out.reshape(len(nodes), *field.shape[1:], nodes.shape[1])
-
     def sum_at_nodes(self, forces: np.ndarray) -> np.ndarray:
         """Return the nodal field (n_nodes, d, k) of the cells' forces (n, d, k, n_cells)."""
         n, *shape, count = forces.shape
@@ -326,12 +317,8 @@ class Cells:
             found -= origin
         return out
 
-    def cell_rows(self, columns: int) -> np.ndarray:
-        """Return room for derivatives by `differences`, (n - 1, n_cells, columns)."""
-        return np.empty((self.num_nodes - 1, self.count, columns))
-
     def sum_of_differences(self, rows: np.ndarray) -> np.ndarray:
-        """Return nodal derivatives (n_nodes, columns) of those by `differences`, `cell_rows`."""
+        """Return nodal derivatives (n_nodes, columns) of those (n - 1, n_cells, columns)."""
         return self._sum_differences @ rows.reshape(-1, rows.shape[2])
 
     @cached_property
@@ -363,13 +350,13 @@ class Cells:
         rows, others = self.by_component(left), self.by_component(right)
         out = np.empty(self.count)
         for cells in self._runs(len(rows)):
-            corners = self._corners[:, cells]
-            values, more = (
-                np.stack([each.take(corner, axis=1, mode="clip") for corner in corners])
-                for each in (rows, others)
-            )
+            values, more = self._values(rows, cells), self._values(others, cells)
             out[cells] = _sum_of_products(values, times(of_cells(self.mass, cells), more))
         return out
+
+    def _values(self, rows: np.ndarray, cells: slice) -> np.ndarray:
+        """Return the values (n, d k, cells) of some cells' nodes, see `by_component`."""
+        return np.stack([rows.take(at, axis=1, mode="clip") for at in self._corners[:, cells]])
 
     def _runs(self, columns: int) -> list[slice]:
         """Return runs of so many cells that values of so many columns stay in the cache."""
@@ -377,26 +364,32 @@ class Cells:
         step = max(entries, STRESS_CHUNK_CELLS)
         return [slice(k, min(k + step, self.count)) for k in range(0, self.count, step)]
 
-    def stiffness_times(self, values: np.ndarray) -> np.ndarray:
-        """Return k_e times nodal values (n, d, k, n_cells), see `values`."""
-        flat = values.reshape(-1, *values.shape[2:])
-        return times(self.stiffness, flat).reshape(values.shape)
-
     def energy_matrix(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Return field' K field (k, k) of this rank's cells."""
-        values = self.centred(field)
-        products = self.stiffness_times(values) * young
-        flat = (-1, field.shape[2], len(young))
-        return np.matmul(values.reshape(flat), products.reshape(flat).swapaxes(1, 2)).sum(axis=0)
+        rows, out = self.by_component(field), np.zeros(2 * (field.shape[2],))
+        for cells in self._runs(len(rows)):
+            values, forces = self._strained(rows, young, cells)
+            out += np.matmul(values, forces.swapaxes(1, 2)).sum(axis=0)
+        return out
 
-    def centred(self, field: np.ndarray) -> np.ndarray:
-        """Return `values` less their mean, which has no energy.
+    def forces(self, field: np.ndarray, young: np.ndarray) -> np.ndarray:
+        """Return K field (n_nodes, d, k) of this rank's cells, without translations' rounding."""
+        _, d, k = field.shape
+        _, forces = self._strained(self.by_component(field), young, slice(None))
+        return self.sum_at_nodes(forces.reshape(self.num_nodes, d, k, -1))
 
-        Rounding is then relative to the differences within a cell, not to its displacement.
+    def _strained(
+        self, rows: np.ndarray, young: np.ndarray, cells: slice
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return values (d n, k, cells) less their mean, and E k_e times them.
+
+        The mean has no energy: rounding is relative to what strains a cell.
         """
-        values = self.values(field)
+        values = self._values(rows, cells)
         values -= values.mean(axis=0)
-        return values
+        stiffness = of_cells(self.stiffness, cells)
+        values = values.reshape(stiffness.shape[1], -1, values.shape[2])
+        return values, times(stiffness, values) * young[cells]
 
 
 def _sum_of_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -469,48 +462,33 @@ class StiffenedModes:
         K0 = half.reshape(loads, q, q)
         return 0.5 * (K0 + K0.swapaxes(1, 2))
 
-    def gradient(
-        self, by_K0: np.ndarray, compliance: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    def gradient(self, by_K0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Differentiate a function of K0, given its derivative by K0 (loads, q, q), any symmetry.
 
-        Args:
-            by_K0: the derivative.
-            compliance: C (b, b), where the last b fields are u_F = Psi C with the first b modes
-                Psi: their derivatives are then among those by the modes.
-
         Returns:
-            Its derivatives by the modes (n_nodes, d, q) and by the fields, or those but the last
-            b, (n_nodes, d, loads), contributions of this rank's cells; by Young's modulus
-            (n_cells,), both held; and Psi' times the derivatives by u_F (b, b), or None.
+            Its derivatives by the modes (n_nodes, d, q) and by the fields (n_nodes, d, loads),
+            contributions of this rank's cells; by Young's modulus (n_cells,), both held.
         """
         (q, loads), cells, T = self._shape, self._cells, self._cells.operators.geometric
         symmetric = (0.5 * (by_K0 + by_K0.swapaxes(1, 2))).reshape(loads, -1)
         # Of b = c both factors are the same.
         twice = np.array([2.0 if b == c else 1.0 for b, c in self._pairs])
         weighted = twice[:, None, None] * symmetric.T
-        b = 0 if compliance is None else len(compliance)
-        dim, columns = cells.operators.points.shape[1], q + loads - b
-        rows, by_young = cells.cell_rows(dim * columns), np.empty(cells.count)
-        work = np.zeros((b, b))
+        dim = cells.operators.points.shape[1]
+        rows = np.empty((cells.num_nodes - 1, cells.count, dim * (q + loads)))
+        by_young = np.empty(cells.count)
         for run, products in self._products():
             count = len(run.young)
-            by = np.empty((*run.u.shape[:2], columns, count))
             transposed = of_cells(T, run.cells).swapaxes(1, 2)
             by_u = times(transposed, np.matmul(symmetric, products)).reshape(run.u.shape)
-            by[:, :, q:] = by_u[:, :, : loads - b]
             by_a = self._by_modes(run.a, np.matmul(weighted, run.force))
             # Of second degree in a: a times the derivative by it is twice the value.
             energy = np.einsum("ie,ie->e", run.a.reshape(-1, count), by_a.reshape(-1, count))
             by_young[run.cells] = 0.5 * energy
-            np.multiply(by_a, run.young, out=by[:, :, :q])
-            if compliance is not None:
-                outboard = by_u[:, :, loads - b :]
-                by[:, :, :b] += np.matmul(compliance.T, outboard)
-                work += np.matmul(run.a[:, :, :b], outboard.swapaxes(2, 3)).sum(axis=(0, 1))
+            by = np.concatenate([by_a * run.young, by_u], axis=2)
             rows[:, run.cells] = by.reshape(len(by), -1, count).swapaxes(1, 2)
-        nodal = cells.sum_of_differences(rows).reshape(-1, dim, columns)
-        return nodal[:, :, :q], nodal[:, :, q:], by_young, work if b else None
+        nodal = cells.sum_of_differences(rows).reshape(-1, dim, q + loads)
+        return nodal[:, :, :q], nodal[:, :, q:], by_young
 
     def stiffness_products(self, left: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,) of the first fields.

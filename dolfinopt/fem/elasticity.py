@@ -28,7 +28,6 @@ from dolfinopt.fem.assembly import (
     of_directions,
 )
 from dolfinopt.fem.interface import (
-    Connectivity,
     ConstraintModes,
     InterfaceTransformation,
     StaticFields,
@@ -145,11 +144,6 @@ class Substructure:
         layout = self.interior.layout
         entries = of_directions(layout.entries(), self.T.dim)
         return InteriorMatrix(layout.comm, entries, layout.rows)
-
-    @cached_property
-    def connectivity(self) -> Connectivity:
-        """Which cells share a facet, and which lie at the interfaces."""
-        return Connectivity(*self._graph)
 
     def joins(self, solid: np.ndarray) -> bool:
         """Return whether the solid ones (n_cells,) of its cells join all interfaces."""
@@ -271,11 +265,6 @@ class ElasticArm:
         """Mass density (n_cells,) of the owned cells, kg/m3."""
         return self.M.scale
 
-    @property
-    def connectivity(self) -> Connectivity:
-        """See `Substructure.connectivity`."""
-        return self.substructure.connectivity
-
     # -- products ----------------------------------------------------------------------------
 
     def stiffness_times(self, field: np.ndarray) -> np.ndarray:
@@ -292,10 +281,6 @@ class ElasticArm:
     def interior_mass(self) -> InteriorMatrix:
         """M_II."""
         return self.substructure.interior_mass(self.M)
-
-    def interior_mass_times(self, V: np.ndarray) -> np.ndarray:
-        """Return M_II V of owned interior rows (num_interior, k)."""
-        return self.interior_mass.times(V)
 
     @cached_property
     def rigid_inertia(self) -> np.ndarray:

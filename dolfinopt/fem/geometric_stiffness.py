@@ -25,12 +25,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.fem.assembly import StiffenedModes, combine, of_cells
+from dolfinopt.fem.frames import (
+    NUM_INERTIAL,
+    SECOND_TURNS,
+    TURNS,
+    accelerations,
+    by_inertia,
+    by_rigid_motions,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.fem.elasticity import ElasticArm
-
-# Loads by the arm's own inertia, which come first, by the number of directions.
-NUM_INERTIAL = {2: 4, 3: 12}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +76,7 @@ class UnitLoads:
     def geometric_stiffness(self, V: np.ndarray) -> np.ndarray:
         """Return K0 (p, q, q) in modes V (n_nodes, d, q) (collective on the arm's ranks)."""
         arm = self.arm
-        own = self._stiffened(V).stiffness()
+        own = self.stiffened(V).stiffness()
         K0 = own if arm.comm.size == 1 else arm.comm.allreduce(own)
         return K0 + self._face.stiffness(self._face_tensors, V)
 
@@ -99,7 +104,7 @@ class UnitLoads:
     def _last(self) -> dict[str, tuple[np.ndarray, StiffenedModes]]:
         return {}
 
-    def _stiffened(self, V: np.ndarray) -> StiffenedModes:
+    def stiffened(self, V: np.ndarray) -> StiffenedModes:
         """Return what is known of these modes; for the last ones the same."""
         known = self._last.get("modes")
         if known is None or known[0] is not V:
@@ -107,58 +112,26 @@ class UnitLoads:
             known = self._last["modes"] = V, StiffenedModes(cells, self.fields, self.arm.young, V)
         return known[1]
 
-    def gradient(
-        self, V: np.ndarray, by_K0: np.ndarray, *, static: bool = False
-    ) -> GeometricGradient:
+    def gradient(self, V: np.ndarray, by_K0: np.ndarray) -> GeometricGradient:
         """Differentiate a function of K0 by modes and material (collective on the arm's ranks).
 
-        The stresses' part goes through one static solve a load, the adjoint of u_p. Those of the
-        interface's loads are not needed where the constraint modes Psi have an adjoint anyway:
-        u_F = Psi S^-1 with S = Psi'K Psi.
+        The stresses' part goes through one static solve a load, the adjoint of u_p.
 
         Args:
             V: (n_nodes, d, q) as given to `geometric_stiffness`, and to `with_modes` if that was.
             by_K0: (p, q, q) derivatives.
-            static: whether V begins with the constraint modes, by which `by_modes` then
-                differentiates u_F, too, and `by_stiffness` by S.
         """
-        arm, inertial = self.arm, self.num_inertial
-        modes = arm.constraint_modes()
-        compliance = np.linalg.inv(modes.stiffness)
-        known = self._stiffened(V)
-        by_V, forces, direct, work = known.gradient(by_K0, compliance if static else None)
-        by_stiffness = np.zeros_like(compliance)
+        arm = self.arm
+        by_V, forces, direct = self.stiffened(V).gradient(by_K0)
         face = self._face.gradient(self._face_tensors, V, by_K0)
-        by_V = by_V + face.by_modes
         direct = direct + self._face.stiffness_products(face.y, self.fields)
-        forces = forces + face.by_fields[:, :, : forces.shape[2]]
-        if static:  # those of the interface's loads are folded already
-            assert work is not None
-            outboard = face.by_fields[:, :, inertial:]
-            work = work + _fold(outboard, by_V, modes.field, compliance)
-            by_stiffness -= compliance @ arm.comm.allreduce(work) @ compliance
+        forces = forces + face.by_fields
         adjoint = arm.static_response(*arm.restrict(forces))
-        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, by_stiffness, face)
+        by_V = by_V + face.by_modes
+        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, face)
         if self.modes is None:
             return found
         return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
-
-    def stiffness_products(
-        self, left: np.ndarray, V: np.ndarray, adjoint: np.ndarray
-    ) -> np.ndarray:
-        """Return sum_k left_k' k_e V_k - sum_p adjoint_p' k_e u_p (n_cells,).
-
-        Args:
-            left, V: (n_nodes, d, q).
-            adjoint: (n_nodes, d, k) of the first fields.
-        """
-        known, arm = self._last.get("modes"), self.arm
-        if known is not None and known[0] is V:
-            arm.profile.counts.energy_fields += left.shape[2] + adjoint.shape[2]
-            return known[1].stiffness_products(left, adjoint)
-        fields = self.fields[:, :, : adjoint.shape[2]]
-        products = arm.cell_stiffness_products(left, V)
-        return products - arm.cell_stiffness_products(adjoint, fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +143,8 @@ class GeometricGradient:
         modes, by_K0: (n_nodes, d, q) and (p, q, q), as given.
         by_modes: (n_nodes, d, q) by the modes, contributions of this rank's cells.
         direct: (n_cells,) by Young's modulus, modes and fields held.
-        by_fields: (n_nodes, d, k) by the fields of the first k loads, contributions of this
-            rank's cells; those of the others are among those by modes and S.
-        adjoint: (n_nodes, d, k) of these fields.
-        by_stiffness: (b, b) by S of the constraint modes; zero where they were not to be used.
+        by_fields: (n_nodes, d, p) by the fields of the loads, contributions of this rank's cells.
+        adjoint: (n_nodes, d, p) of these fields.
         face: of the interfaces' rotations.
     """
 
@@ -184,29 +155,22 @@ class GeometricGradient:
     direct: np.ndarray
     by_fields: np.ndarray
     adjoint: np.ndarray
-    by_stiffness: np.ndarray
     face: FaceGradient
 
-    def by_young_beside(self, left: np.ndarray, V: np.ndarray) -> np.ndarray:
-        """Return `by_young` plus sum_k left_k' k_e V_k (n_cells,), in one product.
+    def by_young(self, left: np.ndarray) -> np.ndarray:
+        """Return the derivative by Young's modulus, plus sum_k left_k' k_e V_k (n_cells,).
 
         Args:
-            left: (n_nodes, d, q).
-            V: the modes.
+            left: (n_nodes, d, q), by which the modes V follow it.
         """
-        return self.direct + self.loads.stiffness_products(left, V, self.adjoint)
-
-    @property
-    def by_young(self) -> np.ndarray:
-        """By Young's modulus (n_cells,), modes held."""
-        fields = self.loads.fields[:, :, : self.adjoint.shape[2]]
-        return self.direct - self.loads.arm.cell_stiffness_products(self.adjoint, fields)
+        self.loads.arm.profile.counts.energy_fields += left.shape[2] + self.adjoint.shape[2]
+        known = self.loads.stiffened(self.modes)
+        return self.direct + known.stiffness_products(left, self.adjoint)
 
     @property
     def stiffness(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Fields l and r of l . dK r, modes held, but for what stiffens the cells themselves."""
-        every = self.loads.fields
-        return [(-self.adjoint, every[:, :, : self.adjoint.shape[2]]), (self.face.y, every)]
+        return [(self.face.y - self.adjoint, self.loads.fields)]
 
     def at_interfaces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivatives by the outboard interfaces' shape, modes held (collective).
@@ -214,20 +178,19 @@ class GeometricGradient:
         By `InterfaceTransformation.rigid` (n_nodes, d, b), in which the fields and their adjoints
         move the interfaces' nodes; and by the nodes' places as lever arms (n_nodes, d).
         """
-        loads, arm, k = self.loads, self.loads.arm, self.adjoint.shape[2]
-        T, fields, accelerations = arm.substructure.T, loads.fields[:, :, :k], loads.accelerations
-        residual = arm.stiffness_times(fields)
-        count = min(k, accelerations.shape[2])
-        residual[:, :, :count] -= arm.mass_times(accelerations[:, :, :count])
+        loads, arm = self.loads, self.loads.arm
+        T, accelerations = arm.substructure.T, loads.accelerations
+        residual = arm.stiffness_times(loads.fields)
+        residual[:, :, : loads.num_inertial] -= arm.mass_times(accelerations)
         by_fields = self.by_fields - arm.stiffness_times(self.adjoint)
-        rigid = by_fields @ T.coordinates(fields).T - residual @ T.coordinates(self.adjoint).T
+        rigid = by_fields @ T.coordinates(loads.fields).T
+        rigid -= residual @ T.coordinates(self.adjoint).T
         return rigid, loads.by_levers(self.face)
 
     @cached_property
     def _by_loads(self) -> np.ndarray:
         """By the loads f_p that are inertia (n_nodes, d, k)."""
-        adjoint = self.adjoint[:, :, : self.loads.num_inertial]
-        return np.asarray(adjoint - self.face.y[:, :, : adjoint.shape[2]])
+        return np.asarray((self.adjoint - self.face.y)[:, :, : self.loads.num_inertial])
 
     @property
     def by_inertia(self) -> np.ndarray:
@@ -238,41 +201,6 @@ class GeometricGradient:
     def by_modal_inertia(self) -> np.ndarray:
         """Fields whose products with d(M V) are the modal loads' part (n_nodes, d, q)."""
         return self._by_loads[:, :, self.loads.num_frame :]
-
-    @property
-    def by_density(self) -> np.ndarray:
-        """By mass density (n_cells,), modes held."""
-        arm = self.loads.arm
-        unit = np.zeros_like(arm.points)
-        unit[:, 0] = 1.0
-        left, right = [self.by_inertia], [np.stack([unit, arm.points], axis=2)]
-        if self.loads.modes is not None:
-            left.append(self.by_modal_inertia)
-            right.append(self.loads.modes)
-        return arm.cell_mass_products(np.concatenate(left, axis=2), np.concatenate(right, axis=2))
-
-
-def _fold(
-    outboard: np.ndarray, by_V: np.ndarray, psi: np.ndarray, compliance: np.ndarray
-) -> np.ndarray:
-    """Add derivatives by u_F = Psi C (n_nodes, d, b) to those by Psi; return Psi' times them."""
-    by_V[:, :, : len(compliance)] += combine(outboard, compliance)
-    return np.tensordot(psi, outboard, ((0, 1), (0, 1)))
-
-
-def by_inertia(adjoint: np.ndarray) -> np.ndarray:
-    """Return what the inertial loads' adjoints multiply dM 1_x and dM X by (n_nodes, d, 2)."""
-    # M treats the components alike: only the sum of what multiplies 1 or an X_b counts.
-    out = np.zeros((*adjoint.shape[:2], 2))
-    if adjoint.shape[1] == 3:
-        for a in range(3):
-            out[:, 0, 0] += adjoint[:, a, a]
-            out[:, :, 1] += adjoint[:, a, 3 + 3 * a : 6 + 3 * a]
-        return out
-    out[:, 0, 0] = adjoint[:, 0, 0] + adjoint[:, 1, 1]
-    out[:, 0, 1] = adjoint[:, 0, 3] + adjoint[:, 1, 2]
-    out[:, 1, 1] = adjoint[:, 1, 3] - adjoint[:, 0, 2]
-    return out
 
 
 def unit_loads(arm: ElasticArm) -> UnitLoads:
@@ -292,33 +220,15 @@ def interface_fields(arm: ElasticArm) -> np.ndarray:
     return combine(modes.field, np.linalg.inv(modes.stiffness))
 
 
-def accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the fields (n_nodes, d, 4 or 12) whose inertia loads the body, or M times them."""
-    # 1_x, 1_y, S X and X in the plane; 1_x, 1_y, 1_z and X_b in direction a, b running faster, in
-    # space. Of 1 and X (n_nodes, d), or M times these: M knows no direction. M (-y, x) is (-(M
-    # X)_y, (M X)_x), as M treats the components alike.
-    dim = ones.shape[1]
-    fields = np.zeros((*ones.shape, NUM_INERTIAL[dim]))
-    if dim == 3:
-        for a in range(3):
-            fields[:, a, a] = ones[:, a]
-            fields[:, a, 3 + 3 * a : 6 + 3 * a] = places
-        return fields
-    fields[:, 0, 0], fields[:, 1, 1] = ones.T
-    fields[:, 0, 2], fields[:, 1, 2] = -places[:, 1], places[:, 0]
-    fields[:, :, 3] = places
-    return fields
-
-
 # -- what the rotation of second order of a rigid interface adds to the geometric stiffness ------
 #
 # A node of the outboard interface, r from its point of reference, moves by u + (exp(theta~) - 1) r,
 # theta being the rotation vector. The linear modes hold u + theta x r of it; the reaction R_p of
 # the interface's nodes to a unit load does work along the rest, theta x (theta x r) / 2:
 #
-#     K0_p[i, j] gains theta_i' D_p theta_j,   D_p = S_p - tr(S_p) 1,   S_p = sym(sum R_p r').
+#     K0_p[i, j] gains theta_i' D_p theta_j,   D_kl = S : S_k S_l,   S = sym(sum R_p r'),
 #
-# In the plane theta has one component and D_p is -tr(S_p).
+# with the rotations S_k of `frames`: S - tr(S) 1 in space, -tr(S) in the plane.
 #
 # Without it a rotation of the interface would strain the cells beside it, whose stress across the
 # arm is large, and a moment M at the interface would act on nodes that keep the directions of their
@@ -377,7 +287,7 @@ class FaceRotation:
         """
         forces, levers = self._reactions(fields, accelerations), self._levers[:, self._nodes]
         S = self.arm.comm.allreduce(np.einsum("enap,ienb->ipab", forces, levers))
-        return _deviated(0.5 * (S + S.swapaxes(2, 3)))
+        return np.einsum("klab,ipab->ipkl", SECOND_TURNS[S.shape[3]], 0.5 * (S + S.swapaxes(2, 3)))
 
     def _reactions(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Return K u_p - f_p of the cells beside the interfaces (cells, n, d, p)."""
@@ -420,7 +330,8 @@ class FaceRotation:
         dim, c = V.shape[1], theta.shape[1]
         by_theta = np.zeros((len(theta), dim + c, V.shape[2]))
         by_theta[:, dim:] = 2.0 * np.einsum("mpab,mbj,pij->mai", D, theta, symmetric)
-        by_S = _by_moments(theta[:, None] @ symmetric @ theta[:, None].swapaxes(2, 3))
+        by_D = theta[:, None] @ symmetric @ theta[:, None].swapaxes(2, 3)
+        by_S = np.einsum("klab,mpkl->mpab", SECOND_TURNS[dim], by_D)
         y = np.einsum("mpab,mnb->nap", by_S, self._levers)
         forces = np.zeros_like(y)
         np.add.at(forces, self._nodes, self._stiffness_times(y[self._nodes]))
@@ -447,20 +358,7 @@ class FaceRotation:
 
 def _levers(rigid: np.ndarray) -> np.ndarray:
     """Return r (m, n_nodes, d) from every interface's point of reference, zero elsewhere."""
-    # Rotations among the unit motions (n_nodes, d, (d + c) m) tell it: theta x r.
-    if rigid.shape[1] == 2:
-        about_z = rigid[:, :, 2::3]
-        return np.stack([about_z[:, 1], -about_z[:, 0]], axis=-1).swapaxes(0, 1)
-    about_x, about_y = rigid[:, :, 3::6], rigid[:, :, 4::6]
-    return np.stack([-about_y[:, 2], about_x[:, 2], -about_x[:, 1]], axis=-1).swapaxes(0, 1)
-
-
-def _deviated(S: np.ndarray) -> np.ndarray:
-    """Return S - tr(S) 1 of symmetric tensors (..., 3, 3); -tr(S) (..., 1, 1) in the plane."""
-    trace = np.trace(S, axis1=-2, axis2=-1)[..., None, None]
-    return -trace if S.shape[-1] == 2 else S - trace * np.eye(3)
-
-
-def _by_moments(by_D: np.ndarray) -> np.ndarray:
-    """Return the transpose of `_deviated`: derivatives by S, given those by D (symmetric)."""
-    return -by_D * np.eye(2) if by_D.shape[-1] == 1 else _deviated(by_D)
+    # Of its rotations S_k r, sum_k S_k' S_k = (d - 1) 1.
+    d = rigid.shape[1]
+    ends = np.split(rigid, rigid.shape[2] // (d + len(TURNS[d])), axis=2)
+    return np.stack([by_rigid_motions(end) for end in ends]) / (d - 1)

@@ -6,10 +6,10 @@ has the rows of the outboard interfaces, too: [K_II, K_Ib; K_bI, K_bb].
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,7 +17,12 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix, interior_entries
+from dolfinopt.fem.assembly import (
+    AssembledMatrix,
+    InteriorEntries,
+    InteriorMatrix,
+    interior_entries,
+)
 from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.measured import (
     BAND_WORK_LIMIT,
@@ -40,21 +45,6 @@ from dolfinopt.solver import (
 )
 
 OPTIONS = "dolfinopt_stiffness_"  # prefix of the solver's PETSc options
-
-
-class Stiffness(Protocol):
-    """K of one design.
-
-    Attributes:
-        scale: (n_cells,) Young's modulus of the cells, Pa.
-        data: all values, one behind the other; assembled when they are first asked for.
-    """
-
-    @property
-    def scale(self) -> np.ndarray: ...
-
-    @property
-    def data(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +105,34 @@ def interior_layout(
     )
 
 
-class Solver(Protocol):
+@dataclass(frozen=True, eq=False)
+class ExtendedStiffness:
+    """K of one design, and what the rows of the outboard interfaces take of it.
+
+    Attributes:
+        of: K over local dofs.
+        border: coupling of the owned nodes beside the interfaces with the interfaces'
+            coordinates, then stiffness of these alone.
+    """
+
+    of: AssembledMatrix
+    border: np.ndarray
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Young's modulus (n_cells,) of the cells, Pa."""
+        return self.of.scale
+
+    @property
+    def data(self) -> np.ndarray:
+        """All values, one behind the other; not kept."""
+        return np.append(self.of.data, self.border)
+
+
+Stiffness = AssembledMatrix | ExtendedStiffness
+
+
+class Factor(ABC):
     """K^-1 of one design after another, of the rows that this rank owns; all is collective.
 
     Attributes:
@@ -124,45 +141,21 @@ class Solver(Protocol):
         failed: K has no factor but for rounding, or the last solution did not converge.
     """
 
-    @property
-    def name(self) -> str: ...
+    tolerance = 0.0
 
-    @property
-    def tolerance(self) -> float: ...
-
-    @property
-    def failed(self) -> bool: ...
-
-    def update(self, K: Stiffness) -> None:
-        """Take another design."""
+    @abstractmethod
+    def precondition(self, right: np.ndarray) -> np.ndarray:
+        """Return an approximation of K^-1 right (rows, k), symmetric positive definite."""
 
     def solve(
         self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
     ) -> np.ndarray:
         """Return K^-1 right (rows, k); see `block_conjugate_gradients` for the other arguments."""
-
-    def precondition(self, right: np.ndarray) -> np.ndarray:
-        """Return an approximation of K^-1 right (rows, k), symmetric positive definite."""
-
-
-class Factor:
-    """What `Solver`s by a factor have in common: `precondition` solves."""
-
-    tolerance = 0.0
-
-    def precondition(self, right: np.ndarray) -> np.ndarray:
-        """See `Solver`."""
-        raise NotImplementedError
-
-    def solve(
-        self, right: np.ndarray, tolerance: float | None = None, held: np.ndarray | None = None
-    ) -> np.ndarray:
-        """See `Solver`."""
         return self.precondition(right)
 
 
 class PetscSolver(Factor):
-    """MUMPS' factor, or what the user's PETSc options put in its place; see `Solver`."""
+    """MUMPS' factor, or what the user's PETSc options put in its place."""
 
     def __init__(self, layout: Layout):
         self._matrix = InteriorMatrix(layout.comm, layout.entries(), layout.rows)
@@ -179,11 +172,11 @@ class PetscSolver(Factor):
 
     @property
     def failed(self) -> bool:
-        """See `Solver`."""
+        """See `Factor`."""
         return self._factor is not None and self._factor.failed
 
     def update(self, K: Stiffness) -> None:
-        """See `Solver`."""
+        """Take another design."""
         self._matrix.update(K.data)
         self._ksp.setOperators(self._matrix.mat)
         with obeying_options(OPTIONS):
@@ -191,13 +184,13 @@ class PetscSolver(Factor):
         self._factor = PetscFactor(self._ksp)
 
     def precondition(self, right: np.ndarray) -> np.ndarray:
-        """See `Solver`."""
+        """See `Factor`."""
         assert self._factor is not None
         return self._factor.solve(right)
 
 
 class BandSolver(Factor):
-    """LAPACK's factor of a band that one rank owns; see `Solver`."""
+    """LAPACK's factor of a band that one rank owns."""
 
     name = "LAPACK's band"
 
@@ -214,18 +207,21 @@ class BandSolver(Factor):
 
     @property
     def failed(self) -> bool:
-        """See `Solver`."""
+        """See `Factor`."""
         return not self._is_definite and self._indefinite.failed
 
     def update(self, K: Stiffness) -> None:
-        """See `Solver`."""
+        """Take another design."""
         self._is_definite = self._band.factorise(K.data.take(self._source, mode="clip"))
         if not self._is_definite:
             self._indefinite.update(K)
 
     def precondition(self, right: np.ndarray) -> np.ndarray:
-        """See `Solver`."""
+        """See `Factor`."""
         return (self._band if self._is_definite else self._indefinite).solve(right)
+
+
+Solver = PetscSolver | BandSolver | MultigridSolver
 
 
 def choose_solver(layout: Layout, tolerance: float) -> Solver:
@@ -326,7 +322,7 @@ class LinearSystem:
         tolerance: float | None = None,
         held: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return K^-1 right (rows, k), see `Solver.solve` (collective).
+        """Return K^-1 right (rows, k), see `Factor.solve` (collective).
 
         Raises:
             ConvergenceError: K is singular but for rounding, or there are too many iterations.
@@ -359,30 +355,6 @@ class LinearSystem:
 
 
 # -- with the rows of the outboard interfaces -----------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class ExtendedStiffness:
-    """K of one design, and what the rows of the outboard interfaces take of it.
-
-    Attributes:
-        of: K over local dofs.
-        border: coupling of the owned nodes beside the interfaces with the interfaces'
-            coordinates, then stiffness of these alone.
-    """
-
-    of: Stiffness
-    border: np.ndarray
-
-    @property
-    def scale(self) -> np.ndarray:
-        """See `Stiffness`."""
-        return self.of.scale
-
-    @property
-    def data(self) -> np.ndarray:
-        """See `Stiffness`; not kept."""
-        return np.append(self.of.data, self.border)
 
 
 def extended_layout(

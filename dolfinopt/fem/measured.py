@@ -18,27 +18,12 @@ KERNEL_CHUNK_ENTRIES = 2_000_000
 
 # -- interface -------------------------------------------------------------------------------
 
-# Largest relative error that rounding may make in the stiffness of a design in which solids float:
-# a tenth of what an optimiser's step changes. Against long double errors are 0.03 to 0.35 of the
-# estimate.
-STIFFNESS_ROUNDING_LIMIT = 1e-3
-# Part of a cell's displacement as a rigid translation in that estimate. The energy does not know
-# translations, the assembled matrix does: where they are lost in it, refinement fails.
-ROUNDING_TRANSLATION_SHARE = 0.03
-ROUNDING_ITERATIONS = 6  # of that estimate; four give two digits
+# Largest bound of the relative error that rounding makes in the stiffness of a soft design. The
+# error itself is up to 1e-3 then, a tenth of what an optimiser's step changes.
+ROUNDING_ERROR_LIMIT = 0.4
 # Ratio of Young's moduli up to which floating solids do no harm: the stiffness of an arm is then
-# off by at most a few 1e-7, from rounding.
-HARMLESS_CONTRAST = 1e6
-
-# -- stress: directions of a motion's loads ----------------------------------------------------
-
-# Of the largest one, by the length of the accelerations, below which a direction in which the loads
-# vary along a motion is none. Stress of spatial_arm.toml is then right to 4e-12 of the largest, by
-# 34 to 40 solves an arm in place of 54 or 66.
-MOTION_RANK_SHARE = 1e-9
-SUMS_RANK_SHARE = 1e-11  # the same of displacements whose adjoints are summed
-# Part of the loads up to which so many directions are solved for in their place.
-FEWER_DIRECTIONS = 0.9
+# off by at most 1e-6, from rounding.
+HARMLESS_CONTRAST = 1e7
 
 # -- interior: the choice of a solver --------------------------------------------------------
 

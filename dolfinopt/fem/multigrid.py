@@ -17,14 +17,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import product
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from mpi4py import MPI
 
 from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
-from dolfinopt.fem.interface import InterfaceTransformation, rigid_motions
+from dolfinopt.fem.frames import rigid_motions
+from dolfinopt.fem.interface import InterfaceTransformation
 from dolfinopt.fem.measured import (
     BOX_CHUNK_COLUMNS,
     COARSEST_BAND_WORK,
@@ -41,13 +42,6 @@ CORNERS = tuple(product((0, 1), repeat=3))  # of a cell, in these directions
 
 Columns = Callable[[np.ndarray], np.ndarray]
 NAME = "conjugate gradients"  # of the solver
-
-
-class Scaled(Protocol):
-    """K of one design, by Young's modulus (n_cells,) of this rank's cells, Pa."""
-
-    @property
-    def scale(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,28 +138,12 @@ def box_of(T: InterfaceTransformation, cells: Cells, centroid: np.ndarray) -> Bo
 # -- levels: rows are three a node of the interior, then those of the rigid coordinates, if any ----
 
 
-class Level(Protocol):
-    """K on one grid.
+class Mesh:
+    """K on the mesh's own grid, by its cells; the interior's rows are component after component.
 
     Attributes:
         inverse_diagonal: (rows, 1), 0 for the rigid coordinates, which coarser grids alone correct.
         highest: no less than the largest eigenvalue of the diagonally scaled matrix.
-    """
-
-    inverse_diagonal: np.ndarray
-    highest: float
-
-    def update(self, young: np.ndarray) -> None:
-        """Take Young's modulus (n_cells,) of the box's cells, Pa."""
-
-    def times(self, X: np.ndarray) -> np.ndarray:
-        """Return K X (rows, k)."""
-
-
-class Mesh:
-    """K on the mesh's own grid, by its cells; the interior's rows are component after component.
-
-    See `Level`.
     """
 
     def __init__(self, box: Box, rigid: np.ndarray):
@@ -183,7 +161,7 @@ class Mesh:
         self.highest = _highest(box.stiffness[None])
 
     def update(self, young: np.ndarray) -> None:
-        """See `Level`."""
+        """Take Young's modulus (n_cells,) of the box's cells, Pa."""
         x, z, y = shape = self._box.shape
         self._young[:x, :z, :y] = young.reshape(shape)
         self._each = self._young.ravel()[: self._count]
@@ -198,7 +176,7 @@ class Mesh:
         return field[..., self._layer : -self._layer]
 
     def times(self, X: np.ndarray) -> np.ndarray:
-        """See `Level`."""
+        """Return K X (rows, k)."""
         k, U = X.shape[1], np.zeros((3, X.shape[1], self._size))
         for one, column in zip(U.swapaxes(0, 1), X[: self._interior].T, strict=True):
             self._inner(one)[...] = column.reshape(3, -1)
@@ -230,9 +208,8 @@ class Mesh:
 class Grid:
     """K of a coarser grid, P' K P of the box's cells; the interior's rows are node after node.
 
-    See `Level`.
-
     Attributes:
+        inverse_diagonal, highest: see `Mesh`.
         expansion: (3 n_nodes, rows) displacements of all nodes by the rows: none of the clamped
             ones, rigid ones at the end.
     """
@@ -257,7 +234,7 @@ class Grid:
         self._inner = slice(len(end), len(end) + inner)
 
     def update(self, young: np.ndarray) -> None:
-        """See `Level`."""
+        """Take Young's modulus (n_cells,) of the box's cells, Pa."""
         by_kind = self._by_kind  # whose entries are the numbers of the box's cells
         values = young[by_kind.data], by_kind.indices, by_kind.indptr
         stiffness = self._stiffness.reshape(len(self._stiffness), -1)
@@ -269,7 +246,7 @@ class Grid:
         self.inverse_diagonal[: len(diagonal), 0] = 1.0 / diagonal
 
     def times(self, X: np.ndarray) -> np.ndarray:
-        """See `Level`."""
+        """Return K X (rows, k)."""
         return self._restriction @ (self._matrix @ (self.expansion @ X))
 
     def assembled(self) -> sp.coo_matrix:
@@ -318,6 +295,9 @@ def _highest(stiffness: np.ndarray) -> float:
     return float(np.linalg.eigvalsh(scaled).max())
 
 
+Level = Mesh | Grid
+
+
 class BoxMultigrid:
     """K of a box on the mesh's and coarser grids, for one design after another.
 
@@ -330,7 +310,7 @@ class BoxMultigrid:
     def __init__(self, box: Box, coordinates: bool):
         """Choose the grids; `coordinates` says whether the rigid ones are rows."""
         rigid = box.rigid if coordinates else box.rigid[..., :0]
-        self.levels: list[Mesh | Grid] = [Mesh(box, rigid)]
+        self.levels: list[Level] = [Mesh(box, rigid)]
         self.steps: list[tuple[sp.csr_matrix, sp.csr_matrix]] = []
         self.works = False
         lines = [np.arange(n + 1) for n in box.shape]
@@ -521,8 +501,8 @@ class MultigridSolver:
         if comm.rank == 0:
             self._grids = BoxMultigrid(box, coordinates)
 
-    def update(self, K: Scaled) -> None:
-        """Take another design, see `interior.Solver`."""
+    def update(self, K: Any) -> None:
+        """Take another design."""
         whole = self._box.comm.gather(K.scale)
         if whole is not None:
             values = np.empty(len(self._box.cells))

@@ -155,7 +155,7 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
             ends = like.passive_columns * arm.length / arm.cells[0]
         size = (arm.length, arm.height, arm.thickness)[: len(arm.cells)]
         mesh = box_arm(comm, arm.name, size, arm.cells, ends)
-        if arm.interfaces:
+        if arm.further_interfaces:
             mesh = with_interfaces(mesh, arm, ends)
     return with_regions(mesh, like, scales)
 
@@ -180,37 +180,43 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
         facets, notes = on_root(comm, build_model, gmsh, arm)
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=3 if arm.is_solid else 2)
     with together(comm):
-        mesh, tags = _arm_mesh(comm, arm.name, arm.length, *parts), parts[2]
+        mesh, tags = _tagged(comm, arm, *parts), parts[2]
         further = tuple(
             InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(point))
-            for k, (one, point) in enumerate(zip(arm.interfaces, arm.interface_points[1:]))
+            for k, (one, point) in enumerate(zip(arm.further_interfaces, arm.interface_points[1:]))
         )
         mesh.passive[:] |= _distance(mesh.centroid, facets) < arm.solid_ends
     return replace(mesh, notes=notes, further=further)
 
 
-def _arm_mesh(
-    comm: MPI.Comm, name: str, length: float, mesh: Any, cell_tags: Any, facet_tags: Any
-) -> ArmMesh:
+def _tagged(comm: MPI.Comm, arm: scenes.Arm, mesh: Any, cell_tags: Any, facet_tags: Any) -> ArmMesh:
+    """Return an arm of a model's groups."""
     owned, _ = compat.local_cell_counts(mesh)
-    dim = mesh.geometry.dim
-    corners = compat.cell_coordinates(mesh, owned)[:, :, :dim]
-    solid, void = np.zeros((2, owned), dtype=bool)
-    for group, marked in ((PASSIVE, solid), (VOID, void)):
+    regions = []
+    for group in (PASSIVE, VOID):
+        marked = np.zeros(owned, dtype=bool)
         tagged = cell_tags.indices[cell_tags.values == group]
         marked[tagged[tagged < owned]] = True
-    return ArmMesh(
-        name=name,
-        comm=comm,
-        mesh=mesh,
-        centroid=corners.mean(axis=1),
-        area=cell_sizes(corners),
-        passive=solid,
-        void=void,
-        inboard_facets=facet_tags.indices[facet_tags.values == INBOARD],
-        outboard_facets=facet_tags.indices[facet_tags.values == OUTBOARD],
-        outboard_point=np.array([length, 0.0, 0.0])[:dim],
-    )
+        regions.append(marked)
+    facets = [facet_tags.indices[facet_tags.values == group] for group in (INBOARD, OUTBOARD)]
+    return _arm_mesh(comm, arm.name, arm.length, mesh, regions, facets)
+
+
+def _arm_mesh(
+    comm: MPI.Comm,
+    name: str,
+    length: float,
+    mesh: Any,
+    regions: Sequence[np.ndarray],
+    facets: Sequence[np.ndarray],
+) -> ArmMesh:
+    """Return an arm of its solid and void cells, and of its interfaces' facets."""
+    dim = mesh.geometry.dim
+    corners = compat.cell_coordinates(mesh, len(regions[0]))[:, :, :dim]
+    centroid, area = corners.mean(axis=1), cell_sizes(corners)
+    point = np.array([length, 0.0, 0.0])[:dim]
+    (passive, void), (inboard, outboard) = regions, facets
+    return ArmMesh(name, comm, mesh, centroid, area, passive, void, inboard, outboard, point)
 
 
 def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmMesh:
@@ -324,24 +330,13 @@ def box_arm(
         for k in range(len(size)):
             snap(mesh.geometry.x[:, k], low[k], size[k] / cells[k])
     ends = [compat.facets_on(mesh, x, 0.25 * length / cells[0]) for x in (0.0, length)]
+    owned, _ = compat.local_cell_counts(mesh)
     with together(comm):
-        owned, _ = compat.local_cell_counts(mesh)
-        corners = compat.cell_coordinates(mesh, owned)[:, :, : len(size)]
-        centroid = corners.mean(axis=1)
+        found = _arm_mesh(comm, name, length, mesh, [*np.zeros((2, owned), dtype=bool)], ends)
         layers = math.ceil(passive / length * cells[0] - 0.5)  # as in meshes/arm.geo
-        layer = np.floor(centroid[:, 0] / length * cells[0])
-        return ArmMesh(
-            name=name,
-            comm=comm,
-            mesh=mesh,
-            centroid=centroid,
-            area=cell_sizes(corners),
-            passive=(layer < layers) | (layer >= cells[0] - layers),
-            void=np.zeros(owned, dtype=bool),
-            inboard_facets=ends[0],
-            outboard_facets=ends[1],
-            outboard_point=np.array([length, *(0.0 for _ in across)]),
-        )
+        layer = np.floor(found.centroid[:, 0] / length * cells[0])
+        found.passive[:] = (layer < layers) | (layer >= cells[0] - layers)
+        return found
 
 
 # -- further outboard interfaces of a box: the sides of its cells near a point of its surface ----
@@ -365,7 +360,7 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
     middles, outer = sides.mean(axis=2), _outer(mesh, sides.mean(axis=2), arm)
     taken = np.isin(facets, np.concatenate([mesh.inboard_facets, mesh.outboard_facets]))
     found, solid = [], mesh.passive.copy()
-    for one in arm.interfaces:
+    for one in arm.further_interfaces:
         point = np.array(one.point)
         assert one.radius is not None
         distance = np.linalg.norm(middles - point, axis=2)
@@ -419,7 +414,7 @@ def hollow_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
                 add_cells(gmsh, hull.member(limits[1]))
         parts = compat.model_to_mesh(gmsh.model, comm, gdim=3)
     with together(comm):
-        mesh = _arm_mesh(comm, arm.name, arm.length, *parts)
+        mesh = _tagged(comm, arm, *parts)
         wall = wall_of(hull, limits, mesh.mesh.geometry.x, mesh.centroid)
         # As exact as the hull: the ends' faces stay where they are whatever the thickness.
         mesh.mesh.geometry.x[:] = hull.points(limits[1])[wall.nodes]

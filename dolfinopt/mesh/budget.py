@@ -65,7 +65,7 @@ def _cell_bytes(scene: Scene, index: int) -> float:
     standard = DEFAULT_ELEMENT[arm.shape]
     element, nodes = arm.element or standard, 1.0
     if (arm.shape, element) not in FILE_CELL_BYTES:
-        nodes = arm.nodes_per_cell / arm.model_copy(update={"element": None}).nodes_per_cell
+        nodes = arm.nodes_per_cell / arm.unchecked_copy({"element": None}).nodes_per_cell
         element = standard
     return max(usual, nodes * FILE_CELL_BYTES[arm.shape, element][stiffened])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
 
@@ -16,120 +16,33 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.measured import (
     FILE_ROUNDING_SHARE,
     FRAME_TOLERANCE,
-    GRID_ROUNDING_SHARE,
     UNIT_FACTOR,
 )
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.arms import STEP_FILES
 
-OVERLAP = "overlap others (inverted cells, or {} on top of each other)"
-TENSOR_PLANE = {3: [0, 1, 2], 4: [0, 1, 3, 2]}  # from corners around a cell to DOLFINx's order
 
-
-@dataclass(frozen=True, eq=False)
-class FlatMesh:
-    """The cells and interfaces of a Gmsh model as arrays.
-
-    Attributes:
-        points: (n_points, 3) m; may hold points of no cell.
-        cells: (n_cells, 3 or 4) points around each cell.
-        inboard, outboard: (n, 2) points of the interfaces' lines.
-    """
-
-    points: np.ndarray
-    cells: np.ndarray
-    inboard: np.ndarray
-    outboard: np.ndarray
-
-
-def check_mesh(flat: FlatMesh, arm: Arm) -> None:
+def check_mesh(
+    points: np.ndarray, cells: np.ndarray, interfaces: Mapping[str, np.ndarray], arm: Arm
+) -> None:
     """Check that a mesh can be the arm of a scene.
 
+    Args:
+        points: (n_points, d) m; may hold points of no cell.
+        cells: (n, c) in DOLFINx's order.
+        interfaces: facets (k, f) by their names.
+        arm: of the scene.
+
     Raises:
-        InputError: not in the plane z = 0; folded or overlapping cells; several parts; an
-            interface that is no side of cells; or not in the arm's frame.
+        InputError: folded, flat or overlapping cells; several parts; an interface that is no side
+            of cells; or not in the arm's frame.
     """
-    if flat.inboard.shape[1] != 2:
-        raise InputError("its lines are curved; expected straight ones (Mesh.ElementOrder = 1)")
-    used = flat.points[np.unique(flat.cells)]
-    off = np.abs(used[:, 2]).max()
-    if off > FILE_ROUNDING_SHARE * arm.height:
-        raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
-    _check_cells(flat)
-    for name, lines, x in (("inboard", flat.inboard, 0.0), ("outboard", flat.outboard, arm.length)):
-        check_place(flat.points[lines.ravel(), :2], name, x, arm)
-    check_extents(used[:, :2], arm)
-
-
-def _check_cells(flat: FlatMesh) -> None:
-    corner = flat.points[flat.cells][:, :, :2]
-    ahead, back = np.roll(corner, -1, axis=1) - corner, np.roll(corner, 1, axis=1) - corner
-    turn = ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0]
-    least = FILE_ROUNDING_SHARE * np.linalg.norm(ahead, axis=2) * np.linalg.norm(back, axis=2)
-    sound = (turn > least).all(axis=1) | (turn < -least).all(axis=1)
-    _refuse(~sound, corner, "are folded or flat")
-    angle = np.arctan2(np.abs(turn), (ahead * back).sum(axis=2))
-    _refuse(_covering(flat, corner, angle), corner, OVERLAP.format("surfaces"))
-    _check_parts(flat.cells, "surfaces must share their curves")
-    tensor = flat.cells[:, TENSOR_PLANE[flat.cells.shape[1]]]
-    for name, lines in (("inboard", flat.inboard), ("outboard", flat.outboard)):
-        check_facets(lines, tensor, 2, name)
-
-
-def _covering(flat: FlatMesh, corner: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return (n,) True for convex cells that cover a place twice, given the angles at corners."""
-    # The way round a cell does not tell: surfaces may be oriented either way. But neighbours lie on
-    # different sides of what they share, the angles about a point add up to a full turn at most,
-    # and then a connected mesh overlaps only where its outline crosses itself or cells lie in
-    # others.
-    order = TENSOR_PLANE[flat.cells.shape[1]]
-    keys = facet_keys(flat.cells[:, order], 2)
-    bad = _overlapping(corner[:, order], keys)
-    total = np.bincount(flat.cells.ravel(), angle.ravel())
-    bad |= (total > 2.0 * np.pi + FILE_ROUNDING_SHARE)[flat.cells].any(axis=1)
-    if not bad.any():
-        _, first, count = np.unique(keys, return_index=True, return_counts=True)
-        side, cell = np.divmod(first[count == 1], len(corner))
-        ends = np.array(facet_corners(2, corner.shape[1]))[side]
-        bad[cell[_crossings(corner[:, order][cell[:, None], ends])]] = True
-    return bad if bad.any() else _covered(corner.mean(axis=1), corner)
-
-
-def _twice_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return twice the signed area (n,) of the triangles a b c, each (n, 2)."""
-    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-
-
-def _crossings(lines: np.ndarray) -> np.ndarray:
-    """Return (n,) True for each of lines (n, 2, 2) that crosses another one, not at its ends."""
-    a, b = lines[:, 0], lines[:, 1]
-    reach = np.linalg.norm(b - a, axis=1).max()
-    pairs = cKDTree(0.5 * (a + b)).query_pairs(reach, output_type="ndarray")
-    i, j = pairs.T
-    tiny = GRID_ROUNDING_SHARE * reach * reach
-    first = _twice_area(a[i], b[i], a[j]), _twice_area(a[i], b[i], b[j])
-    second = _twice_area(a[j], b[j], a[i]), _twice_area(a[j], b[j], b[i])
-    cross = np.minimum(*map(np.abs, first)) > tiny
-    cross &= np.minimum(*map(np.abs, second)) > tiny
-    cross &= (first[0] * first[1] < 0.0) & (second[0] * second[1] < 0.0)
-    crossed = np.zeros(len(lines), dtype=bool)
-    crossed[pairs[cross]] = True
-    return crossed
-
-
-def _covered(centre: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """Return (n,) True for cells whose centre (n, 2) lies in one of the cells near it."""
-    near = cKDTree(centre).query(centre, k=min(9, len(centre)))[1].reshape(len(centre), -1)
-    covered = np.zeros(len(centre), dtype=bool)
-    here = np.arange(len(centre))
-    for other in near.T:
-        a = corner[other]
-        turns = np.stack(
-            [_twice_area(a[:, k - 1], a[:, k], centre) for k in range(corner.shape[1])], axis=1
-        )
-        inside = (turns > 0.0).all(axis=1) | (turns < 0.0).all(axis=1)
-        covered |= inside & (other != here)
-    return covered
+    check_cells(points, cells)
+    for name, facets in interfaces.items():
+        check_facets(facets, cells, points.shape[1], name)
+    for name, x in (("inboard", 0.0), ("outboard", arm.length)):
+        check_place(points[interfaces[name].ravel()], name, x, arm)
+    check_extents(points[np.unique(cells)], arm)
 
 
 def check_place(points: np.ndarray, name: str, x: float, arm: Arm) -> None:
@@ -184,28 +97,33 @@ def remedy(found: float, expected: float, keys: str) -> str:
     return f"correct the geometry, or {keys} in the scene"
 
 
-# -- whether cells in space can be a solid: no flat, folded or overlapping ones, one part --------
+# -- whether cells can be an arm: no flat, folded or overlapping ones, one part ------------------
 
 
 def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     """Check the cells of a mesh file.
 
     Args:
-        points: (n_points, 3) m.
-        cells: (n, 4 or 8) points of tetrahedra or hexahedra, in DOLFINx's order.
+        points: (n_points, d) m.
+        cells: (n, c) points of triangles and quadrilaterals, tetrahedra and hexahedra, in DOLFINx's
+            order.
 
     Raises:
         InputError: coordinates that are no numbers; flat, folded or overlapping cells; several
             parts.
     """
-    corners = points[cells]
+    corners, dim = points[cells], points.shape[1]
     _refuse(~np.isfinite(corners).all(axis=(1, 2)), corners, "have corners that are no numbers")
-    longest = np.ptp(corners, axis=1).max(axis=1)
-    _refuse(cell_sizes(corners) < FILE_ROUNDING_SHARE * longest**3, corners, "are flat")
-    if cells.shape[1] == 8:
-        _refuse(_folded(corners, FILE_ROUNDING_SHARE * longest**3), corners, "are folded")
-    _refuse(_overlapping(corners, facet_keys(cells, 3)), corners, OVERLAP.format("volumes"))
-    _check_parts(cells, "volumes must share their faces")
+    tiny = FILE_ROUNDING_SHARE * np.ptp(corners, axis=1).max(axis=1) ** dim
+    if cells.shape[1] == 2**dim:
+        _refuse(_folded(corners, tiny), corners, "are folded")
+    _refuse(cell_sizes(corners) < tiny, corners, "are flat")
+    bad = _overlapping(corners, facet_keys(cells, dim))
+    if dim == 2 and not bad.any():
+        bad = _covered(corners)
+    kind, shared = ("surfaces", "curves") if dim == 2 else ("volumes", "faces")
+    _refuse(bad, corners, f"overlap others (inverted cells, or {kind} on top of each other)")
+    _check_parts(cells, f"{kind} must share their {shared}")
 
 
 def check_facets(facets: np.ndarray, cells: np.ndarray, dim: int, name: str) -> None:
@@ -225,14 +143,43 @@ def _refuse(bad: np.ndarray, corners: np.ndarray, what: str) -> None:
 
 
 def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
-    """Return (n,) True for hexahedra that turn one way at a corner, the other way at another."""
-    grid = corners.reshape(-1, 2, 2, 2, 3)  # z, y, x
-    edges = [np.diff(grid, axis=axis) for axis in (3, 2, 1)]
-    shape = grid.shape
-    J = np.stack([np.broadcast_to(edge, shape) for edge in edges], axis=4)
-    turn = np.linalg.det(J).reshape(-1, 8)
+    """Return (n,) True for cells that turn one way at a corner, the other way at another."""
+    dim = corners.shape[2]
+    grid = corners.reshape(-1, *dim * (2,), dim)  # z, y, x
+    edges = [np.broadcast_to(np.diff(grid, axis=axis), grid.shape) for axis in range(dim, 0, -1)]
+    turn = np.linalg.det(np.stack(edges, axis=-1)).reshape(len(corners), -1)
     found: np.ndarray = (turn.min(axis=1) < -tiny) & (turn.max(axis=1) > tiny)
     return found
+
+
+def _covered(corners: np.ndarray) -> np.ndarray:
+    """Return (n,) True for convex cells with a place of theirs in one of the cells near it.
+
+    Places are the centre, and points near the corners.
+    """
+    centre = corners.mean(axis=1)
+    places = [centre, *(0.9 * corner + 0.1 * centre for corner in corners.swapaxes(0, 1))]
+    sides = facet_corners(corners.shape[2], corners.shape[1])
+    planes = [inward_normal(corners, side) for side in sides]
+    covered, here = np.zeros(len(centre), dtype=bool), np.arange(len(centre))
+    tree = cKDTree(centre)
+    for place in places:
+        near = tree.query(place, k=min(9, len(centre)))[1].reshape(len(centre), -1)
+        for other in near.T:
+            inside = other != here
+            for origin, normal in planes:
+                height = np.einsum("ni,ni->n", normal[other], place - origin[other])
+                inside &= height > 0.0
+            covered |= inside
+    return covered
+
+
+def inward_normal(corners: np.ndarray, side: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a point (n, d) of each cell's side, and a vector normal to it into the cell."""
+    # Three corners tell a side of a hexahedron.
+    origin, normal = corners[:, side[0]], facet_areas(corners[:, side[:3]])
+    height = np.einsum("ni,ni->n", normal, corners.mean(axis=1) - origin)
+    return origin, normal * np.sign(height)[:, None]
 
 
 def facet_keys(cells: np.ndarray, dim: int) -> np.ndarray:

@@ -255,11 +255,6 @@ def local_cell_counts(mesh: Any) -> tuple[int, int]:
     return cells.size_local, cells.num_ghosts
 
 
-def scatter_forward(function: Any) -> None:
-    """Copy owned values to the ghosts on other ranks."""
-    function.x.scatter_forward()
-
-
 def scatter_reverse_add(function: Any) -> None:
     """Add the ghosts' values to their owners."""
     if hasattr(la, "InsertMode"):

@@ -15,15 +15,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import (
-    FlatMesh,
-    check_cells,
-    check_extents,
-    check_facets,
-    check_mesh,
-    check_place,
-    check_unit,
-)
+from dolfinopt.mesh.checks import check_mesh, check_unit
 from dolfinopt.mesh.file_check import open_file
 from dolfinopt.mesh.gmsh_session import (
     DESIGN,
@@ -39,9 +31,10 @@ from dolfinopt.mesh.gmsh_session import (
     silent_terminal,
 )
 from dolfinopt.mesh.inp import read_inp
+from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE
 from dolfinopt.mesh.solid_cells import (
-    ENDS,
     HEXAHEDRON,
+    REGIONS,
     TENSOR,
     TETRAHEDRON,
     Entities,
@@ -103,7 +96,7 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
             check_unit(arm.mesh_scale * gmsh.model.mesh.getNodes()[1].reshape(-1, 3), arm)
             groups = placed(gmsh, groups, arm)
         _set_groups(gmsh, groups, arm)
-        facets = (_check_solid if arm.is_solid else _check_plane)(gmsh, groups, arm)
+        facets = _check(gmsh, groups, arm)
     if arm.is_solid:
         return facets, ()
     if SOLID in _parameters(gmsh):
@@ -264,34 +257,33 @@ def _unknown_names(where: str, names: list[str]) -> str:
 # -- whether a mesh can be the arm of a scene ----------------------------------------------------
 
 
-def _check_plane(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
-    """Check the mesh of a plane arm, and return the lines (n, 2, 2) of its interfaces."""
-    flat = flatten(gmsh, groups)
-    check_mesh(flat, arm)
-    return flat.points[np.concatenate([flat.inboard, flat.outboard])][:, :, :2]
+def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
+    """Check the mesh of an arm.
+
+    Returns:
+        Lines (n, 2, 2) of its interfaces; points (n, 1, 3) of the facets of a solid's.
+    """
+    dim = 3 if arm.is_solid else 2
+    points, regions = points_by_tag(gmsh), [one for tag in REGIONS for one in groups[tag]]
+    cells = elements_of(gmsh, dim, regions)
+    cells = cells[:, TENSOR[dim, cells.shape[1]]]
+    facets = {
+        name: elements_of(gmsh, dim - 1, groups[tag]) for tag, name in interface_names(arm).items()
+    }
+    if dim == 2:
+        _check_flat(points[np.unique(cells)], facets["inboard"], arm)
+    check_mesh(points[:, :dim], cells, facets, arm)
+    corners = [points[one][:, :, :dim] for one in facets.values()]
+    if dim == 2:
+        return np.concatenate(corners)
+    parts = [part for one in corners for part in (one.reshape(-1, 3), one.mean(axis=1))]
+    return np.concatenate(parts)[:, None]
 
 
-def flatten(gmsh: Any, groups: Entities) -> FlatMesh:
-    """Return the cells and the interfaces' lines of a plane model."""
-    cells = elements_of(gmsh, 2, groups[DESIGN] + groups[PASSIVE])
-    return FlatMesh(
-        points_by_tag(gmsh), cells, *(elements_of(gmsh, 1, groups[group]) for group in ENDS)
-    )
-
-
-def _check_solid(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
-    """Check the mesh of a solid arm, and return points (n, 1, 3) of its interfaces' facets."""
-    points = points_by_tag(gmsh)
-    cells = elements_of(gmsh, 3, groups[DESIGN] + groups[PASSIVE] + groups[VOID])
-    cells = cells[:, TENSOR[cells.shape[1]]]
-    check_cells(points, cells)
-    found = []
-    for tag, name in interface_names(arm).items():
-        facets = elements_of(gmsh, 2, groups[tag])
-        check_facets(facets, cells, 3, name)
-        if tag in ENDS:  # the reference point of another may lie anywhere
-            x = 0.0 if tag == INBOARD else arm.length
-            check_place(points[facets].reshape(-1, 3), name, x, arm)
-        found += [points[facets].reshape(-1, 3), points[facets].mean(axis=1)]
-    check_extents(points[np.unique(cells)], arm)
-    return np.concatenate(found)[:, None]
+def _check_flat(used: np.ndarray, lines: np.ndarray, arm: Arm) -> None:
+    """Raise InputError unless lines are straight, and points (n, 3) in the plane z = 0."""
+    if lines.shape[1] != 2:
+        raise InputError("its lines are curved; expected straight ones (Mesh.ElementOrder = 1)")
+    off = np.abs(used[:, 2]).max()
+    if off > FILE_ROUNDING_SHARE * arm.height:
+        raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")

@@ -5,28 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.sparse as sp
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import check_place, facet_corners
+from dolfinopt.mesh.checks import check_place
 from dolfinopt.mesh.geometry import read_groups, telling_where, where_of
 from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE
 from dolfinopt.mesh.measured import (
     CORNER_CELL_RATIO,
     FILE_ROUNDING_SHARE,
-    RAY_SHIFT_SHARE,
     ROUND_CELLS,
-    SECTION_ALONG_SHARE,
     SECTION_CELLS,
     SECTION_END_CELLS,
     SECTION_LEAST_ALONG,
-    SHORT_CELL_SHARE,
 )
-from dolfinopt.mesh.solid_cells import ENDS, TENSOR, elements_of, points_by_tag
+from dolfinopt.mesh.solid_cells import ENDS, boundary, elements_of, points_by_tag
 
 if TYPE_CHECKING:
     from dolfinopt.scene.load import Arm
@@ -64,21 +63,29 @@ Plane = tuple[np.ndarray, np.ndarray]  # points (n, 2) of y and z, m; quadrilate
 
 @dataclass(frozen=True)
 class Section:
-    """A kind of section, by its outer height and thickness and a share.
+    """A kind of section by its outer height h and thickness b, and a size w: the wall, m.
 
     Attributes:
-        area: (height, thickness, share): m2.
-        measures: (height, thickness, share): its sizes in the order of `named`, m.
+        area_of: (h, b, w): m2.
+        measures_of: (h, b, w): its sizes in the order of `named`, m.
         named: what the measures are, in words.
-        largest_wall: (height, thickness): its wall with a share of 1, m.
-        plane: (height, thickness, wall, layers): its cells; None of a bar, which is a box.
+        largest: (h, b): w with a share of 1.
+        plane: (h, b, w, layers): its cells; None of a bar, which is a box.
     """
 
-    area: Callable[[float, float, float], float]
-    measures: Callable[[float, float, float], tuple[float, ...]]
+    area_of: Callable[[float, float, float], float]
+    measures_of: Callable[[float, float, float], tuple[float, ...]]
     named: str
-    largest_wall: Callable[[float, float], float] = lambda height, thickness: 0.5 * height
+    largest: Callable[[float, float], float]
     plane: Callable[[float, float, float, int], Plane] | None = None
+
+    def area(self, height: float, thickness: float, share: float) -> float:
+        """Return its area, m2."""
+        return self.area_of(height, thickness, share * self.largest(height, thickness))
+
+    def measures(self, height: float, thickness: float, share: float) -> tuple[float, ...]:
+        """Return its sizes, m."""
+        return self.measures_of(height, thickness, share * self.largest(height, thickness))
 
 
 def member(section: Section, length: float, sides: tuple[float, float], share: float) -> Member:
@@ -92,8 +99,8 @@ def member(section: Section, length: float, sides: tuple[float, float], share: f
     """
     assert section.plane is not None
     layers = 1 + int(share * SECTION_CELLS)
-    flat, quads = section.plane(*sides, share * section.largest_wall(*sides), layers)
-    along = max(SECTION_LEAST_ALONG, round(length / (SECTION_ALONG_SHARE * max(sides))))
+    flat, quads = section.plane(*sides, share * section.largest(*sides), layers)
+    along = max(SECTION_LEAST_ALONG, round(2.0 * length / max(sides)))
     places = stations(length, along)
     points = np.concatenate([np.column_stack([np.full(len(flat), x), flat]) for x in places])
     first = np.concatenate([quads, quads + len(flat)], axis=1)
@@ -162,52 +169,36 @@ def _half(height: float, thickness: float) -> float:
     return 0.5 * min(height, thickness)
 
 
-def _tube_area(height: float, thickness: float, share: float) -> float:
-    wall = share * _half(height, thickness)
-    return height * thickness - (height - 2.0 * wall) * (thickness - 2.0 * wall)
-
-
-def _round_area(height: float, thickness: float, share: float) -> float:
-    return math.pi * _half(height, thickness) ** 2 * (1.0 - (1.0 - share) ** 2)
-
-
-def _beam_wall(height: float, thickness: float) -> float:
-    return min(0.5 * height, thickness)
-
-
-def _beam_area(height: float, thickness: float, share: float) -> float:
-    wall = share * _beam_wall(height, thickness)
-    return 2.0 * thickness * wall + (height - 2.0 * wall) * wall
-
-
-# In the plane of motion the thickness is the scene's.
+# Of bars w is the height, of solid ones in space the share itself: both sides are scaled by it. In
+# the plane of motion the thickness is the scene's.
 FLAT_BAR = Section(
-    lambda h, b, share: share * h * b, lambda h, b, share: (share * h, b), "height x thickness"
+    lambda h, b, w: w * b, lambda h, b, w: (w, b), "height x thickness", lambda h, b: h
 )
 SOLID_BAR = Section(
-    lambda h, b, share: share * share * h * b,
-    lambda h, b, share: (share * h, share * b),
+    lambda h, b, w: w * w * h * b,
+    lambda h, b, w: (w * h, w * b),
     "height x thickness",
+    lambda h, b: 1.0,
 )
 RECTANGULAR_TUBE = Section(
-    _tube_area,
-    lambda h, b, share: (h, b, share * _half(h, b)),
+    lambda h, b, w: h * b - (h - 2.0 * w) * (b - 2.0 * w),
+    lambda h, b, w: (h, b, w),
     "height x thickness x wall",
     _half,
     _rectangular_tube,
 )
 ROUND_TUBE = Section(
-    _round_area,
-    lambda h, b, share: (min(h, b), share * _half(h, b)),
+    lambda h, b, w: math.pi * (min(h, b) - w) * w,
+    lambda h, b, w: (min(h, b), w),
     "diameter x wall",
     _half,
     _round_tube,
 )
 I_SECTION = Section(
-    _beam_area,
-    lambda h, b, share: (h, b, share * _beam_wall(h, b)),
+    lambda h, b, w: 2.0 * b * w + (h - 2.0 * w) * w,
+    lambda h, b, w: (h, b, w),
     "height x width x wall",
-    _beam_wall,
+    lambda h, b: min(0.5 * h, b),
     _beam,
 )
 KINDS = {  # by the machine's dimension
@@ -351,7 +342,7 @@ def box_hull(
 
 def _has_short(side: float, short: float) -> bool:
     """Return whether cells of this side, m, are long enough for short ones at the corners."""
-    return SHORT_CELL_SHARE * side > short
+    return side - short > 0.5 * short
 
 
 def _side(size: float, count: int, short: float) -> np.ndarray:
@@ -405,18 +396,24 @@ class Wall:
     nodes: np.ndarray
     cells: np.ndarray
 
+    @cached_property
+    def _mean(self) -> sp.csr_matrix:
+        """What makes of the wall's cells the mean of those around every point of the hull."""
+        along, around = self.hull.shape
+        ahead = sp.eye(along + 1, along) + sp.eye(along + 1, along, k=-1)
+        back = np.roll(np.arange(around), 1)
+        turn = sp.eye(around) + sp.eye(around, format="csr")[back]
+        sums = sp.kron(ahead, turn, format="csr")
+        return sp.diags(1.0 / np.asarray(sums.sum(axis=1)).ravel()) @ sums
+
     def thickness(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
         """Return the thickness (s, r) at the points of the hull, m (collective on the arm)."""
         along, around = self.hull.shape
         whole = np.zeros(along * around)
         whole[self.cells] = x
         comm.Allreduce(MPI.IN_PLACE, whole)
-        grid = whole.reshape(along, around)
-        rows = grid + np.roll(grid, 1, axis=1)
-        total = np.zeros((along + 1, around))
-        total[:-1] += rows
-        total[1:] += rows
-        return self.least + (self.most - self.least) * total / self._around
+        share = (self._mean @ whole).reshape(-1, around)
+        return np.asarray(self.least + (self.most - self.least) * share)
 
     @property
     def normals(self) -> np.ndarray:
@@ -435,20 +432,10 @@ class Wall:
 
     def backward(self, by_points: np.ndarray) -> np.ndarray:
         """Return the derivative by x (n_cells,), given that by this rank's nodes (n, 3)."""
-        along, around = self.hull.shape
-        whole = np.zeros((2 * (along + 1) * around, 3))
+        whole = np.zeros((2 * self.hull.outer[:, :, 0].size, 3))
         whole[self.nodes] = by_points
-        share = self.hull.by_thickness(whole) / self._around
-        rows = share[:-1] + share[1:]
-        rows = rows + np.roll(rows, -1, axis=1)
-        return (self.most - self.least) * rows.ravel()[self.cells]
-
-    @property
-    def _around(self) -> np.ndarray:
-        """Number of cells (s, 1) around the points of a station."""
-        count = np.full((self.hull.shape[0] + 1, 1), 4.0)
-        count[[0, -1]] = 2.0
-        return count
+        by_share = self._mean.T @ self.hull.by_thickness(whole).ravel()
+        return np.asarray((self.most - self.least) * by_share[self.cells])
 
 
 def wall_of(
@@ -478,7 +465,7 @@ def read_hull(gmsh: Any, arm: Arm) -> Hull:
         InputError: the file cannot be the arm, or one of its sections be told by rays from the
             axis; one line that names file and remedy.
     """
-    points, cells, ends = read_cells(gmsh, arm.model_copy(update={"mesh": arm.hull}))
+    points, cells, ends = read_cells(gmsh, arm.unchecked_copy({"mesh": arm.hull}))
     gmsh.clear()
     assert arm.cells is not None
     first, last = float(ends[0][:, 0].max()), float(ends[1][:, 0].min())
@@ -486,8 +473,10 @@ def read_hull(gmsh: Any, arm: Arm) -> Hull:
     turns = 2.0 * np.pi * np.arange(arm.cells_around) / arm.cells_around
     rays = np.column_stack([arm.height * np.cos(turns), arm.thickness * np.sin(turns)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    triangles = points[_surface(cells[:, TENSOR[cells.shape[1]]])]
-    shift = RAY_SHIFT_SHARE * (last - first)
+    facets = boundary(cells)
+    halves = [facets[:, [0, k, k + 1]] for k in range(1, facets.shape[1] - 1)]
+    triangles = points[np.concatenate(halves)]
+    shift = FILE_ROUNDING_SHARE * (last - first)
     outer = np.empty((len(x), len(rays), 3))
     outer[:, :, 0] = x[:, None]
     for i, at in enumerate(x):
@@ -519,40 +508,19 @@ def read_cells(gmsh: Any, arm: Arm) -> tuple[np.ndarray, np.ndarray, list[np.nda
     return points, cells, ends
 
 
-def _surface(cells: np.ndarray) -> np.ndarray:
-    """Return the triangles (n, 3) of the facets that only one cell has."""
-    sides = np.array(facet_corners(3, cells.shape[1]))
-    facets = cells[:, sides].reshape(-1, sides.shape[1])
-    _, first, count = np.unique(
-        np.sort(facets, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    outer = facets[first[count == 1]]
-    if outer.shape[1] == 3:
-        return outer
-    return np.concatenate([outer[:, [0, 1, 3]], outer[:, [0, 3, 2]]])
-
-
 def _radii(triangles: np.ndarray, x: float, rays: np.ndarray, arm: Arm) -> np.ndarray:
     """Return how far the surface is from the axis in a section along rays (r, 2), m."""
-    offset = triangles[:, :, 0] - x
-    cut = triangles[(offset.min(axis=1) < 0.0) & (offset.max(axis=1) >= 0.0)]
-    above = cut[:, :, 0] >= x
-    # The corner that is alone on its side, and the two others.
-    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    rows = np.arange(len(cut))
-    a = cut[rows, alone]
-    ends = []
-    for step in (1, 2):
-        b = cut[rows, (alone + step) % 3]
-        share = ((x - a[:, 0]) / (b[:, 0] - a[:, 0]))[:, None]
-        ends.append((a + share * (b - a))[:, 1:])
+    a, b = triangles, np.roll(triangles, -1, axis=1)
+    cut = (a[:, :, 0] < x) != (b[:, :, 0] < x)  # two edges of a triangle, or none
+    a, b = a[cut], b[cut]
+    share = (x - a[:, :1]) / (b[:, :1] - a[:, :1])
+    ends = (a + share * (b - a)).reshape(-1, 2, 3)[:, :, 1:]
+    aside, along = ends @ np.array([-rays[:, 1], rays[:, 0]]), ends @ rays.T
     found = np.empty(len(rays))
     for k, ray in enumerate(rays):
-        beside = [end @ np.array([-ray[1], ray[0]]) for end in ends]
-        along = [end @ ray for end in ends]
-        meets = (beside[0] < 0.0) != (beside[1] < 0.0)
-        share = beside[0][meets] / (beside[0] - beside[1])[meets]
-        radius = along[0][meets] + share * (along[1] - along[0])[meets]
+        meets = (aside[:, 0, k] < 0.0) != (aside[:, 1, k] < 0.0)
+        (s, t), (near, far) = aside[meets, :, k].T, along[meets, :, k].T
+        radius = near + s / (s - t) * (far - near)
         radius = np.sort(radius[radius > 0.0])
         apart = np.diff(radius, prepend=-np.inf) > FILE_ROUNDING_SHARE * arm.height
         if apart.sum() != 1:

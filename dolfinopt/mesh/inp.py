@@ -18,7 +18,6 @@ from dolfinopt.mesh.abaqus import Abaqus, facets_of, numbered, read_abaqus
 from dolfinopt.mesh.gmsh_session import DESIGN, PASSIVE, VOID
 from dolfinopt.mesh.measured import INP_BYTES_LIMIT
 from dolfinopt.mesh.solid_cells import (
-    ENDS,
     REGIONS,
     Entities,
     SolidCells,
@@ -105,8 +104,7 @@ def _missing(mesh: Abaqus, name: str, group: int, has_nodes: bool) -> str:
     names = sorted({*mesh.node_sets, *mesh.element_sets, *mesh.surfaces})
     held = ", ".join(map(repr, names[:8])) or "none"
     why = "holds the corners of no cell's side on the surface" if has_nodes else "is missing"
-    key = "inboard_bore, outboard_bore" if group in ENDS else "axis and radius"
     return (
         f'the node set "{name}" {why}; its sets are {held}: name that of the interface\'s '
-        f"nodes so (*NSET, NSET={name}), or state the bore (arms.{key})"
+        f"nodes so (*NSET, NSET={name}), or state its bore (axis and radius of arms.interfaces)"
     )

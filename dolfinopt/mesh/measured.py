@@ -25,12 +25,6 @@ FRAME_TOLERANCE = 0.05
 # squared, for lines that meet at an end; of a sample of widths, beyond its cell.
 GRID_ROUNDING_SHARE = 1e-9
 
-# -- hollow ----------------------------------------------------------------------------------
-
-# Of a hollow link's length: how far beside a station the surface is cut, so that no node lies in
-# the plane.
-RAY_SHIFT_SHARE = 1e-7
-
 # -- budget ----------------------------------------------------------------------------------
 
 # Peak memory beyond the libraries of one simulation with its gradient, two arms of n
@@ -64,8 +58,7 @@ THICKNESS_TOLERANCE = 1e-3  # relative, of a solid: sheet metal is made no close
 
 SECTION_CELLS = 4  # of the sides between the walls, and of the thickest wall
 ROUND_CELLS = 24  # around a tube
-SECTION_ALONG_SHARE = 0.5  # side of a cell along the member over the larger one of the section
-SECTION_LEAST_ALONG = 24  # cells along
+SECTION_LEAST_ALONG = 24  # cells along, half as long as the section's larger side at most
 # Where the first cell along is cut, and likewise the last: the rigid interface holds the section's
 # width there, which would stiffen whole cells (tubes by 1.1 % in bending instead of 0.3 %).
 SECTION_END_CELLS = (0.125, 0.4)
@@ -73,7 +66,6 @@ SECTION_END_CELLS = (0.125, 0.4)
 # is too stiff by 8 % without them (against Prandtl's stress function), with 2 by 1.4 %, 1.5 by
 # 0.8 %, 1.25 by 0.5 %, 1.1 by 0.4 %: then the cells' inner sides are a tenth of the wall.
 CORNER_CELL_RATIO = 1.25
-SHORT_CELL_SHARE = 0.6  # of a side's cells: longer ones are none that stand at corners
 
 # -- file_check, gmsh_session ----------------------------------------------------------------
 

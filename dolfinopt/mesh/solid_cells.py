@@ -39,7 +39,7 @@ from dolfinopt.mesh.measured import (
     LOST_VOLUME_SHARE,
 )
 from dolfinopt.scene.load import Arm
-from dolfinopt.scene.tables.joints import Bore, frame_of
+from dolfinopt.scene.tables.joints import Interface, frame_of
 
 TETRAHEDRON, HEXAHEDRON = 4, 5  # Gmsh's numbers of straight cells
 STRAIGHT = {  # by dimension and number of corners
@@ -49,8 +49,13 @@ STRAIGHT = {  # by dimension and number of corners
     (3, 4): TETRAHEDRON,
     (3, 8): HEXAHEDRON,
 }
-# From Gmsh's order of a hexahedron's corners to that of a tensor product.
-TENSOR = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+# From Gmsh's order of corners to that of a tensor product, DOLFINx's.
+TENSOR = {
+    (2, 3): [0, 1, 2],
+    (2, 4): [0, 1, 3, 2],
+    (3, 4): [0, 1, 2, 3],
+    (3, 8): [0, 1, 3, 2, 4, 5, 7, 6],
+}
 # Sides of cells in Gmsh's order of corners, around them, by the number of corners.
 SIDES = {
     4: [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]],
@@ -63,7 +68,9 @@ Entities = dict[int, list[int]]  # of every group
 
 def further_of(arm: Arm) -> dict[str, int]:
     """Return the groups of the arm's further interfaces by their names, small letters."""
-    return {one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.interfaces)}
+    return {
+        one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.further_interfaces)
+    }
 
 
 def group_named(name: str, *groups: int) -> int | None:
@@ -84,19 +91,19 @@ def no_groups(arm: Arm) -> Entities:
 
 def interface_names(arm: Arm) -> dict[int, str]:
     """Return the names of all interfaces by their groups."""
-    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.interfaces)}
+    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.further_interfaces)}
     return {INBOARD: NAMES[INBOARD], OUTBOARD: NAMES[OUTBOARD], **more}
 
 
-def bores_of(arm: Arm) -> dict[int, Bore]:
+def bores_of(arm: Arm) -> dict[int, Interface]:
     """Return the bores that are interfaces by their groups; points in the file's frame, m."""
     found = {
-        FURTHER + k: Bore(point=one.point, axis=one.axis, radius=one.radius)
-        for k, one in enumerate(arm.interfaces)
+        FURTHER + k: one
+        for k, one in enumerate(arm.further_interfaces)
         if one.axis is not None and one.radius is not None
     }
-    for group, bore in ((INBOARD, arm.inboard_bore), (OUTBOARD, arm.outboard_bore)):
-        if bore is not None:
+    for group in (INBOARD, OUTBOARD):
+        if (bore := arm.end_bore(NAMES[group])) is not None:
             found[group] = bore
     return found
 
@@ -197,8 +204,9 @@ def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
     return into_model(gmsh, SolidCells(points, cells, facets), dim)
 
 
-def _of_bore(points: np.ndarray, outer: np.ndarray, bore: Bore, name: str) -> np.ndarray:
+def _of_bore(points: np.ndarray, outer: np.ndarray, bore: Interface, name: str) -> np.ndarray:
     """Return those of the outer facets whose corners are all as far from a bore's axis."""
+    assert bore.axis is not None and bore.radius is not None
     axis = np.array(bore.axis) / np.linalg.norm(bore.axis)
     apart = points - np.array(bore.point)
     distance = np.linalg.norm(apart - np.outer(apart @ axis, axis), axis=1)

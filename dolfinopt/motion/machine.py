@@ -29,9 +29,8 @@ from dolfinopt.multibody.tree import (
     with_bearings,
 )
 from dolfinopt.scene.load import Arm, Scene
-from dolfinopt.scene.tables import machine as scenes
-from dolfinopt.scene.tables.closures import Closures, closing_site
-from dolfinopt.scene.tables.joints import JointParts, interface_number, joint_parts
+from dolfinopt.scene.tables.closures import Closures
+from dolfinopt.scene.tables.joints import JointParts, joint_parts, place_of
 
 Inertia = tuple[float, ...]
 
@@ -142,15 +141,11 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
             Joint(arm.name, "revolute", k - 1, k + 1, *flat, rotor)
             for k, (arm, rotor) in enumerate(zip(scene.arms, rotors_of(scene), strict=True))
         )
-    index = {arm.name: k for k, arm in enumerate(scene.arms)}
     by_child = {joint.child: joint for joint in scene.joints}
     joints, columns = [], scene.joint_columns
     for arm, coordinate, rotor in zip(scene.arms, columns, rotors_of(scene), strict=True):
         one = by_child[arm.name]
-        parent, interface = GROUND, 0
-        if one.parent != scenes.GROUND:
-            parent = index[one.parent]
-            interface = interface_number(scene.arms[parent], one.parent_interface) or 0
+        parent, interface = place_of(scene, one.parent) or (GROUND, 0)
         joints.append(
             Joint(
                 name=one.name,
@@ -203,7 +198,7 @@ def loops_of(scene: Scene) -> Loops | None:
     places = {one.name: first + k for k, one in enumerate(scene.rods)}
     ties = []
     for one in scene.closures:
-        a, b = (closing_site(scene, one, which) for which in (0, 1))
+        a, b = (place_of(scene, end) for end in one.between)
         assert a is not None
         equations = _equations(one, d, reach, places.get(one.name))
         point, rotation = np.array(one.point[:d], dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]

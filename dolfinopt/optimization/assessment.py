@@ -18,7 +18,7 @@ from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.measured import COORDINATE_RESERVE_FACTOR, NEWTON_ITERATIONS
+from dolfinopt.optimization.measured import NEWTON_ITERATIONS
 from dolfinopt.parallel import together
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import Evaluation, evaluate
@@ -28,8 +28,6 @@ from dolfinopt.scene.tables.responses import STATICS, limited_by
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-
-BISECTIONS = 40  # of a bar's size
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +49,6 @@ class Assessment:
     selection: OrderSelection | None
 
 
-def initial_selection(
-    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]
-) -> OrderSelection | None:
-    """Choose the coordinates by the initial design, where the scene says "auto" (collective)."""
-    return _choose(evaluator, x_phys, COORDINATE_RESERVE_FACTOR)
-
-
 def assess(
     evaluator: Evaluator,
     x_phys: Mapping[int, np.ndarray],
@@ -74,11 +65,14 @@ def assess(
         selection: of the coordinates so far.
     """
     scene, arms = evaluator.scene, evaluator.arms
-    moves = needs(scene, "motion")
+    moves, place = needs(scene, "motion"), (scene, evaluator.partition, arms, x_phys)
     if not moves:
-        selection = _choose(evaluator, x_phys, 1.0)
+        selection = choose_coordinates(*place, evaluator.profile)
     elif selection is not None:
-        selection = replace(selection, error=_selection_error(evaluator, x_phys, selection))
+        error = np.inf  # of a richer motion that cannot be simulated; the design is not lost for it
+        with suppress(ConvergenceError):
+            error = estimated_error(*place, selection.coordinates, evaluator.profile)
+        selection = replace(selection, error=error)
     # A followed mode is known by those before it: the initial and the crisp design's are not.
     vectors = {k: arm.initial_vectors for k, arm in arms.items()}
     initial = crisp = None
@@ -109,25 +103,6 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
     with suppress(ConvergenceError), counted(NEWTON_ITERATIONS * steps):
         return evaluator.evaluate_densities(cut, simulated=True)
     return None
-
-
-def _choose(
-    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray], reserve: float
-) -> OrderSelection | None:
-    one = evaluator
-    return choose_coordinates(
-        one.scene, one.partition, one.arms, x_phys, one.profile, reserve=reserve
-    )
-
-
-def _selection_error(
-    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray], selection: OrderSelection
-) -> float:
-    place = evaluator.scene, evaluator.partition, evaluator.arms
-    try:
-        return estimated_error(*place, x_phys, selection.coordinates, evaluator.profile)
-    except ConvergenceError:  # of the richer motion; the design is not lost for it
-        return np.inf
 
 
 # -- comparison with solid arms and straight bars --------------------------------------------
@@ -194,35 +169,30 @@ def straight_bars(
 
 def _bar(arm: Arm, fraction: float) -> np.ndarray:
     """Return the densities (n_cells,) of a bar that fills this fraction of an arm's volume."""
-    low, high = 0.0, 1.0
-    for _ in range(BISECTIONS):
-        size = 0.5 * (low + high)
-        short = arm.volume_fraction(drawn(arm, "bar", size)) < fraction
-        low, high = (size, high) if short else (low, size)
-    return drawn(arm, "bar", high)
+    from scipy.optimize import brentq
+
+    away = np.abs(across(arm)).max(axis=1)
+
+    def lack(size: float) -> float:
+        return fraction - float(arm.volume_fraction(filled(arm, size - away)))
+
+    size = 0.0 if lack(0.0) <= 0.0 else 1.0 if lack(1.0) >= 0.0 else brentq(lack, 0.0, 1.0)
+    return filled(arm, size - away)
 
 
-def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
-    """Return the densities (n_cells,) of a straight member within an arm's box of cells.
+def across(arm: Arm) -> np.ndarray:
+    """Return how far cells are off the axis (n_cells, d - 1), in half sides of an arm's box."""
+    one = arm.scene.arms[arm.places[0]]
+    return (
+        2.0 * arm.mesh.centroid[:, 1:] / np.array([one.height, one.thickness][: arm.mesh.dim - 1])
+    )
+
+
+def filled(arm: Arm, depth: np.ndarray) -> np.ndarray:
+    """Return the densities of cells whose centres lie so deep in material, in half sides.
 
     Cells that its surface cuts are filled in part.
-
-    Args:
-        arm: of cells along, over the height, and of solids over the thickness.
-        kind: "bar": the arm's section times `size`; "tube": walls of `size` half heights, in the
-            plane flanges; "truss": such flanges, and as thick diagonals of 45 degrees between them.
-        size: from 0 to 1, solid.
     """
-    mesh, one = arm.mesh, arm.scene.arms[arm.places[0]]
-    assert one.cells is not None
-    sides = np.array([one.height, one.thickness][: mesh.dim - 1])
-    across = 2.0 * mesh.centroid[:, 1:] / sides
-    away = np.abs(across).max(axis=1)  # of the axis, 1 at the surface
-    inside = size - away if kind == "bar" else size - (1.0 - away)
-    if kind == "truss":
-        phase = np.mod(mesh.centroid[:, 0] / one.height, 2.0)
-        diagonal = 1.0 - 2.0 * np.abs(phase - 1.0)
-        flanges = size - (1.0 - np.abs(across[:, 0]))
-        inside = np.maximum(flanges, 0.5 * size - np.abs(across[:, 0] - diagonal) / np.sqrt(2.0))
-    cell = 2.0 / min(one.cells[1:])  # in half heights
-    return mesh.keep(np.clip(0.5 + inside / cell, arm.scene.design.minimum, 1.0))
+    cells = arm.scene.arms[arm.places[0]].cells
+    assert cells is not None
+    return arm.mesh.keep(np.clip(0.5 + 0.5 * depth * min(cells[1:]), arm.scene.design.minimum, 1.0))

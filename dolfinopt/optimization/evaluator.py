@@ -35,8 +35,7 @@ class Evaluator:
         variables, projection: how x makes designs.
         trajectory: of the design evaluated last; None without a motion and off the root.
         solutions: its motions; the next evaluation sets out from them.
-        initial_solutions, initial_vectors: from where that of the last x set out, so that it can be
-            repeated in the same bits.
+        start: from where that of the last x set out, so that it can be repeated in the same bits.
     """
 
     def __init__(
@@ -47,8 +46,7 @@ class Evaluator:
         self.projection = Projection(scene, partition, arms)
         self.trajectory: Trajectory | None = None
         self.solutions: tuple[Solution, ...] = ()
-        self.initial_solutions: tuple[Solution, ...] = ()
-        self.initial_vectors: dict[int, list[np.ndarray]] = {}
+        self.start: Start = (), {}
 
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
         """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
@@ -69,8 +67,7 @@ class Evaluator:
         `accepted` adds them, `undo` takes the whole back. Of robust designs the others have theirs
         at once, as long as their factors are at hand.
         """
-        self.initial_solutions = self.solutions
-        self.initial_vectors = {k: arm.initial_vectors for k, arm in self.arms.items()}
+        self.start = self.solutions, {k: arm.initial_vectors for k, arm in self.arms.items()}
         *others, nominal = self.physical_designs(x)
         found = [
             self.differentiated(one, self.evaluate_densities(densities(one))) for one in others
@@ -85,19 +82,9 @@ class Evaluator:
 
     def undo(self) -> None:
         """Set out from where the last evaluation did (collective)."""
-        self.solutions = self.initial_solutions
-        for k, vectors in self.initial_vectors.items():
-            self.arms[k].initial_vectors = vectors
-
-    @property
-    def start(self) -> Start:
-        """From where the evaluation of the last x set out, for `restart`."""
-        return self.initial_solutions, self.initial_vectors
-
-    def restart(self, start: Start) -> None:
-        """Let the next evaluation set out from there (collective)."""
-        self.initial_solutions, self.initial_vectors = start
-        self.undo()
+        self.solutions, vectors = self.start
+        for k, own in vectors.items():
+            self.arms[k].initial_vectors = own
 
     def evaluate_again(self, x: np.ndarray) -> list[EvaluatedDesign]:
         """Evaluate the last x again, from the same initial guesses: in the same bits (collective).
@@ -115,8 +102,8 @@ class Evaluator:
 
     def use_gradient(self, kind: str) -> None:
         """Use another gradient from the next evaluation on."""
-        objective = self.scene.objective.model_copy(update={"gradient": kind})
-        self.scene = self.scene.model_copy(update={"objective": objective})
+        objective = self.scene.objective.unchecked_copy({"gradient": kind})
+        self.scene = self.scene.unchecked_copy({"objective": objective})
 
     def with_gradient(self, kind: str) -> Evaluator:
         """Return an evaluator of the same arms with another gradient.

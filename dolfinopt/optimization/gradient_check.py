@@ -25,7 +25,7 @@ from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.evaluation import evaluate, gradient
-from dolfinopt.responses.motion import MotionResponse
+from dolfinopt.responses.motion import MotionResponse, motions_of
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
 
@@ -147,8 +147,8 @@ def check_exact(scene: Scene) -> None:
 
 def _with(scene: Scene, gradient: str) -> Scene:
     """Return the scene with another gradient."""
-    objective = scene.objective.model_copy(update={"gradient": gradient})
-    return scene.model_copy(update={"objective": objective})
+    objective = scene.objective.unchecked_copy({"gradient": gradient})
+    return scene.unchecked_copy({"objective": objective})
 
 
 def _physical(variables: Variables, patterns: Patterns, x: np.ndarray) -> dict[int, np.ndarray]:
@@ -187,11 +187,11 @@ def _fixed_objective(
 
 
 def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float:
-    """Return one value of a motion at the instants that `base` chooses."""
-    if not trajectory.scenarios:
-        return part.value_at(trajectory.at(base.t), part.load_cases(base))
-    pairs = zip(trajectory.scenarios, base.scenarios, strict=True)
-    values = [part.value_at(one.at(own.t), part.load_cases(own)) for one, own in pairs]
+    """Return one value of a motion, or of its scenarios, at the instants that `base` chooses."""
+    values = []
+    for one, own in zip(motions_of(trajectory), motions_of(base), strict=True):
+        seen = part.seen(own)
+        values.append(part.value_at(one.at(seen.t), part.load_cases(seen)))
     return part.combine(trajectory.scene, values)[0]
 
 

@@ -170,7 +170,8 @@ class Iterate:
                 return
             self.projection.beta = before
             rises = False  # the shorter step is one of the same projection
-        self.evaluator.restart(start)
+        self.evaluator.start = start
+        self.evaluator.undo()
         self.evaluate_again()
         self.stuck = self.stuck or "every step, however short, makes it twice as bad"
 
@@ -272,7 +273,7 @@ class Iterate:
 
     def memory(self) -> IterateMemory:
         """Return all that the next step depends on, but for the problem at x."""
-        state = self.state
+        state, (solutions, vectors) = self.state, self.evaluator.start
         columns = [self.x, state.x_old1, state.x_old2, state.low, state.upp, self.best.x]
         return IterateMemory(
             iteration=self.iteration,
@@ -282,11 +283,11 @@ class Iterate:
             mma_steps=state.iteration,
             gradient=self.evaluator.gradient,
             cells=self.variables.split(np.column_stack(columns)),
-            modes=self.evaluator.initial_vectors,
+            modes=vectors,
             multipliers=state.multipliers,
             best=self.best,
             progress=self.progress,
-            solutions=self.evaluator.initial_solutions,
+            solutions=solutions,
             beta=self.projection.beta,
         )
 

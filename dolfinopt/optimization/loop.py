@@ -13,7 +13,6 @@ from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.optimization.assessment import (
     assess,
     evaluated_beside,
-    initial_selection,
     solid_limits,
     solid_sentence,
     straight_bars,
@@ -25,8 +24,9 @@ from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.measured import (
     CHECKPOINT_SECONDS,
     COMPARED_ITERATIONS,
+    COORDINATE_RESERVE_FACTOR,
     FROZEN_GAIN,
-    FROZEN_WINDOW,
+    WINDOW,
 )
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
@@ -35,7 +35,7 @@ from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import log
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
-from dolfinopt.responses.order_selection import OrderSelection
+from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene, pose_scenarios
 from dolfinopt.scene.tables.responses import freezes
@@ -155,7 +155,8 @@ class _Run:
                 self.exact_from = 0
             if needs(scene, "motion"):
                 initial = densities(self.evaluator.physical_designs(self.iterate.x)[-1])
-                self.selection = initial_selection(self.evaluator, initial)
+                place = scene, self.partition, self.arms, initial, self.profile
+                self.selection = choose_coordinates(*place, reserve=COORDINATE_RESERVE_FACTOR)
         if self.recorder is not None:
             self.recorder.begin(self.history)
 
@@ -195,7 +196,7 @@ class _Run:
         self.finished = stop_code(
             self.scene, one.iteration, last, one.progress, one.best, one.stuck
         )
-        late = self._begins_with_frozen_loads and one.progress.gain(FROZEN_WINDOW) <= FROZEN_GAIN
+        late = self._begins_with_frozen_loads and one.progress.gain(WINDOW // 2) <= FROZEN_GAIN
         return late or self.finished is not None
 
     @property

@@ -26,8 +26,6 @@ GENTLE_SHARPNESS = 4.0
 # merit rises then by itself, and makes them so. Within 8 iterations and with that length a design
 # falls apart, ten times as soft as with five times the length; it is five times as soft with three.
 SLOW_CONTINUATION = 25.0
-# Relative violation of a limit from which on beta waits for the design to come back.
-WAITING_EXCESS = 0.02
 # Of a relative excess, in objectives: 1 % costs a tenth; mass and compliance change by 1 to 3 %
 # with a percent of a limit.
 LIMIT_PRICE = 10.0
@@ -40,7 +38,6 @@ ERODED_LIMIT_FACTOR = 1.3
 
 # -- Residual and endings (stopping, loop) --
 
-FREE_SET_ROUNDS = 10  # of choosing the variables with room; two or three are the rule
 # Of the largest curvature: constraints whose gradients say the same.
 DEPENDENT_SHARE = 1e-12
 ROOM_SHARE = 1e-3  # of their range that variables are away from both bounds that can move
@@ -49,12 +46,11 @@ TRIAL_STEP_SHARE = 0.1
 # Grayness above which a projection has not done its work: 2 % of the cells at 1/2.
 GREY_SHARE = 0.02
 WINDOW = 20  # iterations in which a run that goes on gains `optimizer.tolerance`; 10 end rods early
-INFEASIBLE_WINDOW = 60  # as long as no design keeps all limits
 LOOKED_AT = 5  # every so many iterations: counts do not depend on rounding then
-FROZEN_WINDOW = 10  # iterations in which frozen loads gain FROZEN_GAIN, else the exact gradient
+# Of the best design in half a window, with which frozen loads go on; with less the exact gradient.
 FROZEN_GAIN = 0.01
 OPPOSING_SHARE = 0.05  # of a violated limit's gradient that another one balances: they conflict
-# Of a limit: nearer than that it counts as reached, the iterations may end any time.
+# Of a limit: nearer than that it counts as reached; beta waits for a design that is farther beyond.
 REACHED_LIMIT_SHARE = 0.02
 # After which a checkpoint is written: a kill costs no more, writing stays below a percent.
 CHECKPOINT_SECONDS = 2.0
@@ -87,18 +83,8 @@ CURVED_ASYMPTOTE_DISTANCE = 1.0
 # Of the range: a smaller move counts neither as back nor as forth. With 1e-9 rounding decides, and
 # the kernels of OpenBLAS end in 2 % of the runs with other counts; with 1e-6 in none of 200.
 REST_MOVE_SHARE = 1e-6
-PENALTY_LIMIT = 1e9  # of the elastic price
 # The dual is stepped in units of (multiplier + this), as they span decades; below raa0 they hardly
 # change the design.
 MULTIPLIER_FLOOR = 1e-5
-FIRST_DUAL_RADIUS = 10.0  # of the trust region in these units: about a decade of every multiplier
 DUAL_EVALUATIONS = 300  # at most; 4 to 5 are the rule
-DUAL_ROUNDING = 1e-14  # of its value relative to its terms, and of multipliers
-ACTIVE_MULTIPLIER = 1e-7 * MULTIPLIER_FLOOR  # smaller ones move no variable
-# Of an active constraint relative to its terms; only constraints that nearly repeat each other come
-# near.
-COMPLEMENTARITY_REST = 1e-6
-FLAT_GRADIENT_SHARE = 1e-6  # added to the curvature of a flat dual; vanishes at the maximum
-# Variables at a time, whose temporaries stay in the cache (96 kB): nearly three times as fast at 19
-# 200 variables.
-BLOCK_ENTRIES = 12288
+ROUNDING = 1e-14  # of sums relative to their terms

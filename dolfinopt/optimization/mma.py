@@ -18,26 +18,21 @@ which has no difference of large numbers, and whose minimiser over s_j costs one
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.measured import (
-    ACTIVE_MULTIPLIER,
-    BLOCK_ENTRIES,
-    COMPLEMENTARITY_REST,
     DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
-    DUAL_ROUNDING,
     FIRST_ASYMPTOTE_DISTANCE,
-    FIRST_DUAL_RADIUS,
-    FLAT_GRADIENT_SHARE,
     LARGEST_ASYMPTOTE_DISTANCE,
     LEAST_ASYMPTOTE_DISTANCE,
     MULTIPLIER_FLOOR,
-    PENALTY_LIMIT,
     REST_MOVE_SHARE,
+    ROUNDING,
 )
 
 Array = npt.NDArray[np.float64]
@@ -48,7 +43,7 @@ _LARGEST_STEP = 0.9  # of the distance to the asymptote: Svanberg's 1 - albefa
 
 CURVATURE = 1.002  # Svanberg's 1.001 + 0.001 of 2007
 _RAA0 = 1e-5  # his raa0: convex even where all gradients are zero
-_PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y + y^2 / 2
+_PENALTY = 1000.0  # his c_i: violating a normalised constraint by y costs c y
 
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -101,7 +96,7 @@ def mma_step(
     the constraints with them, before the approximation is built: the step depends neither on the
     units of f0 and f_i nor on those of x. A constraint whose gradient is zero says nothing about
     the step and is left out. The approximation is solved to rounding through its dual; where its
-    constraints contradict each other they are violated at a cost of c_i y_i + y_i^2 / 2.
+    constraints contradict each other they are violated at a cost of c_i y_i.
 
     Args:
         x: (n,) design.
@@ -121,7 +116,7 @@ def mma_step(
         The new design (n,) and the state for the next step; both are new arrays.
 
     Raises:
-        ValueError: an input has the wrong shape, is not finite, or x leaves its bounds.
+        ValueError: an input is not finite, or x leaves its bounds.
         ConvergenceError: the approximation could not be solved.
 
     Source: doi:10.1002/nme.1620240207 and Svanberg's notes of 2007.
@@ -137,23 +132,25 @@ def mma_step(
     s_min = -np.minimum(step, (x - low) / (distance * width))
     s_max = np.minimum(step, (high - x) / (distance * width))
     largest = np.abs(gradients).max(axis=1, initial=0.0)
-    active = largest > 0.0
-    active[0] = True  # an objective without gradient still holds the variables in place
-    scale = np.where(largest > 0.0, largest, 1.0)[active]
+    felt = largest[1:] > 0.0
+    used = np.append(True, felt)  # an objective without gradient still holds the variables
+    scale = np.where(largest > 0.0, largest, 1.0)[used]
+    G = distance * gradients[used] / scale[:, None]
+    H = CURVATURE * np.abs(G) + 2.0 * _RAA0 * distance
+    cost = np.full(f.size, _PENALTY)[felt]
+    if prices is not None:
+        dear = np.asarray(prices, dtype=np.float64)[felt] * scale[1:] / scale[0]
+        cost = np.maximum(dear, MULTIPLIER_FLOOR)
     # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
     with np.errstate(over="ignore"):
-        normalised = np.clip(f[active[1:]] / scale[1:], -1e30, 1e30)
-    penalty = np.full(normalised.size, _PENALTY)
-    if prices is not None:
-        dear = np.asarray(prices, dtype=np.float64)[active[1:]] * scale[1:] / scale[0]
-        penalty = np.clip(dear, MULTIPLIER_FLOOR, PENALTY_LIMIT)
-    dual = _Dual(gradients[active] / scale[:, None], distance, s_min, s_max, normalised, penalty)
-    known = state.multipliers.shape == f.shape
-    point = _solve_dual(dual, state.multipliers[active[1:]] if known else np.ones(penalty.size))
+        normalised = np.clip(f[felt] / scale[1:], -1e30, 1e30)
+    known = state.multipliers if state.multipliers.shape == f.shape else np.ones(f.size)
+    dual = _Dual(G, H, s_min, s_max, normalised, cost)
+    point = _solve_dual(dual, np.minimum(known[felt], cost))
     multipliers = np.zeros(f.size)
-    multipliers[active[1:]] = point.multipliers
+    multipliers[felt] = point.multipliers
     distance = distance * width
-    new = np.clip(x + distance * np.concatenate(point.steps), low, high)
+    new = np.clip(x + distance * point.s, low, high)
     after = MMAState(
         state.iteration + 1, x, state.x_old1.copy(), x - distance, x + distance, multipliers
     )
@@ -161,17 +158,14 @@ def mma_step(
 
 
 def _check(x: Array, low: Array, high: Array, f: Array, gradients: Array) -> None:
-    """Raise ValueError where the inputs do not belong together, or are not finite."""
-    if gradients.shape != (1 + f.size, x.size):
-        raise ValueError(f"MMA: {gradients.shape} gradients of {f.size} constraints, {x.size} x")
+    """Raise ValueError where an input is not finite, or x outside its bounds."""
     for name, values in {"x": x, "f": f, "gradients times ranges": gradients}.items():
         if not np.isfinite(values).all():
-            where = np.argwhere(~np.isfinite(values))[0].tolist()
-            raise ValueError(f"MMA: {name} not finite, first at {where}")
-    outside = ~((low <= x) & (x <= high))
-    if outside.any():
-        j = int(np.flatnonzero(outside)[0])
-        raise ValueError(f"MMA: x[{j}] = {x[j]} is not between {low[j]} and {high[j]}")
+            raise ValueError(
+                f"MMA: {name} not finite, first at {np.argwhere(~np.isfinite(values))[0]}"
+            )
+    if not ((low <= x) & (x <= high)).all():
+        raise ValueError("MMA: x is not between its bounds")
 
 
 def _asymptote_distances(
@@ -188,152 +182,116 @@ def _asymptote_distances(
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
-    """Hold the approximation in some variables: G, H (1 + m, b) and bounds of s (b,)."""
-
-    G: Array
-    H: Array
-    s_min: Array
-    s_max: Array
-
-
-@dataclass(frozen=True, eq=False)
 class _DualPoint:
     """The dual function at some multipliers: value, gradient (m,), minus Hessian (m, m)."""
 
     multipliers: Array
-    steps: list[Array]  # the minimisers s of the Lagrangian, block by block
+    s: Array  # (n,) minimiser of the Lagrangian
     value: float
     gradient: Array
     curvature: Array
 
 
+@dataclass(frozen=True, eq=False)
 class _Dual:
-    """Evaluate the concave dual function of the subproblem."""
+    """The concave dual function of the subproblem, over multipliers from 0 to their prices.
 
-    # W(l) = sum_j min_s (G_j s + H_j s^2) / (1 - s^2) + l.f + sum_i min_y (c y + y^2/2 - l_i y)
-    # with G_j = G_0j + sum_i l_i G_ij and H_j likewise. The inner minimum is at
-    # s = -G / (H + sqrt(H^2 - G^2)), cut off at the bounds of s.
+    W(l) = sum_j min_s (G_j s + H_j s^2) / (1 - s^2) + l.f with G_j = G_0j + sum_i l_i G_ij and H_j
+    likewise. The inner minimum is at s = -G / (H + sqrt(H^2 - G^2)), cut off at the bounds of s.
 
-    def __init__(
-        self, g: Array, distance: Array, s_min: Array, s_max: Array, f: Array, penalty: Array
-    ):
-        self.f, self.penalty, self.blocks = f, penalty, list[_Block]()
-        size = max(BLOCK_ENTRIES // len(g), 256)
-        for k in range(0, max(len(distance), 1), size):
-            part = slice(k, k + size)
-            H = distance[part] * (CURVATURE * np.abs(g[:, part]) + 2.0 * _RAA0)
-            self.blocks.append(_Block(distance[part] * g[:, part], H, s_min[part], s_max[part]))
-        # Sizes of the sums, to know when what is left of them is rounding.
-        self.size: Array = np.sum([one.H.sum(axis=1) for one in self.blocks], axis=0)
-        self.size[1:] += np.abs(f)
+    Attributes:
+        G, H: (1 + m, n).
+        s_min, s_max: (n,) bounds.
+        f, prices: (m,) values of the constraints, and what a unit of their violation costs.
+    """
+
+    G: Array
+    H: Array
+    s_min: Array
+    s_max: Array
+    f: Array
+    prices: Array
 
     def at(self, multipliers: Array) -> _DualPoint:
         """Evaluate the dual function at multipliers (m,)."""
-        m = multipliers.size
-        weights, sums = np.append(1.0, multipliers), np.zeros(1 + m + m * m)
-        steps = []
-        for block in self.blocks:
-            G, H = weights @ block.G, weights @ block.H
-            root = np.sqrt((H - G) * (H + G))
-            unbounded = -G / (H + root)
-            s = np.minimum(np.maximum(unbounded, block.s_min), block.s_max)
-            square = s * s
-            gap = 1.0 - square
-            sums[: 1 + m] += block.G @ (s / gap) + block.H @ (square / gap)
-            # Twice root / gap^2 is the Lagrangian's second derivative; what is at a bound stays.
-            half_slope = block.G[1:] * (0.5 + 0.5 * square) + block.H[1:] * s
-            compliance = (s == unbounded) * 2.0 / (gap * gap * root)
-            sums[1 + m :] += ((half_slope * compliance) @ half_slope.T).ravel()
-            steps.append(s)
-        violation = np.maximum(multipliers - self.penalty, 0.0)
-        constraints = self.f + sums[1 : 1 + m]
-        value = sums[0] + multipliers @ constraints - 0.5 * violation @ violation
-        gradient = constraints - violation
+        weights = np.append(1.0, multipliers)
+        G, H = weights @ self.G, weights @ self.H
+        root = np.sqrt((H - G) * (H + G))
+        unbounded = -G / (H + root)
+        s = np.minimum(np.maximum(unbounded, self.s_min), self.s_max)
+        gap = 1.0 - s * s
+        values = self.G @ (s / gap) + self.H @ (s * s / gap)
+        values[1:] += self.f
         # What is left of the sums by rounding must not steer the iteration.
-        known = np.abs(gradient) > 4.0 * np.finfo(float).eps * (self.size[1:] + multipliers)
-        gradient[~known] = 0.0
-        return _DualPoint(multipliers, steps, value, gradient, sums[1 + m :].reshape(m, m))
+        gradient = np.where(np.abs(values[1:]) > self.rounding[1:], values[1:], 0.0)
+        # Twice root / gap^2 is the Lagrangian's second derivative; what is at a bound stays.
+        half_slope = self.G[1:] * (0.5 + 0.5 * s * s) + self.H[1:] * s
+        compliance = (s == unbounded) * 2.0 / (gap * gap * root)
+        curvature = (half_slope * compliance) @ half_slope.T
+        return _DualPoint(multipliers, s, float(weights @ values), gradient, curvature)
+
+    @cached_property
+    def rounding(self) -> Array:
+        """What is left of the sums (1 + m,) by rounding."""
+        sizes = self.H.sum(axis=1)
+        sizes[1:] += np.abs(self.f)
+        return ROUNDING * sizes
 
 
 def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
-    """Maximise the dual over multipliers >= 0 by Newton steps within a trust region."""
-    # The dual is concave and once continuously differentiable; its curvature jumps where variables
-    # meet their bounds. A step is accepted if the dual still rises at its end, hence rose all the
-    # way, or if it falls there no more than half as steeply as it rose at the beginning and is not
-    # lower. The derivatives are known down to rounding, the values are not.
-    # Raises ConvergenceError where the constraints are not met to `COMPLEMENTARITY_REST`.
-    point = dual.at(multipliers)
-    radius = np.full(multipliers.size, FIRST_DUAL_RADIUS)
-    evaluations, kinked = 1, False
-    while multipliers.size and evaluations < DUAL_EVALUATIONS:
-        z = _newton_step(point, radius, dual.penalty)
-        if np.abs(z).max() <= DUAL_ROUNDING:
-            break
-        trial = dual.at(_stepped(point.multipliers, z, dual.penalty))
-        evaluations += 1
-        change = trial.multipliers - point.multipliers
+    """Maximise the dual by Newton steps within a trust region.
+
+    It is concave and once continuously differentiable; its curvature jumps where variables meet
+    their bounds. A step is taken if the dual still rises at its end, hence rose all the way, or if
+    it falls there no more than half as steeply as it rose at the beginning and is not lower.
+
+    Raises:
+        ConvergenceError: after `DUAL_EVALUATIONS`.
+    """
+    point, radius = dual.at(multipliers), np.full(multipliers.size, 4.0)
+    rounding = dual.rounding
+    if not multipliers.size:
+        return point
+    for _ in range(DUAL_EVALUATIONS):
+        new = _newton_step(point, radius, dual.prices)
+        change = new - point.multipliers
+        relative = np.abs(change) / (point.multipliers + MULTIPLIER_FLOOR)
+        if relative.max() <= ROUNDING:
+            return point
+        trial = dual.at(new)
         rise, rise_there = point.gradient * change, trial.gradient * change
-        rounding = DUAL_ROUNDING * (dual.size[0] + trial.multipliers @ dual.size[1:])
-        not_lower = trial.value >= point.value - rounding
-        turned = -rise_there.sum()
-        mean_curvature = 0.5 * (point.curvature + trial.curvature)
-        if turned <= 0.0 or (turned <= 0.5 * rise.sum() and not_lower):
-            if kinked and abs(turned) > 0.5 * rise.sum():
-                trial = replace(trial, curvature=mean_curvature)
-            point = trial
-            radius = np.where(rise_there >= 0.0, np.maximum(radius, 4.0 * np.abs(z)), radius)
+        higher = trial.value >= point.value - rounding @ np.append(1.0, new)
+        if rise_there.sum() >= 0.0 or (rise_there.sum() >= -0.5 * rise.sum() and higher):
+            wider = np.maximum(radius, 4.0 * relative)
+            point, radius = trial, np.where(rise_there >= 0.0, wider, radius)
         else:
-            # The multipliers that turned the derivative go less far. What was met on the way enters
-            # the curvature: on a ridge between two kinks either side alone points off the ridge.
-            part = np.maximum(rise, 0.0) / np.maximum(np.abs(rise) + np.abs(rise_there), _TINY)
-            shrunk = np.abs(z) * np.minimum(np.maximum(part, 0.1), 0.5)
-            radius = np.where(rise_there < 0.1 * rise_there.min(), shrunk, radius)
-            point = replace(point, curvature=mean_curvature)
-            kinked = True
-    _check_solved(dual, point, evaluations)
-    return point
+            # The multipliers that turned the derivative go less far. The curvature of both ends
+            # counts: on a ridge between two kinks either points off it.
+            turned = rise_there < 0.1 * rise_there.min()
+            radius = np.where(turned, 0.25 * relative, radius)
+            mean = 0.5 * (point.curvature + trial.curvature)
+            point = replace(point, curvature=mean)
+    raise ConvergenceError(
+        f"MMA: the subproblem was not solved in {DUAL_EVALUATIONS} evaluations of its dual: "
+        f"multipliers {point.multipliers}, derivatives {point.gradient}. Check that values and "
+        "gradients of the constraints belong together, or reduce move."
+    )
 
 
-def _check_solved(dual: _Dual, point: _DualPoint, evaluations: int) -> None:
-    """Raise ConvergenceError unless multipliers and constraints are complementary."""
-    active = point.multipliers > ACTIVE_MULTIPLIER
-    left = np.where(active, np.abs(point.gradient), np.maximum(point.gradient, 0.0))
-    allowed = COMPLEMENTARITY_REST * (dual.size[1:] + _TINY)
-    if (left > allowed).any():
-        i = int(np.argmax(left / allowed))
-        raise ConvergenceError(
-            f"MMA: the subproblem was not solved in {evaluations} evaluations of its dual: "
-            f"constraint {i} (of those with a gradient) is left at {left[i]:.1e} in units of its "
-            f"largest derivative, with multiplier {point.multipliers[i]:.1e}. Check that its "
-            "value and gradient belong together and that no two constraints are equivalent, or "
-            "reduce move."
-        )
+def _newton_step(point: _DualPoint, radius: Array, prices: Array) -> Array:
+    """Return the multipliers that maximise the dual's quadratic model near the point.
 
-
-def _newton_step(point: _DualPoint, radius: Array, penalty: Array) -> Array:
-    """Return the Newton step z in units of multiplier + MULTIPLIER_FLOOR, within the radius."""
-    # A radius r lets a multiplier grow or shrink by the factor 1 + r. The price of violation has a
-    # kink where the multiplier reaches the penalty: the step ends there at the latest, and the next
-    # one starts with the curvature of the side it goes to.
+    Near: each grows or shrinks by the factor 1 + radius at most, in units of it and a floor.
+    """
     old = point.multipliers
     unit = old + MULTIPLIER_FLOOR
-    violated = (old > penalty) | ((old == penalty) & (point.gradient > 0.0))
-    to_kink = (penalty - old) / unit
-    lower = np.maximum(np.where(violated, to_kink, -old / unit), -radius / (1.0 + radius))
-    upper = np.minimum(np.where(violated, radius, to_kink), radius)
-    curvature = (point.curvature + np.diag(violated.astype(float))) * np.outer(unit, unit)
-    return _maximise_in_box(point.gradient * unit, curvature, lower, upper)
-
-
-def _stepped(old: Array, z: Array, penalty: Array) -> Array:
-    """Return the multipliers after the step z, exactly 0 or the penalty if it leads there."""
-    unit = old + MULTIPLIER_FLOOR
-    new = old + unit * z
+    lower = np.maximum(-old / unit, -radius / (1.0 + radius))
+    upper = np.minimum((prices - old) / unit, radius)
+    curvature = point.curvature * np.outer(unit, unit)
+    z = _maximise_in_box(point.gradient * unit, curvature, lower, upper)
+    new = np.clip(old + unit * z, 0.0, prices)
     new[z <= -old / unit] = 0.0
-    kinked = np.abs(new - penalty) <= 1e-15 * penalty
-    new[kinked] = penalty[kinked]
-    return new
+    return np.asarray(np.where(z >= (prices - old) / unit, prices, new))
 
 
 def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Array) -> Array:
@@ -342,9 +300,8 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     # release a bound the maximum has turned away from. The value never falls, so that the iterate
     # is an ascent direction even if the number of rounds runs out.
     m = gradient.size
-    # Vanishes with the gradient, so that Newton's rate stays, and bounds the step where the dual
-    # is flat; the relative part is for equivalent constraints.
-    diagonal = DEPENDENT_SHARE * np.diag(curvature) + FLAT_GRADIENT_SHARE * np.abs(gradient) + _TINY
+    # Bounds the step where the dual is flat, or constraints say the same.
+    diagonal = DEPENDENT_SHARE * (np.diag(curvature) + np.abs(gradient)) + _TINY
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)
     fixed = ((lower == 0.0) & (gradient <= 0.0)) | ((upper == 0.0) & (gradient >= 0.0))

@@ -11,8 +11,8 @@ from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.optimization.measured import (
     GENTLE_SHARPNESS,
     LEAST_REACH,
+    REACHED_LIMIT_SHARE,
     SLOW_CONTINUATION,
-    WAITING_EXCESS,
 )
 from dolfinopt.parallel import Partition, together
 from dolfinopt.scene.load import Scene
@@ -83,7 +83,7 @@ class Projection:
         Args:
             excess: largest relative violation of a limit.
         """
-        return not self.complete and excess <= WAITING_EXCESS
+        return not self.complete and excess <= REACHED_LIMIT_SHARE
 
     def advance(self) -> None:
         """Raise beta.

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dolfinopt.optimization.measured import (
-    DEPENDENT_SHARE,
-    FREE_SET_ROUNDS,
     ROOM_SHARE,
     TRIAL_STEP_SHARE,
 )
@@ -82,7 +80,7 @@ def kkt_residual(
     g0 = g0 / scale
     slack = np.maximum(-f, 0.0)
     best, inside = Residual(np.inf, np.zeros(f.size)), roomy
-    for _ in range(FREE_SET_ROUNDS):
+    while True:
         count = max(1, np.count_nonzero(inside | roomy))
         found = _multipliers(g0, g, inside, slack / np.sqrt(count))
         L = g0 + found @ g
@@ -97,31 +95,19 @@ def kkt_residual(
         moved = np.where(movable, g0, 0.0)
         rms = float(np.sqrt(own / (moved @ moved))) if moved.any() else np.inf
         if rms < best.rms:
-            best = Residual(rms, found, scale)
-        if f.size == 0 or (moving == inside).all():
-            break
-        inside = moving
-    return best
+            best, inside = Residual(rms, found, scale), moving
+        else:
+            return best
 
 
 def _multipliers(
     g0: np.ndarray, g: np.ndarray, inside: np.ndarray, slack: np.ndarray
 ) -> np.ndarray:
     """Return l >= 0 that makes |g0 + l g|^2 + |l slack|^2 least over the variables inside."""
-    m = len(g)
-    if m == 0:
-        return np.zeros(0)
-    chosen = g * inside
-    gram, right = chosen @ chosen.T + np.diag(slack**2), -chosen @ g0
-    scale = np.sqrt(np.diag(gram))
-    scale[scale == 0.0] = 1.0
-    # |A l - b| with A'A = gram: its square root by eigenvectors, rounding left out.
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-    kept = values > DEPENDENT_SHARE * values[-1]
-    if not kept.any():
-        return np.zeros(m)
-    root = np.sqrt(values[kept])
-    A, b = root[:, None] * vectors[:, kept].T, (vectors[:, kept].T @ (right / scale)) / root
     from scipy.optimize import nnls  # takes as long to import as NumPy
 
-    return np.asarray(nnls(A, b)[0] / scale)
+    A = np.vstack([(g * inside).T, np.diag(slack)])
+    unit = np.sqrt(np.square(A).sum(axis=0))
+    unit[unit == 0.0] = 1.0
+    right = np.concatenate([-g0 * inside, np.zeros(len(slack))])
+    return np.asarray(nnls(A / unit, right)[0] / unit) if len(g) else np.zeros(0)

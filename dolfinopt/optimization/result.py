@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.optimization.certificate import Certificate
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.optimization.stopping import StopCode
 from dolfinopt.parallel import Partition
@@ -21,6 +20,7 @@ from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.optimization.certificate import Certificate
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

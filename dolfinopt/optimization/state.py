@@ -63,10 +63,7 @@ class HistoryRow:
     @classmethod
     def from_values(cls, columns: Sequence[str], values: Sequence[float]) -> HistoryRow:
         """Return the row of which `columns` and `values` are."""
-        known = [f.name for f in fields(cls)][:-3]
-        pairs = list(zip(columns, map(float, values), strict=True))
-        # A limit may have the name of a column of the design: the first one is that.
-        count = sum(name in known and name not in columns[:k] for k, name in enumerate(columns))
+        pairs, count = list(zip(columns, map(float, values), strict=True)), len(fields(cls)) - 3
         own, figures, size = dict(pairs[:count]), dict(pairs[count:]), len(MULTIPLIER)
         # Columns by name: one by one they would hide what mypy can check.
         return cls(

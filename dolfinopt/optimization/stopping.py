@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from dolfinopt.optimization.measured import (
-    INFEASIBLE_WINDOW,
-    LOOKED_AT,
-    WINDOW,
-)
+from dolfinopt.optimization.measured import LOOKED_AT, WINDOW
 from dolfinopt.optimization.state import Best, Progress
 from dolfinopt.scene.load import Scene
 
@@ -28,9 +24,9 @@ def stop_code(
 ) -> StopCode | None:
     """Return why the iterations end here, None where they go on.
 
-    A run ends where its best design gained at most `optimizer.tolerance` in `WINDOW` iterations
-    of one projection; it is looked at every few iterations, so that rounding does not change
-    their number, and where no step leads on.
+    A run ends where its best design gained at most `optimizer.tolerance` in `WINDOW` iterations of
+    one projection, or in three times as many while no design keeps all limits, and where no step
+    leads on. It is looked at every few iterations, so that rounding does not change their number.
 
     Args:
         scene: with the tolerance.
@@ -45,7 +41,7 @@ def stop_code(
         return StopCode.SETTLED if gained_nothing else StopCode.STUCK
     if iteration and iteration % LOOKED_AT == 0:
         tolerance, feasible = scene.optimizer.tolerance, best.excess == 0.0
-        if progress.gain(WINDOW if feasible else INFEASIBLE_WINDOW) <= tolerance:
+        if progress.gain(WINDOW if feasible else 3 * WINDOW) <= tolerance:
             return StopCode.SETTLED if feasible else StopCode.INFEASIBLE
     return StopCode.ITERATIONS if iteration >= last else None
 
@@ -66,7 +62,7 @@ def ending(
     reason = {
         StopCode.SETTLED: f"finished: at most {tolerance:g} % gained in {WINDOW} iterations",
         StopCode.INFEASIBLE: f"stopped: the limits are not met, and their violation fell by at "
-        f"most {tolerance:g} % in {INFEASIBLE_WINDOW} iterations",
+        f"most {tolerance:g} % in {3 * WINDOW} iterations",
         StopCode.STUCK: f"stopped: no step leads on ({stuck})",
         StopCode.ITERATIONS: f"stopped after optimizer.max_iterations = {options.max_iterations}",
     }[code]

@@ -185,7 +185,7 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
             radius = 0.5 * (x1 - x0)
             points = np.column_stack([x0 + radius * (1 + turn.real), y0 + radius * (1 + turn.imag)])
         found.append((region.kind, points * scale))
-        if pattern.symmetric:
+        if pattern.symmetric_about[0]:
             found.append((region.kind, points * scale * [1.0, -1.0]))
     return tuple(found)
 

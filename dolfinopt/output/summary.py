@@ -538,8 +538,6 @@ def _widths(
             points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
             if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
                 points = _lowest(mesh.comm, points)
-            if points.shape[1:] == (4, 2):
-                points = points[:, [0, 1, 3, 2]]
             corners[k], solid[k], fixed[k] = points, x_phys[k] > SOLID, mesh.fixed
             asked[k] = max(design.least_widths)
     whole, cut, stays = (gather_cells(partition, one) for one in (corners, solid, fixed))

@@ -346,7 +346,7 @@ def _stated(
     found, shapes = np.zeros(len(centroid), dtype=bool), []
     for one in arm.regions:
         if one.kind == kind and one.depth is None:
-            for mirror in (1.0, -1.0) if arm.symmetric else (1.0,):
+            for mirror in (1.0, -1.0) if arm.symmetric_about[0] else (1.0,):
                 found |= one.covers(centroid[:, 0], mirror * centroid[:, 1])
                 shapes.append(Region([_shape(one, mirror)]))
     if kind == "solid" and arm.cells is None and arm.solid_ends > 0.0:
@@ -555,7 +555,7 @@ def domain_of(
         grid=None if entry.cells is None else entry.cells[:2],
         length=entry.length,
         thickness=entry.thickness,
-        symmetric=like.symmetric,
+        symmetric=like.symmetric_about[0],
         minimum_member=scene.part.minimum_member or scene.design.minimum_member,
     )
 
@@ -749,7 +749,7 @@ def _flat_domain(
     if np.ptp(values, axis=1).max() > ROUNDING:
         return None
     plate = box_arm(MPI.COMM_SELF, arm.name, (arm.length, arm.height), arm.cells[:2])
-    thin = arm.model_copy(update={"cells": (*arm.cells[:2], 1)})
+    thin = arm.unchecked_copy({"cells": (*arm.cells[:2], 1)})
     points = np.column_stack([plate.centroid, np.zeros(plate.num_cells)])
     x, smooth, passive, void = values.mean(axis=1)[_grid_places(thin, points)].T
     plate = replace(plate, passive=passive > 0.5, void=void > 0.5)

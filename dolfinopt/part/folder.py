@@ -194,7 +194,7 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
             row.update(_meshed(meshes.absolute() / f"{name}.msh") | parts[owner].keys())
             row["interfaces"] = [
                 {"name": one.name, "point": list(point)}
-                for one, point in zip(arm.interfaces, arm.interface_points[1:], strict=True)
+                for one, point in zip(arm.further_interfaces, arm.interface_points[1:], strict=True)
             ]
     # All of it stays solid; what else there is to say of a design has no use.
     data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
@@ -214,8 +214,6 @@ def _meshed(mesh: Path) -> dict[str, Any]:
         "regions": None,
         "symmetric": False,  # which its mesh is not to the last cell
         "mesh_scale": 1.0,
-        "inboard_bore": None,
-        "outboard_bore": None,
     }
 
 

@@ -21,7 +21,7 @@ from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
 from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import Analysis, objective_of
-from dolfinopt.responses.stress import arm_loads, every_instant, maxima, motions_of
+from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
 
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
@@ -200,8 +200,8 @@ class Problem:
         factor = self._factor(Limit(STRESS, "", 0.0, limit, "Pa")) / limit
         for k, loads in arm_loads(scene, motions).items():
             state, part = simulated.arms[k].current, every[k].current
-            points = part.stress(state, state.load_fields_of(every_instant(loads)))
-            motion = [points.coefficients(one) for one in loads]
+            points = part.stress(state, state.load_fields)
+            motion = [one.coefficients for one in loads]
             each = [maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion]
             stress = np.max(each, axis=0)
             means_of = points.means(motion, self._exponent(PLACE_EXPONENT))
@@ -272,7 +272,7 @@ class Problem:
         parts = {k: one.current for k, one in outlines.items()}
         one, p = simulated, self._exponent(exponent)
         given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
-        options = one.scene.objective.model_copy(update={"stress_exponent": p})
+        options = one.scene.objective.unchecked_copy({"stress_exponent": p})
         return OutlineStress(options, parts, nodes), analysis_of(*given)
 
     def _exponent(self, least: float) -> float:

@@ -26,14 +26,13 @@ from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.part.mesh import CORNER
 from dolfinopt.part.plane.curves import Shape, direction
 from dolfinopt.part.solid.surface import distance_to_faces
-from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE, P_MEAN_STRIDE
+from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
     PointStress,
     Stress,
     arm_loads,
     every,
-    every_instant,
     maxima,
     motions_of,
     screen,
@@ -94,10 +93,10 @@ def stress_of_parts(
         if not arms[k].solid.law.has_strength:
             continue
         state = arms[k].current
-        points = parts[k].stress(state, state.load_fields_of(every_instant(loads)))
+        points = parts[k].stress(state, state.load_fields)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
         for one in loads:
-            a, t = points.coefficients(one), motions[one.motion].t
+            a, t = one.coefficients, motions[one.motion].t
             best = points.peak(a, t, np.flatnonzero(counts))
             known = found.get(one.place)
             if known is not None and known.peak.value >= best.value:
@@ -136,7 +135,7 @@ class CornerStress(PointStress):
 
     def peak(self, a: np.ndarray, t: np.ndarray, chosen: np.ndarray) -> Peak:
         """Return the largest stress of the chosen points, instants t (n,) and coefficients a."""
-        largest = screen(MPI.COMM_SELF, self.A[:, chosen], a, every(len(a)))
+        largest = screen(MPI.COMM_SELF, self.A[:, chosen], a)
         place = tuple(map(float, self.places[chosen][largest.point]))
         return Peak(largest.largest, place, float(t[largest.instant]))
 
@@ -147,7 +146,7 @@ class CornerStress(PointStress):
 
         That of `OutlineStress` of these points, which leaves out instants of hardly any stress.
         """
-        summed = [a[every(len(a))[::P_MEAN_STRIDE]] for a in motions]
+        summed = [a[every(len(a))[::2]] for a in motions]
         stress = np.sqrt(np.square(self.A @ np.concatenate(summed).T).sum(axis=0))
 
         def mean(some: np.ndarray) -> float:
@@ -174,7 +173,7 @@ class CornerStress(PointStress):
         by_weights: np.ndarray,
     ) -> tuple[np.ndarray, Products]:
         """Follow derivatives by the stress to nodes, see `PointStress`; which count is held."""
-        at, columns = self.corners.ravel(), self.fields.to_columns.T @ a.T
+        at, columns = self.corners.ravel(), a.T
         by_own = by[:, at] * self.shares.ravel()[:, None]
         apart = np.einsum("cim,cim->i", by_own, self.own @ columns - (self.A @ columns)[:, at])
         by_areas = apart.reshape(self.corners.shape).sum(axis=1) / state.mesh.area

@@ -9,7 +9,7 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.assembly import combine
 from dolfinopt.fem.elasticity import ElasticArm, Rows
-from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
+from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
 from dolfinopt.fem.measured import ROUNDING_SHARE
 from dolfinopt.parallel import on_root, total
 from dolfinopt.reduction.measured import DEFLATION_SHARE, KRYLOV_BLOCKS_LIMIT, ROUNDING_LENGTH_SHARE
@@ -335,5 +335,5 @@ def solve_at(arm: ElasticArm, omega: float, right: Rows) -> np.ndarray:
     raise ConvergenceError(
         f"arm {arm.mesh.name!r}: the response at {omega / (2.0 * np.pi):g} Hz does not "
         "converge: too close to a natural frequency, or too far above the first ones; move or "
-        "lower reduction.shifts"
+        "lower reduction.frequencies"
     )

@@ -81,7 +81,7 @@ class Pencil:
     def mass(self, V: np.ndarray) -> np.ndarray:
         """Return T'MT V."""
         if not self.is_free:
-            return self.arm.interior_mass_times(V)
+            return self.arm.interior_mass.times(V)
         interior, outboard = self.arm.restrict(self.arm.mass_times(self.field(V)))
         if self.carried is not None:
             outboard += self.carried @ self.split(V)[1]
@@ -366,7 +366,7 @@ def _krylov_schur(
     known: np.ndarray | None = None,
     product: Columns | None = None,
 ) -> Pairs:
-    """Return up to `count` pairs.
+    """Return up to `count` pairs in SLEPc's order, the wanted ones first.
 
     Args:
         pencil: K, M.
@@ -377,17 +377,33 @@ def _krylov_schur(
         product: None for the lowest modes of K phi = lambda M phi; A times columns for the largest
             mu of A phi = mu K phi, descending.
     """
-    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
-    # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
-    # have, need more vectors, not more restarts.
-    for space, restarts in ((max(count + 4, 2 * count), 25), (4 * count + 100, 100)):
-        with _solver(pencil, product) as eps:
-            eps.setDimensions(min(count, pencil.size), min(space, pencil.size))
+    with _solver(pencil, product) as eps:
+        vector = eps.getOperators()[0].createVecLeft()
+        given = [_filled(vector, first)]
+        eps.setInitialSpace(given)
+        if known is not None:
+            space = [_filled(vector, column) for column in known.T]
+            eps.setDeflationSpace(space)
+            given += space
+        # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
+        # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
+        # have, need more vectors, not more restarts.
+        for size, restarts in ((max(count + 4, 2 * count), 25), (4 * count + 100, 100)):
+            eps.setDimensions(min(count, pencil.size), min(size, pencil.size))
             eps.setTolerances(tolerance, restarts)
-            pairs = _solved(pencil, eps, count, first, known)
-        if len(pairs[0]) == count:
-            break
-    return pairs
+            with obeying_options(OPTIONS):
+                eps.setFromOptions()
+                eps.solve()
+            converged = min(eps.getConverged(), count)
+            if converged == count:
+                break
+        values, vectors = np.empty(converged), np.empty((pencil.rows, converged))
+        for k in range(converged):
+            values[k] = eps.getEigenpair(k, vector).real
+            vectors[:, k] = vector.array
+        for each in (vector, *given):
+            each.destroy()
+    return values, vectors
 
 
 @contextmanager
@@ -414,30 +430,6 @@ def _solver(pencil: Pencil, product: Columns | None) -> Iterator[SLEPc.EPS]:
     # PETSc keeps what Python forgets, and with it the arm's design: 5 MB of 400 x 24 cells.
     for each in (eps, transform, ksp, stiffness, other):
         each.destroy()
-
-
-def _solved(
-    pencil: Pencil, eps: SLEPc.EPS, count: int, first: np.ndarray, known: np.ndarray | None
-) -> Pairs:
-    """Return up to `count` pairs in SLEPc's order, the wanted ones first."""
-    vector = eps.getOperators()[0].createVecLeft()
-    given = [_filled(vector, first)]
-    eps.setInitialSpace(given)
-    if known is not None:
-        space = [_filled(vector, column) for column in known.T]
-        eps.setDeflationSpace(space)
-        given += space
-    with obeying_options(OPTIONS):
-        eps.setFromOptions()
-        eps.solve()
-    converged = min(eps.getConverged(), count)
-    values, vectors = np.empty(converged), np.empty((pencil.rows, converged))
-    for k in range(converged):
-        values[k] = eps.getEigenpair(k, vector).real
-        vectors[:, k] = vector.array
-    for each in (vector, *given):
-        each.destroy()
-    return values, vectors
 
 
 def _without_gaps(pencil: Pencil, values: np.ndarray, vectors: np.ndarray) -> Pairs:

@@ -259,7 +259,7 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
         if not chains:
             raise ConvergenceError(
                 f"arm {arm.mesh.name!r}: only {V.shape[2]} of {options.coordinates} Krylov vectors "
-                "are independent; ask for fewer reduction.coordinates or move reduction.shifts"
+                "are independent; ask for fewer reduction.coordinates or move reduction.frequencies"
             )
         longer: list[tuple[float, _Group | None, np.ndarray]] = []
         for omega, group, columns in chains:
@@ -320,7 +320,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     else:
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: the responses up to {options.band[1]:g} Hz do not converge; "
-            "lower reduction.band"
+            "lower reduction.frequencies"
         )
     factor = responses * np.sqrt(weights / np.pi)[:, None]
     factor = np.concatenate([factor.real, factor.imag], axis=1).reshape(len(factor), -1)
@@ -334,7 +334,7 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: responses between {options.band[0]:g} and "
             f"{options.band[1]:g} Hz have only {found} of {options.coordinates} directions; "
-            "ask for fewer reduction.coordinates or widen reduction.band"
+            "ask for fewer reduction.coordinates or widen reduction.frequencies"
         )
     return ritz(arm, combine(V, np.linalg.solve(upper, U[:, : options.coordinates])))
 

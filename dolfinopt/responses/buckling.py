@@ -12,9 +12,9 @@ Source: Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from scipy.signal import find_peaks
@@ -28,13 +28,9 @@ from dolfinopt.fem.stress import Prestress, PrestressGradient, StressedModulus
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
     BUCKLING_MODES,
-    BUCKLING_PEAK_SHARE,
     BUCKLING_PEAKS,
-    BUCKLING_PLATEAU,
     BUCKLING_PROMINENCE,
     BUCKLING_RANK_SHARE,
-    BUCKLING_ROUNDS,
-    BUCKLING_WEIGHT_SHARE,
     LARGEST_FACTOR,
     VOID_STRESS_SHARE,
 )
@@ -50,7 +46,6 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import pairs_at_interfaces
 from dolfinopt.responses.stress import ArmGradient, ArmLoads, ByLoads, arm_loads, through_motions
-from dolfinopt.scene.load import Scene
 
 # -- the instants of one arm along one motion at which it comes closest to buckling ---------------
 
@@ -62,62 +57,48 @@ class Pressed:
     Attributes:
         loads: along the motion.
         instant: of it.
-        stiffer: Young's modulus of the motion's scene over the nominal one.
-        modes: of the nominal stiffness under the stress over `stiffer`.
+        modes: of the nominal stiffness under the stress over `loads.stiffer`.
     """
 
     loads: ArmLoads
     instant: int
-    stiffer: float
     modes: BucklingModes
 
     @property
     def a(self) -> np.ndarray:
         """Coefficients (m,) of that stress."""
-        return np.asarray(self.loads.coefficients[self.instant] / self.stiffer)
+        return np.asarray(self.loads.coefficients[self.instant] / self.loads.stiffer)
 
 
-def pressed(state: DesignState, loads: ArmLoads, stiffer: float) -> list[Pressed]:
+def pressed(state: DesignState, loads: ArmLoads) -> list[Pressed]:
     """Return the instants that count (collective on the arm's ranks).
 
-    The first are those of the largest strain energy. The modes found there tell at any other
-    instant that mu is at least their Ritz value: where that has its peaks modes are computed next,
-    until the peaks are known.
+    The modes at the instants of the largest strain energy tell at any other instant that mu is at
+    least their Ritz value: the instants that count are where that has its peaks.
     """
-    a, fields, modulus = loads.coefficients / stiffer, state.load_fields, stressed_modulus(state)
+    a, fields = loads.coefficients / loads.stiffer, state.load_fields
+    modulus = stressed_modulus(state)
+
+    @cache
+    def modes_at(n: int) -> BucklingModes:
+        stress = Prestress(fields, modulus, a[n : n + 1])
+        return buckling_modes(stress, BUCKLING_MODES, 1.0 / LARGEST_FACTOR)
+
     energies = state.elastic.energy_matrix(fields.columns)
-    peaks = worst_instants(np.einsum("nk,kl,nl->n", a, energies, a))
-    known: dict[int, BucklingModes] = {}
-    for left in reversed(range(BUCKLING_ROUNDS)):
-        new = [n for n in peaks if n not in known]
-        for n in new:
-            stress = Prestress(fields, modulus, a[n : n + 1])
-            known[n] = buckling_modes(stress, BUCKLING_MODES, 1.0 / LARGEST_FACTOR)
-        if not (new and left):
-            break
-        values = _ritz(state, a, known)
-        highest = worst_instants(values, BUCKLING_PEAK_SHARE)
-        peaks = list(dict.fromkeys(_nearby(values, n, known) for n in highest))
-    return [Pressed(loads, n, stiffer, known[n]) for n in peaks]
+    first = worst_instants(np.einsum("nk,kl,nl->n", a, energies, a))
+    if not first:
+        return []
+    peaks = worst_instants(_ritz(state, a, [modes_at(n) for n in first]))
+    return [Pressed(loads, n, modes_at(n)) for n in peaks]
 
 
-def _nearby(values: np.ndarray, peak: int, known: Iterable[int]) -> int:
-    """Return a known instant of the same peak of values (n,), where it is as high as that."""
-    for n in known:
-        first, last = sorted((n, peak))
-        if values[first : last + 1].min() >= (1.0 - BUCKLING_PLATEAU) * values[peak]:
-            return n
-    return peak
-
-
-def worst_instants(values: np.ndarray, share: float = 0.0) -> list[int]:
-    """Return the highest peaks of values (n,), at least a share of the largest, largest first."""
+def worst_instants(values: np.ndarray) -> list[int]:
+    """Return the highest peaks of values (n,), largest first."""
     around = np.concatenate([[0.0], np.maximum(values, 0.0), [0.0]])  # the ends may be peaks
     peaks = find_peaks(around, prominence=BUCKLING_PROMINENCE * around.max())[0] - 1
     if not around.any():
         return []
-    first = peaks[np.argsort(-values[peaks], kind="stable")][:BUCKLING_PEAKS]
-    return [int(n) for n in first if values[n] >= share * values[first[0]]]
+    return list(map(int, peaks[np.argsort(-values[peaks], kind="stable")][:BUCKLING_PEAKS]))
 
 
 def stressed_modulus(state: DesignState) -> StressedModulus:
@@ -133,10 +114,10 @@ def stressed_modulus(state: DesignState) -> StressedModulus:
     return StressedModulus(solid * r * share, share * (r + 2.0 * e) / (r + e))
 
 
-def _ritz(state: DesignState, a: np.ndarray, known: Mapping[int, BucklingModes]) -> np.ndarray:
+def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> np.ndarray:
     """Return the largest mu (n,) that the known modes show of all instants."""
     arm, fields = state.elastic, state.load_fields
-    V = np.concatenate([one.field[:, :, :2] for one in known.values()], axis=2)
+    V = np.concatenate([one.field[:, :, :2] for one in known], axis=2)
     every = Prestress(fields, stressed_modulus(state), np.eye(a.shape[1]))
     K, K0 = arm.energy_matrix(V), every.stiffness(V)
 
@@ -179,7 +160,7 @@ def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuc
         trajectory: of these arms; of scenarios the worst counts.
     """
     scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
-    loads, found = _loads(scene, trajectory), list[LeastBuckling]()
+    loads, found = arm_loads(scene, motions), list[LeastBuckling]()
     for k, arm in arms.items():
         for one in _of_design(arm.current, loads[k]):
             mu, motion = float(one.modes.inverse[0]), motions[one.loads.motion]
@@ -188,25 +169,10 @@ def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuc
     return min(found, key=lambda one: one.factor, default=None)
 
 
-Loads = list[tuple[ArmLoads, float]]  # of one design, each with `Pressed.stiffer`
-
-
-def _loads(scene: Scene, trajectory: Trajectory) -> dict[int, Loads]:
-    """Return the loads of every design."""
-    motions = motions_of(trajectory)
-
-    def stiffer(one: ArmLoads) -> float:
-        other = motions[one.motion].scene.material_of(one.place).modulus
-        return other / scene.material_of(one.place).modulus
-
-    every = arm_loads(scene, motions)
-    return {k: [(one, stiffer(one)) for one in each] for k, each in every.items()}
-
-
-def _of_design(state: DesignState, loads: Loads) -> list[Pressed]:
+def _of_design(state: DesignState, loads: Sequence[ArmLoads]) -> list[Pressed]:
     """Return the instants of all arms with a design (collective on its ranks)."""
     with state.elastic.profile.phase("buckling"):
-        return [each for one in loads for each in pressed(state, *one)]
+        return [each for one in loads for each in pressed(state, one)]
 
 
 # -- as objective and as limit -------------------------------------------------------------------
@@ -244,7 +210,7 @@ class Buckling(Response):
         designs, world = analysis.designs, analysis.partition.world
 
         def find() -> dict[int, list[Pressed]]:
-            every = on_root(world, lambda: _loads(analysis.scene, analysis.motion))
+            every = on_root(world, lambda: arm_loads(analysis.scene, motions_of(analysis.motion)))
             with together(world):
                 return {k: _of_design(state, every[k]) for k, state in designs.items()}
 
@@ -268,30 +234,22 @@ def _gradient_of_arm(
     state: DesignState, found: Sequence[Pressed], weights: Sequence[np.ndarray]
 ) -> ArmGradient:
     """Differentiate by what one design's K0 is made of (collective on the arm's ranks)."""
-    least = BUCKLING_WEIGHT_SHARE
-    every = zip(found, weights, strict=True)
-    counted = [(one, by * (by > least)) for one, by in every if by.max(initial=0.0) > least]
+    counted = [(one, by) for one, by in zip(found, weights, strict=True) if by.any()]
     if not counted:
-        return ArmGradient([], None, Products())
-    kept = [by > 0.0 for _, by in counted]
-    modes = np.concatenate(
-        [one.modes.field[:, :, own] for (one, _), own in zip(counted, kept, strict=True)], axis=2
-    )
-    mu = np.concatenate(
-        [one.modes.inverse[own] for (one, _), own in zip(counted, kept, strict=True)]
-    )
-    by_mu = np.concatenate([by[own] for (_, by), own in zip(counted, kept, strict=True)])
-    instant = np.repeat(np.arange(len(counted)), [own.sum() for own in kept])
+        return ArmGradient([], None, (Products(),))
+    modes = np.concatenate([one.modes.field for one, _ in counted], axis=2)
+    mu = np.concatenate([one.modes.inverse for one, _ in counted])
+    by_mu = np.concatenate([by for _, by in counted])
+    instant = np.repeat(np.arange(len(counted)), [len(by) for _, by in counted])
     by_K0 = np.zeros((len(counted), len(mu), len(mu)))
     by_K0[instant, range(len(mu)), range(len(mu))] = -by_mu
     a, fields = np.array([one.a for one, _ in counted]), state.load_fields
     one = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
     pair = (modes * (-by_mu * mu), modes)
     by_loads = [
-        ByLoads(
-            each.loads.motion, each.loads.place, np.array([each.instant]), by[None] / each.stiffer
-        )
+        ByLoads(to.motion, to.place, np.array([each.instant]), by[None] / to.stiffer)
         for (each, _), by in zip(counted, one.by_a, strict=True)
+        for to in [each.loads]
     ]
     beside = Products(
         stiffness=(pair, (one.y, one.stress.u)),
@@ -300,18 +258,7 @@ def _gradient_of_arm(
         interfaces=partial(_at_interfaces, one, pair),
         prestress=one,
     )
-    return ArmGradient(_joined(by_loads), one.through, beside)
-
-
-def _joined(every: Sequence[ByLoads]) -> list[ByLoads]:
-    """Return one entry for every arm along every motion, instants ascending."""
-    found = []
-    for motion, place in sorted({(one.motion, one.place) for one in every}):
-        own = [one for one in every if (one.motion, one.place) == (motion, place)]
-        own.sort(key=lambda one: one.instants[0])
-        instants = np.concatenate([one.instants for one in own])
-        found.append(ByLoads(motion, place, instants, np.concatenate([one.by for one in own])))
-    return found
+    return ArmGradient(by_loads, one.through, (beside,))
 
 
 def _at_interfaces(gradient: PrestressGradient, pair: Pair) -> tuple[np.ndarray, np.ndarray]:

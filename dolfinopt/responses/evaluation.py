@@ -278,21 +278,38 @@ def _simulated(
     kept: list[Trajectory] = []
 
     def run() -> Motion:
-        others = pose_scenarios(scene)
-        first = starts[0] if starts else None
-        moved = [simulate(scene, chain_of(scene, owned), profile, first)]
-        for number, one in enumerate(others, 1):
-            # Scenarios begin with the scene's motion unless theirs is known.
-            start = starts[number] if number < len(starts) else moved[0].solution
-            # The nominal machine's feed-forward is kept where the motion is the same.
-            held = moved[0].feed_forward if one.motion == scene.motion else None
-            moved.append(simulate(one, bodies_in(scene, one, owned), profile, start, held))
-        kept.append(replace(moved[0], scenarios=tuple(moved[1:])))
+        kept.append(moved([scene, *pose_scenarios(scene)], owned, profile, starts))
         with profile.phase("objective"):
             return _motion(kept[0])
 
     motion = on_root(partition.world, run)
     return motion, kept[0] if kept else None
+
+
+def moved(
+    scenes: Sequence[Scene],
+    owned: Mapping[int, ShapeIntegrals],
+    profile: Profile,
+    starts: Sequence[Solution] = (),
+) -> Trajectory:
+    """Simulate a scene with its scenarios (root only).
+
+    Args:
+        scenes: it and them.
+        owned: bodies of the arms with a design of their own.
+        profile: counts and seconds.
+        starts: solutions of a nearby design; scenarios begin with the scene's unless theirs is
+            known.
+    """
+    scene, *others = scenes
+    first = simulate(scene, chain_of(scene, owned), profile, starts[0] if starts else None)
+    found = []
+    for number, one in enumerate(others, 1):
+        start = starts[number] if number < len(starts) else first.solution
+        # The nominal machine's feed-forward is kept where the motion is the same.
+        held = first.feed_forward if one.motion == scene.motion else None
+        found.append(simulate(one, bodies_in(scene, one, owned), profile, start, held))
+    return replace(first, scenarios=tuple(found))
 
 
 def _motion(trajectory: Trajectory) -> Motion:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -88,8 +89,12 @@ class MotionResponse(Response):
         """
         return [("", self)]
 
+    def seen(self, trajectory: Trajectory) -> Trajectory:
+        """Return a motion at the instants of which some make it up; by default its own."""
+        return trajectory
+
     def load_cases(self, trajectory: Trajectory) -> LoadCases:
-        """Return the instants that make it up; by default all."""
+        """Return these of what is `seen`; by default all."""
         return all_instants(trajectory)
 
     @abstractmethod
@@ -130,7 +135,7 @@ class MotionResponse(Response):
     def derivatives(self, trajectory: Trajectory, cases: LoadCases) -> ByMotion:
         """Return the derivatives of `value` at held instants, see `followed`."""
         y = self.quantity(trajectory)[cases.indices]
-        return ByMotion(*self.followed(trajectory, cases, self.gradient(y, cases.weights)))
+        return self.followed(trajectory, cases, self.gradient(y, cases.weights))
 
     def cotangents(self, trajectory: Trajectory) -> Followed:
         """Return the exact derivatives by the shape integrals of every body, of one motion.
@@ -138,10 +143,11 @@ class MotionResponse(Response):
         Its own, with the coordinates held, and the trajectory's, whose coordinates follow. The
         choice of instants is held: where two of an interval are equally bad there is a kink.
         """
-        cases = self.load_cases(trajectory)
-        return followed_by(
-            trajectory, trajectory.t[cases.indices], self.derivatives(trajectory, cases)
-        )
+        seen = self.seen(trajectory)
+        cases = self.load_cases(seen)
+        by = self.derivatives(seen, cases)
+        found = trajectory.followed(seen.t[cases.indices], by.unknowns, by.motion)
+        return replace(found, bodies=list(map(add_integrals, found.bodies, by.bodies)))
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
@@ -160,7 +166,8 @@ class MotionResponse(Response):
 
     def of_motion(self, trajectory: Trajectory) -> float:
         """Return the value of one motion, at the instants that it chooses (root only)."""
-        return self.value_at(trajectory, self.load_cases(trajectory))
+        seen = self.seen(trajectory)
+        return self.value_at(seen, self.load_cases(seen))
 
     def combine(self, scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
         """Return the value of all scenarios from their own, and its derivatives by them."""
@@ -170,17 +177,17 @@ class MotionResponse(Response):
 
     def of_trajectory(self, trajectory: Trajectory) -> tuple[float, float]:
         """Return true and smooth value of a motion, or of its scenarios together (root only)."""
-        scenarios = trajectory.scenarios
-        if not scenarios:
-            return self.extreme(trajectory), self.of_motion(trajectory)
-        smooth = self.combine(trajectory.scene, [self.of_motion(one) for one in scenarios])[0]
-        true = [self.extreme(one) for one in scenarios]
+        scene, motions = trajectory.scene, motions_of(trajectory)
+        smooth = self.combine(scene, [self.of_motion(one) for one in motions])[0]
+        true = [self.extreme(one) for one in motions]
+        if not self.limited and scene.objective.scenarios == "sum":
+            return combined(scene, true)[0], smooth
+        lower = self.turned
         if self.limited:
-            return min(true) if self.declared.lower else max(true), smooth
-        if trajectory.scene.objective.scenarios == "sum":
-            return combined(trajectory.scene, true)[0], smooth
-        weighted = [s.weight * f for s, f in zip(trajectory.scene.scenarios, true, strict=True)]
-        return min(weighted) if self.turned else max(weighted), smooth
+            lower = self.declared.lower
+        else:
+            true = [s.weight * f for s, f in zip(scene.scenarios, true, strict=False)] or true
+        return min(true) if lower else max(true), smooth
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return the values of the analysis's motion (collective)."""
@@ -214,10 +221,8 @@ class MotionResponse(Response):
 
     def _weights_of_scenarios(self, trajectory: Trajectory) -> list[float]:
         """Return the derivatives of the value by those of `motions_of`."""
-        others = trajectory.scenarios
-        if not others:
-            return [1.0]
-        return self.combine(trajectory.scene, [self.of_motion(one) for one in others])[1]
+        values = [self.of_motion(one) for one in motions_of(trajectory)]
+        return self.combine(trajectory.scene, values)[1]
 
     def _frozen_moments(self, trajectory: Trajectory) -> dict[int, np.ndarray]:
         """Return `load_case_moments` of every design, of all scenarios together."""
@@ -280,13 +285,6 @@ def over_motions(
         further = by_owner(scene, nominal.gradient(np.sum(by_coefficients, axis=0)))
         total = {k: by + further[k] for k, by in total.items()}
     return total
-
-
-def followed_by(trajectory: Trajectory, t: np.ndarray, by: ByMotion) -> Followed:
-    """Return how a function of a motion at instants t (n,), s, follows the bodies."""
-    found = trajectory.followed(t, by.unknowns, by.motion)
-    bodies = [add_integrals(a, own) for a, own in zip(found.bodies, by.bodies, strict=True)]
-    return replace(found, bodies=bodies)
 
 
 class ComplianceResponse(MotionResponse):
@@ -436,7 +434,10 @@ class DriveResponse(MotionResponse):
 
     Attributes:
         drives: numbers of those of the scene's drives that count; None: all.
+        weighs_limits: whether a limit, too, is of the weighted forces.
     """
+
+    weighs_limits: ClassVar[bool] = True
 
     def __init__(
         self, options: Objective, limited: bool = False, drives: tuple[int, ...] | None = None
@@ -447,13 +448,16 @@ class DriveResponse(MotionResponse):
 
     def quantity(self, trajectory: Trajectory) -> np.ndarray:
         """Return the forces of the drives that count, N and N m, times their weights."""
-        scene = trajectory.scene
-        return trajectory.joint_forces[:, self._columns(scene)] * self._weights(scene)
+        columns, weights = self._counted(trajectory.scene)
+        return trajectory.joint_forces[:, columns] * weights
 
     def followed(self, trajectory: Trajectory, cases: LoadCases, by_y: np.ndarray) -> ByMotion:
         """Return the derivatives through coordinates, rates and accelerations, and by bodies."""
-        by, scene = np.zeros_like(trajectory.joint_forces), trajectory.scene
-        by[np.ix_(cases.indices, self._columns(scene))] = by_y * self._weights(scene)
+        by, (columns, weights) = (
+            np.zeros_like(trajectory.joint_forces),
+            self._counted(trajectory.scene),
+        )
+        by[np.ix_(cases.indices, columns)] = by_y * weights
         by_rates, by_motion, bodies = trajectory.drive_forces.gradient(by)
         own = [integrals_of(one) for one in bodies]
         return ByMotion(by_rates[:, cases.indices], own, by_motion[:, cases.indices])
@@ -462,17 +466,16 @@ class DriveResponse(MotionResponse):
         """Return the numbers of the drives that count."""
         return tuple(range(len(scene.driven))) if self.drives is None else self.drives
 
-    def _columns(self, scene: Scene) -> np.ndarray:
-        """Return their columns among all rigid coordinates."""
-        every = np.arange(len(scene.rigid_units))[scene.driven_columns]
-        return every[list(self.counted(scene))]
+    def _counted(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        """Return their columns among all rigid coordinates, and weights, 1/N and 1/(N m).
 
-    def _weights(self, scene: Scene) -> np.ndarray:
-        """Return their weights, 1/N and 1/(N m): 1 of each by default."""
-        given = self.options.effort_weights
-        if given is None:
-            return np.ones(len(self.counted(scene)))
-        return np.array(given)[list(self.counted(scene))]
+        These are 1 by default.
+        """
+        drives, given = list(self.counted(scene)), self.options.effort_weights
+        columns = np.arange(len(scene.rigid_units))[scene.driven_columns][drives]
+        if given is None or (self.limited and not self.weighs_limits):
+            return columns, np.ones(len(drives))
+        return columns, np.array(given)[drives]
 
 
 @response("effort")
@@ -501,6 +504,8 @@ class PeakForce(DriveResponse):
     What drives must be able to give. As objective the sum over the drives, each times its weight of
     `objective.effort_weights`.
     """
+
+    weighs_limits = False
 
     def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of those drives that have a limit, and these limits."""
@@ -533,7 +538,3 @@ class PeakForce(DriveResponse):
         sizes = np.abs(y[:, 0])
         _, by = p_norm(sizes, self.options.exponent, weights / weights.sum())
         return np.sign(y) * by[:, None]
-
-    def _weights(self, scene: Scene) -> np.ndarray:
-        """Return the weights of an objective; a limit is of the forces themselves."""
-        return np.ones(len(self.counted(scene))) if self.limited else super()._weights(scene)

@@ -13,23 +13,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
-from dolfinopt.dynamics.simulation import simulate
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
-from dolfinopt.responses.evaluation import decide_stiffening
+from dolfinopt.responses.evaluation import decide_stiffening, moved
 from dolfinopt.responses.measured import (
     RICHER_COORDINATES,
     RICHER_RATIO,
     TIME_ERROR_SHARE,
     TRIED_COORDINATES_LIMIT,
 )
-from dolfinopt.responses.reductions import RICHER_METHOD, Reductions
-from dolfinopt.responses.response import bodies_in, factors
+from dolfinopt.responses.reductions import RICHER_METHOD, Reductions, fewest
+from dolfinopt.responses.response import factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
@@ -85,20 +83,17 @@ def choose_coordinates(
     goal = scene.reduction.tolerance / reserve
     most = min(max(TRIED_COORDINATES_LIMIT, least), comparison.reductions.limit)
     tried: dict[int, float] = {}
-    low, high = least - 1, least
-    while not (error := comparison.error(high)) <= goal:  # not a number included
-        tried[high] = error
-        if high >= most:
-            raise _none_found(scene, tried, goal)
-        low, high = high, min(high + max(1, high - least), most)
-    tried[high] = error
-    while high - low > 1:
-        middle = (low + high) // 2
-        tried[middle] = comparison.error(middle)
-        low, high = (low, middle) if tried[middle] <= goal else (middle, high)
+
+    def holds(count: int) -> bool:
+        tried[count] = comparison.error(count)
+        return tried[count] <= goal  # not a number does not
+
+    found = fewest(least, most, holds)
+    if found is None:
+        raise _none_found(scene, tried, goal)
     for arm in arms.values():
-        arm.set_order(high)
-    return OrderSelection(high, tried[high], tuple(sorted(tried.items())))
+        arm.set_order(found)
+    return OrderSelection(found, tried[found], tuple(sorted(tried.items())))
 
 
 def estimated_error(
@@ -181,13 +176,11 @@ class _Comparison:
 
     def _moved(self, bases: Mapping[int, Basis]) -> list[Trajectory]:
         """Return the root's motions of the scene and its scenarios (collective)."""
-        owned = self.reductions.bodies(bases)
-        (scene, *others), kept = self.scenes, list[Trajectory]()
+        owned, kept = self.reductions.bodies(bases), list[Trajectory]()
 
         def move() -> None:
-            kept.append(simulate(scene, chain_of(scene, owned), self.profile))
-            for one in others:
-                kept.append(simulate(one, bodies_in(scene, one, owned), self.profile))
+            first = moved(self.scenes, owned, self.profile)
+            kept.extend([first, *first.scenarios])
 
         on_root(self.partition.world, move)
         return kept
@@ -197,8 +190,8 @@ def _timed(scene: Scene) -> Scene:
     """Return the scene simulated so well that time steps do not matter to the comparison."""
     tolerance = min(scene.simulation.tolerance, TIME_ERROR_SHARE * scene.reduction.tolerance)
     update = {"tolerance": tolerance}
-    simulation = scene.simulation.model_copy(update=update)
-    return scene.model_copy(update={"simulation": simulation})
+    simulation = scene.simulation.unchecked_copy(update)
+    return scene.unchecked_copy({"simulation": simulation})
 
 
 def _distance(

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 Pair = tuple[np.ndarray, np.ndarray]  # l and r, each (n_nodes, d, k)
 Interfaces = Callable[[], tuple[np.ndarray, np.ndarray]]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,44 +76,6 @@ class Products:
     stress: StressProduct | None = None
     prestress: PrestressGradient | None = None
 
-    def __add__(self, other: Products) -> Products:
-        """Return those of the sum of two functions."""
-        return Products(
-            stiffness=self.stiffness + other.stiffness,
-            mass=self.mass + other.mass,
-            geometric=_only(self.geometric, other.geometric),
-            places=_sum(self.places, other.places),
-            interfaces=_both(self.interfaces, other.interfaces),
-            densities=_sum(self.densities, other.densities),
-            volumes=_sum(self.volumes, other.volumes),
-            stress=_only(self.stress, other.stress),
-            prestress=_only(self.prestress, other.prestress),
-        )
-
-
-def _sum(one: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
-    if one is None or other is None:
-        return other if one is None else one
-    return np.asarray(one + other)
-
-
-def _only(one: T | None, other: T | None) -> T | None:
-    """Return what one of the two has; both never have it."""
-    assert one is None or other is None
-    return other if one is None else one
-
-
-def _both(one: Interfaces | None, other: Interfaces | None) -> Interfaces | None:
-    """Return what `Products.interfaces` does of both."""
-    if one is None or other is None:
-        return other if one is None else one
-
-    def summed() -> tuple[np.ndarray, np.ndarray]:
-        (rigid, levers), (more, further) = one(), other()
-        return rigid + more, levers + further
-
-    return summed
-
 
 # From products to a gradient by variables of the design: by its cells, or by its nodes.
 By = Callable[["DesignState", Products], np.ndarray]
@@ -136,8 +97,8 @@ def by_densities(state: DesignState, products: Products) -> np.ndarray:
     elastic, pairs = state.elastic, products.stiffness
     energies, masses = np.zeros((2, len(state.x_phys)))
     if products.geometric is not None:
-        (left, V), *pairs = pairs
-        energies += products.geometric.by_young_beside(left, V)
+        (left, _), *pairs = pairs
+        energies += products.geometric.by_young(left)
     for left, right in pairs:
         energies += elastic.cell_stiffness_products(left, right)
     for left, right in products.mass:

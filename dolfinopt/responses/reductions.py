@@ -5,7 +5,7 @@ Craig-Bampton bases of fewer coordinates are the leading part of one of more: it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from sys import maxsize
 from typing import TYPE_CHECKING
 
@@ -89,3 +89,19 @@ def _leading(basis: Basis, count: int) -> Basis:
         basis.outboard[:, part],
         basis.start[:, : count - len(basis.outboard)],
     )
+
+
+def fewest(first: int, most: int, holds: Callable[[int], bool]) -> int | None:
+    """Return the fewest coordinates from `first` to `most` that hold, None if none do.
+
+    In growing steps upwards, then by bisection.
+    """
+    low, high = first - 1, first
+    while not holds(high):
+        if high >= most:
+            return None
+        low, high = high, min(high + max(1, high - first), most)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high

@@ -369,15 +369,10 @@ def worst_of(
     Kreisselmeier and Steinhauser's function of the logarithms.
     Source: Kreisselmeier & Steinhauser (1979), doi:10.1016/S1474-6670(17)65584-8.
     """
-    if len(values) == 1 or max(values) == 0.0:
-        return max(values), [1.0] * len(values)
-    if least and min(values) == 0.0:
-        return 0.0, [0.0] * len(values)
-    f = 1.0 / np.array(values) if least else np.array(values)
-    worst, by_values = p_norm(f, exponent)
-    if least:  # of 1 / worst by 1 / f
-        worst, by_values = 1.0 / worst, by_values * (f / worst) ** 2
-    return worst, [float(by) for by in by_values]
+    if len(values) == 1:
+        return values[0], [1.0]
+    worst, by_values = p_norm(np.array(values), -exponent if least else exponent)
+    return worst, by_values.tolist()
 
 
 def combined(
@@ -388,7 +383,7 @@ def combined(
     "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`; or with `least`,
     of what is maximised, the smooth smallest.
     """
-    weights = [one.weight for one in scene.scenarios]
+    weights = [one.weight for one in scene.scenarios] or [1.0]
     if scene.objective.scenarios == "sum":
         return sum(w * f for w, f in zip(weights, values, strict=True)), weights
     scaled_values = [w * f for w, f in zip(weights, values, strict=True)]
@@ -405,15 +400,16 @@ def p_norm(
     """Return (sum_k w_k f_k^p)^(1/p) of f >= 0 and its derivative by f (n,).
 
     With w = 1 at least the largest value and at most n^(1/p) times it; with weights that add up to
-    1 a p-mean, at most the largest. Powers are those of f over its largest, so that they neither
-    over- nor underflow. All zero: 0 and no derivative.
+    1 a p-mean, at most the largest; with p < 0 the smallest, made smooth. Powers are those of f
+    over its largest, or smallest, so that they do not overflow. Where that is zero: 0 and no
+    derivative.
 
     Args:
         values: (n,) f.
-        exponent: p >= 1.
+        exponent: p, |p| >= 1.
         weights: (n,) w >= 0; None: 1.
     """
-    largest = values.max()
+    largest = values.max() if exponent > 0.0 else values.min()
     if largest == 0.0:
         return 0.0, np.zeros_like(values)
     relative = values / largest

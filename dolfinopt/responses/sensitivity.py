@@ -20,7 +20,6 @@ from dolfinopt.fem.geometric_stiffness import GeometricGradient
 from dolfinopt.fem.stress import DisplacementGradient
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, by_modal_loads, mass_partners
 from dolfinopt.reduction import METHODS, AdjointFields, by_frame_fields, frame_fields
-from dolfinopt.responses.measured import LOAD_CASES_RANK_SHARE
 from dolfinopt.responses.products import By, Pair, Products, by_design
 
 
@@ -28,7 +27,7 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
     """Return the derivative by the design of one arm with the equivalent static loads frozen.
 
     dJ/dE_e = -sum_j lambda_j' V_e' k_e V_e q_j = -trace(V_e' k_e V_e A'): as many energy fields as
-    coordinates at most, however many load cases. For the compliance lambda_j = q_j.
+    coordinates, however many load cases. For the compliance lambda_j = q_j.
     Source: Seifried, Moghadasi & Held (2015), eq. (11), doi:10.1016/j.piutam.2015.01.018.
 
     Args:
@@ -40,14 +39,8 @@ def esl_gradient(state: DesignState, A: np.ndarray, by: By = by_design) -> np.nd
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        # By the energy of every coordinate: what is small does not depend on their units.
-        unit = 1.0 / np.sqrt(np.diag(state.basis.stiffness))
-        left, values, right = np.linalg.svd(A / np.outer(unit, unit))
-        keep = values > LOAD_CASES_RANK_SHARE * values[0]
-        V = state.basis.V * unit
-        pair = combine(V, left[:, keep] * -values[keep]), combine(V, right[keep].T)
-        interfaces = partial(pairs_at_interfaces, state.elastic, (pair,))
-        return by(state, Products(stiffness=(pair,), interfaces=interfaces))
+        V = state.basis.V
+        return by(state, of_pairs(state.elastic, ((combine(V, -A), V),)))
 
 
 def exact_gradient(
@@ -55,7 +48,6 @@ def exact_gradient(
     cotangents: ShapeIntegrals,
     displaced: DisplacementGradient | None = None,
     by: By = by_design,
-    beside: Products | None = None,
 ) -> np.ndarray:
     """Return the derivative by the design of one arm of a function of its floating body.
 
@@ -68,14 +60,12 @@ def exact_gradient(
         cotangents: the function's derivatives by the body's integrals; those by D join K's.
         displaced: its derivatives by displacements, where it depends on these, too.
         by: what it is the derivative by.
-        beside: what the function depends on beside body and displacements, these held.
 
     Returns:
         (n_cells,) over this rank's cells, or what `by` returns.
     """
     with state.elastic.profile.phase("gradient"):
-        found = _body_products(state, cotangents, displaced)
-        return by(state, found if beside is None else found + beside)
+        return by(state, _body_products(state, cotangents, displaced))
 
 
 def _body_products(
@@ -96,13 +86,9 @@ def _body_products(
         by_V += displaced.by_modes
     geometric = None
     if cotangents.is_stiffened:
-        static = state.scene.reduction.method == "craig-bampton"
         by_K0 = np.concatenate([cotangents.K0, by_modes, cotangents.K0_outboard])
-        geometric = state.stiffening_loads.gradient(V, by_K0, static=static)
+        geometric = state.stiffening_loads.gradient(V, by_K0)
         by_V += geometric.by_modes
-        if static:  # K's first block is S; the constraint modes' interior is in equilibrium
-            b = len(geometric.by_stiffness)
-            by_K[:b, :b] += geometric.by_stiffness
     interior, outboard = elastic.restrict(by_V)
     method = METHODS[state.scene.reduction.method]
     assert method.adjoint is not None  # the scene refuses the others
@@ -142,9 +128,6 @@ def _at_interfaces(
     T, V = elastic.substructure.T, basis.V
     by_V = by_V - elastic.stiffness_times(fields.stiffness) + elastic.mass_times(fields.mass)
     if geometric is not None:
-        by_S = geometric.by_stiffness + geometric.by_stiffness.T  # see `_body_products`
-        b = len(by_S)
-        by_V[:, :, :b] += elastic.stiffness_times(combine(V[:, :, :b], by_S))
         by_V -= geometric.face.by_modes  # the rotations are coordinates, whatever T
     rigid = by_V @ basis.outboard.T
     rigid -= elastic.stiffness_times(V) @ T.coordinates(fields.stiffness).T
@@ -183,6 +166,17 @@ def pairs_at_interfaces(
     return rigid, np.zeros_like(elastic.points)
 
 
+def of_pairs(
+    elastic: ElasticArm,
+    stiffness: tuple[Pair, ...],
+    mass: tuple[Pair, ...] = (),
+    direct: tuple[Pair, ...] = (),
+) -> Products:
+    """Return what pairs of fields that T makes carry, see `pairs_at_interfaces`."""
+    interfaces = partial(pairs_at_interfaces, elastic, stiffness, mass, direct)
+    return Products(stiffness, mass, interfaces=interfaces)
+
+
 def tip_gradient(
     state: DesignState, left: np.ndarray, right: np.ndarray, by: By = by_design
 ) -> np.ndarray:
@@ -199,9 +193,7 @@ def tip_gradient(
     fields = state.elastic.static_fields(np.hstack([right, left]))
     with state.elastic.profile.phase("gradient"):
         of_left, of_right = (combine(fields.field, fields.amplitudes(f)) for f in (-left, right))
-        pairs = ((of_left, of_right),)
-        interfaces = partial(pairs_at_interfaces, state.elastic, pairs)
-        return by(state, Products(stiffness=pairs, interfaces=interfaces))
+        return by(state, of_pairs(state.elastic, ((of_left, of_right),)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,8 +220,7 @@ def period_gradient(
     with state.elastic.profile.phase("gradient"):
         weighted = modes.field * by_values
         pairs = ((weighted, modes.field),), ((weighted * -modes.values, modes.field),)
-        interfaces = partial(pairs_at_interfaces, state.elastic, *pairs)
-        own = by(state, Products(*pairs, interfaces=interfaces))
+        own = by(state, of_pairs(state.elastic, *pairs))
         carried = -(modes.outboard * (by_values * modes.values)) @ modes.outboard.T
         return PeriodGradient(own, carried)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 from mpi4py import MPI
@@ -17,14 +17,13 @@ from dolfinopt.fem.stress import DisplacementGradient, LoadFields
 from dolfinopt.fem.tensors import element_centre
 from dolfinopt.multibody.dimension import DIMENSIONS
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
-from dolfinopt.parallel import Partition, gather_arms, on_root, sum_over_arms, together
+from dolfinopt.parallel import gather_arms, on_root, sum_over_arms, together
 from dolfinopt.responses.measured import (
     BLOCK_SIZE,
     BOUND_BATCH_INSTANTS,
     COARSE_INSTANTS,
     MAP_ERROR_SHARE,
     NEGLIGIBLE_POWER_SHARE,
-    P_MEAN_STRIDE,
 )
 from dolfinopt.responses.motion import motions_of, over_motions
 from dolfinopt.responses.products import Products, StressProduct
@@ -36,7 +35,7 @@ from dolfinopt.responses.response import (
     factors,
     response,
 )
-from dolfinopt.responses.sensitivity import exact_gradient, pairs_at_interfaces
+from dolfinopt.responses.sensitivity import exact_gradient, of_pairs
 from dolfinopt.scene.load import Scene
 
 # -- von Mises stress at the element centres of one design, relaxed for intermediate density -----
@@ -61,10 +60,6 @@ class PointStress(ABC):
     fields: LoadFields
     A: np.ndarray
     weights: np.ndarray
-
-    def coefficients(self, loads: ArmLoads) -> np.ndarray:
-        """Return those (n, m) of `LoadFields.columns`."""
-        return np.asarray(loads.coefficients @ self.fields.to_columns)
 
     def power_sum(self, a: np.ndarray, unit: float, exponent: float) -> float:
         """Return sum_n sum_e weight_e (s_en / unit)^p over this rank's cells; a is (n, m)."""
@@ -191,11 +186,20 @@ class ArmLoads:
         place: of the arm in the chain.
         motion: number among `motions_of`.
         coefficients: (n, q + 7 + 2 q) of modes and loads, see `LoadFields.split`.
+        stiffer: Young's modulus in the motion's scene over the nominal one.
+        instants: (n,) of the motion.
     """
 
     place: int
     motion: int
     coefficients: np.ndarray
+    stiffer: float
+    instants: np.ndarray
+
+    def at(self, chosen: np.ndarray) -> ArmLoads:
+        """Return those at some of the instants."""
+        own = self.coefficients[chosen], self.instants[chosen]
+        return replace(self, coefficients=own[0], instants=own[1])
 
 
 def every_instant(loads: Sequence[ArmLoads]) -> np.ndarray:
@@ -209,7 +213,9 @@ def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[Arm
     for number, motion in enumerate(motions):
         for place, owner in enumerate(scene.owners):
             if owner is not None:
-                found[owner].append(ArmLoads(place, number, _coefficients(scene, motion, place)))
+                stiffer = motion.scene.material_of(owner).modulus / scene.material_of(owner).modulus
+                a = _coefficients(scene, motion, place)
+                found[owner].append(ArmLoads(place, number, a, stiffer, np.arange(len(a))))
     return found
 
 
@@ -233,27 +239,25 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
     instants = np.unique(np.concatenate([one.instants for one in by_arms]))
     by_q = np.zeros((len(instants), mechanism.num_coordinates))
     by_c = [np.zeros((len(instants), load_counts(body).total)) for body in mechanism.bodies]
-    own: list[dict[str, np.ndarray]] = [{} for _ in mechanism.bodies]
+    own: list[list[dict[str, np.ndarray]]] = [[] for _ in mechanism.bodies]
     for one in by_arms:
-        k, rows, body = (
-            one.place,
-            np.searchsorted(instants, one.instants),
-            mechanism.bodies[one.place],
-        )
+        k, rows = one.place, np.searchsorted(instants, one.instants)
+        body = mechanism.bodies[k]
         by = one.by * _scale(scene, motion.scene, k, body)
         by_modes, by_loads = np.split(by, [body.num_modes], axis=1)
         c, P = motion.load_coefficients[k][one.instants], load_matrix(body)
         z = -np.linalg.solve(body.K, by_modes.T)
-        by_q[rows, mechanism.slices[k]] = by_modes
-        by_c[k][rows] = by_loads + z.T @ P
-        own[k] = _by_integrals(body, z @ c) | {"K": -z @ np.linalg.solve(body.K, P @ c.T).T}
+        by_q[rows, mechanism.slices[k]] += by_modes
+        by_c[k][rows] += by_loads + z.T @ P
+        own[k].append(_by_integrals(body, z @ c))
+        own[k].append({"K": -z @ np.linalg.solve(body.K, P @ c.T).T})
     y, yd, ydd = (x[instants] for x in motion.unknowns)
     t = motion.t[instants]
     by_rates, by_motion, by_bodies = load_gradient(motion.problem, t, (y, yd, ydd), by_c)
     by_rates[0] += motion.by_unknowns(by_q)
     followed = motion.followed(t, by_rates, by_motion)
     parts = zip(followed.bodies, by_bodies, own, strict=True)
-    return replace(followed, bodies=[add_integrals(a + b, more) for a, b, more in parts])
+    return replace(followed, bodies=[reduce(add_integrals, more, a + b) for a, b, more in parts])
 
 
 def _coefficients(scene: Scene, motion: Trajectory, place: int) -> np.ndarray:
@@ -317,15 +321,14 @@ class Stress(Response):
             for k, one in found.items():
                 state = analysis.designs[k]
                 by_u, beside = _by_displacements(one, state)
-                if not len(one.a):
-                    parts[k] = ArmGradient([], None, replace(beside, stress=None))
+                if not len(every_instant(one.loads)):
+                    parts[k] = ArmGradient([], None, (replace(beside, stress=None),))
                 elif self.options.gradient == "esl":
-                    beside += _frozen_loads(one, state, by_u)
-                    parts[k] = ArmGradient([], None, beside)
+                    parts[k] = ArmGradient([], None, (beside, _frozen_loads(one, state, by_u)))
                 else:
                     with analysis.profile.phase("gradient"):
-                        displaced = one.points.fields.gradient(one.a, by_u)
-                    parts[k] = ArmGradient(one.by_loads(displaced.by_a), displaced, beside)
+                        displaced = one.points.fields.gradient(every_instant(one.loads), by_u)
+                    parts[k] = ArmGradient(one.by_loads(displaced.by_a), displaced, (beside,))
         return [through_motions(analysis, parts)]
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> PointStress:
@@ -352,85 +355,33 @@ class Stress(Response):
 
         by_owner: dict[int, list[ArmLoads]] = on_root(world, loads)
         points: dict[int, PointStress] = {}
-        chosen: dict[int, list[ChosenInstants]] = {}
-        largest = largest_summed = 0.0
+        screened: dict[int, list[Screened]] = {}
         with together(world):
             for k, state in analysis.designs.items():
-                points[k] = self.points_of(
-                    k, state, state.load_fields_of(every_instant(by_owner[k]))
-                )
+                fields = state.load_fields
+                points[k] = own = self.points_of(k, state, fields)
                 with analysis.profile.phase("stress"):
-                    chosen[k], own = _screened(partition, points[k], by_owner[k])
-                largest = max(largest, own)
-                largest_summed = max(largest_summed, *(one.largest for one in chosen[k]))
-        largest = world.allreduce(largest, MPI.MAX)
-        # Of the instants that are summed: the largest of all samples may lie between them.
-        cut = NEGLIGIBLE_POWER_SHARE ** (1.0 / p) * world.allreduce(largest_summed, MPI.MAX)
-        sums = {}
+                    screened[k] = [
+                        screen(partition.comm, own.A, one.coefficients) for one in by_owner[k]
+                    ]
+        each = [one for own in screened.values() for one in own]
+        largest = world.allreduce(max((one.largest for one in each), default=0.0), MPI.MAX)
+        # The largest of all may lie between the instants that are summed.
+        summed = world.allreduce(max((one.summed.max() for one in each), default=0.0), MPI.MAX)
+        cut, sums = NEGLIGIBLE_POWER_SHARE ** (1.0 / p) * summed, {}
+        counts = {k: sum(len(one.summed) for one in own) for k, own in screened.items()}
         with together(world), analysis.profile.phase("stress"):
-            for k, each in chosen.items():
-                chosen[k] = [one.above(cut) for one in each]
-                sums[k] = _power_sum(points[k], chosen[k], largest, p)
+            for k, one in points.items():
+                pairs = zip(by_owner[k], screened[k], strict=True)
+                by_owner[k] = [
+                    loads.at(found.counted[found.summed >= cut]) for loads, found in pairs
+                ]
+                a = every_instant(by_owner[k])
+                total = one.power_sum(a, largest, p) if largest else 0.0
+                sums[k] = np.array([total, one.weights.sum() * counts[k]])
         total, weight = sum_over_arms(partition, sums)
         found = PowerSum(largest, float(total), float(weight), p)
-        return {k: StressedDesign(one, chosen[k], found) for k, one in points.items()}
-
-
-def _screened(
-    partition: Partition, points: PointStress, loads: Sequence[ArmLoads]
-) -> tuple[list[ChosenInstants], float]:
-    """Return every motion's evenly spaced instants, and the largest stress of all (collective)."""
-    found, largest = [], 0.0
-    for one in loads:
-        coarse = every(len(one.coefficients))
-        screened = screen(partition.comm, points.A, points.coefficients(one), coarse)
-        largest = max(largest, screened.largest)
-        instants, values = coarse[::P_MEAN_STRIDE], screened.values[::P_MEAN_STRIDE]
-        found.append(ChosenInstants(one, instants, values, len(instants)))
-    return found, largest
-
-
-def _power_sum(
-    points: PointStress, chosen: Sequence[ChosenInstants], unit: float, p: float
-) -> np.ndarray:
-    """Return sum weight (s / unit)^p of chosen instants, and sum weight of all; of this rank."""
-    count, total = sum(one.count for one in chosen), 0.0
-    if unit:
-        columns = np.concatenate([one.a for one in chosen]) @ points.fields.to_columns
-        total = points.power_sum(columns, unit, p)
-    return np.array([total, points.weights.sum() * count])
-
-
-@dataclass(frozen=True, eq=False)
-class ChosenInstants:
-    """Instants of one arm along one motion.
-
-    Attributes:
-        loads: of all instants.
-        instants: (k,) of them.
-        values: (k,) largest stress of the arm there, Pa.
-        count: of the instants among which they were chosen.
-    """
-
-    loads: ArmLoads
-    instants: np.ndarray
-    values: np.ndarray
-    count: int
-
-    @property
-    def a(self) -> np.ndarray:
-        """Coefficients (k, m) there."""
-        return self.loads.coefficients[self.instants]
-
-    @property
-    def largest(self) -> float:
-        """Largest stress, Pa."""
-        return float(self.values.max(initial=0.0))
-
-    def above(self, limit: float) -> ChosenInstants:
-        """Return those whose stress is not smaller."""
-        kept = self.values >= limit
-        return replace(self, instants=self.instants[kept], values=self.values[kept])
+        return {k: StressedDesign(one, by_owner[k], counts[k], found) for k, one in points.items()}
 
 
 @dataclass(frozen=True)
@@ -458,45 +409,45 @@ class PowerSum:
 
 @dataclass(frozen=True, eq=False)
 class StressedDesign:
-    """What is known of one design: stress at its points, instants that count, sums of all."""
+    """What is known of one design: stress at its points, and what is summed.
+
+    Attributes:
+        points: of the design.
+        loads: of the instants that count, of how many.
+        sums: of all designs.
+    """
 
     points: PointStress
-    chosen: Sequence[ChosenInstants]
+    loads: Sequence[ArmLoads]
+    count: int
     sums: PowerSum
 
-    @property
-    def a(self) -> np.ndarray:
-        """Coefficients (k, m) of the instants of all motions, see `LoadFields.split`."""
-        return np.concatenate([one.a for one in self.chosen])
-
     def by_loads(self, by_a: np.ndarray) -> list[ByLoads]:
-        """Return derivatives by `a` (k, m), dealt out to the motions."""
-        ends = np.cumsum([len(one.instants) for one in self.chosen])[:-1]
+        """Return derivatives by all coefficients (k, m), dealt out to the motions."""
+        ends = np.cumsum([len(one.instants) for one in self.loads])[:-1]
         return [
-            ByLoads(one.loads.motion, one.loads.place, one.instants, by)
-            for one, by in zip(self.chosen, np.split(by_a, ends), strict=True)
+            ByLoads(one.motion, one.place, one.instants, by)
+            for one, by in zip(self.loads, np.split(by_a, ends), strict=True)
             if len(by)
         ]
 
 
 def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.ndarray, Products]:
     """Differentiate by displacements of one arm, and by what else its stress is made of."""
-    points, sums, a = found.points, found.sums, found.a
+    points, sums, a = found.points, found.sums, every_instant(found.loads)
     by, by_logs = np.zeros((*points.A.shape[:2], len(a))), np.zeros(len(points.weights))
     by_weights = np.zeros_like(by_logs)
     with state.elastic.profile.phase("stress"):
         if sums.total:
             p, counts = sums.exponent, points.weights > 0.0
             factor = sums.total ** (1.0 / p - 1.0) * sums.weight ** (-1.0 / p)
-            columns = a @ points.fields.to_columns
-            by, by_logs = points.power_sum_gradient(columns, sums.largest, p)
+            by, by_logs = points.power_sum_gradient(a, sums.largest, p)
             by *= factor
             by_logs *= factor
             # Of total / weight, to the power 1 / p: a point's part in either is its weight
             # times a sum.
             np.divide(by_logs, points.weights, out=by_weights, where=counts)
-            instants = sum(one.count for one in found.chosen)
-            by_weights -= sums.smooth / sums.weight * instants
+            by_weights -= sums.smooth / sums.weight * found.count
             by_weights *= counts / p
         by_u, beside = points.through(state, a, by, by_logs, by_weights)
     return by_u, beside
@@ -507,10 +458,9 @@ def _frozen_loads(found: StressedDesign, state: DesignState, by_u: np.ndarray) -
     # With K u_n = f_n held, dJ = -sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n.
     arm = state.elastic
     with arm.profile.phase("gradient"):
-        u = found.points.fields.displacements(found.a)
+        u = found.points.fields.displacements(every_instant(found.loads))
         pairs = ((-arm.static_response(*arm.restrict(by_u)), u),)
-        interfaces = partial(pairs_at_interfaces, arm, pairs, direct=((by_u, u),))
-        return Products(stiffness=pairs, interfaces=interfaces)
+        return of_pairs(arm, pairs, direct=((by_u, u),))
 
 
 # -- gradients of functions of the loads of arms along motions -----------------------------------
@@ -540,12 +490,12 @@ class ArmGradient:
     Attributes:
         by_loads: of every arm that has the design, along every motion; none where no load counts.
         displaced: by displacements, whose coefficients these loads are; None where none counts.
-        beside: by the design itself.
+        beside: by the design itself, the sum of what these carry.
     """
 
     by_loads: Sequence[ByLoads]
     displaced: DisplacementGradient | None
-    beside: Products
+    beside: tuple[Products, ...]
 
 
 def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> CellGradient:
@@ -566,11 +516,10 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
     row = {}
     with together(partition.world):
         for k, one in mine.items():
+            by = [analysis.by(designs[k], each) for each in one.beside]
             if k in by_body:
-                by = by_body[k], one.displaced, analysis.by, one.beside
-                row[k] = exact_gradient(designs[k], *by)
-            else:
-                row[k] = analysis.by(designs[k], one.beside)
+                by.append(exact_gradient(designs[k], by_body[k], one.displaced, analysis.by))
+            row[k] = np.sum(by, axis=0)
     return row
 
 
@@ -587,49 +536,41 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
 # are further instants looked at; so none that is larger is missed, whatever the motion.
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Screened:
-    """What was found at the instants that were looked at.
+    """The largest |A_e a_n| of all, its instant n, and point e on this rank, -1 on others.
 
-    Attributes:
-        largest: max |A_e a_n| over all points and all instants.
-        instant: n where it is.
-        point: e where it is, on this rank; -1 where another rank has it.
-        values: (len(coarse),) largest length over all points of all ranks at each of them.
-        looked_at: number of instants that were looked at.
+    And the largest at every second one of the evenly spaced instants, which may be summed.
     """
 
     largest: float
     instant: int
     point: int
-    values: np.ndarray
-    looked_at: int
+    counted: np.ndarray
+    summed: np.ndarray
 
 
-def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray, coarse: np.ndarray) -> Screened:
+def screen(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> Screened:
     """Find the largest |A_e a_n| (collective on `comm`).
 
     Args:
         comm: ranks that share the points.
         A: (3, n_points, m) of this rank's points, in space (5, ...); there may be none.
         a: (n, m) the same on all ranks.
-        coarse: ascending instants to begin with, the first and the last one among them.
     """
+    coarse, n = every(len(a)), np.arange(len(a))
     values = np.full(len(a), -np.inf)
     values[coarse] = _largest_by_instant(comm, A, a[coarse])
-    straight = np.interp(np.arange(len(a)), coarse, values[coarse])
-    bounds = straight + _off_straight(comm, A, a, coarse)
-    left = np.setdiff1d(np.arange(len(a)), coarse)
+    bounds = np.interp(n, coarse, values[coarse]) + _off_straight(comm, A, a, coarse)
+    left = np.setdiff1d(n, coarse)
     left = left[np.argsort(-bounds[left], kind="stable")]
-    done = 0
-    while done < len(left) and bounds[left[done]] > values.max():
-        batch = left[done : done + BOUND_BATCH_INSTANTS]
+    for batch in np.split(left, range(BOUND_BATCH_INSTANTS, len(left), BOUND_BATCH_INSTANTS)):
+        if not (bounds[batch] > values.max()).any():
+            break
         values[batch] = _largest_by_instant(comm, A, a[batch])
-        done += len(batch)
     instant = int(values.argmax())
-    point = _point_of(comm, A, a[instant])
-    found = float(values[instant])
-    return Screened(found, instant, point, values[coarse], len(coarse) + done)
+    point, counted = _point_of(comm, A, a[instant]), coarse[::2]
+    return Screened(float(values[instant]), instant, point, counted, values[counted])
 
 
 def maxima(comm: MPI.Comm, A: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,19 +13,15 @@ from dolfinopt.fem.tensors import stress_points
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
 from dolfinopt.responses.stress import (
     ArmLoads,
-    CellStress,
     Screened,
     arm_loads,
     cell_stress,
-    every,
-    every_instant,
     maxima,
     screen,
 )
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
@@ -104,58 +100,54 @@ def stress_report(
     if not by_owner:
         return {}
     counts = replace(profile.counts)
-    peaks: dict[int, list[tuple[int, Peak, Peak]]] = {}
+    peaks: dict[int, list[tuple[Peak, Peak]]] = {}
     cells: dict[int, np.ndarray] = {}
     with profile.phase("stress"), together(partition.world):
         for k, arm in arms.items():
-            if not arm.solid.law.has_strength:
-                continue
-            state = arm.current
-            fields = state.load_fields_of(every_instant(by_owner[k]))
-            stress = cell_stress(state, fields, arm.scene.objective.stress_margin)
-            found = [_arm_stress(partition, state, stress, one, t) for one in by_owner[k]]
-            peaks[k] = [
-                (one.place, centre, points)
-                for one, (centre, points, _) in zip(by_owner[k], found, strict=True)
-            ]
-            cells[k] = np.stack([each for _, _, each in found], axis=1)
+            if arm.solid.law.has_strength:
+                peaks[k], cells[k] = _of_design(partition, arm, by_owner[k], t)
     profile.counts = counts
     every_peak, every_cell = gather_arms(partition, peaks), gather_cells(partition, cells)
     return {
-        place: ArmStress(centre, points, *every_cell[k][:, number].T)
-        for k, each in every_peak.items()
-        for number, (place, centre, points) in enumerate(each)
+        one.place: ArmStress(*every_peak[k][n], *every_cell[k][:, n].T)
+        for k in every_peak
+        for n, one in enumerate(by_owner[k])
     }
 
 
-def _arm_stress(
-    partition: Partition, state: DesignState, cells: CellStress, loads: ArmLoads, t: np.ndarray
-) -> tuple[Peak, Peak, np.ndarray]:
-    """Return one arm's peaks at centres and at all points; of cells largest value and instant.
+def _of_design(
+    partition: Partition, arm: Arm, every: Sequence[ArmLoads], t: np.ndarray
+) -> tuple[list[tuple[Peak, Peak]], np.ndarray]:
+    """Return the peaks of all arms of a design, and their cells' largest values and instants.
 
-    Collective on the arm's ranks.
+    Collective on the arm's ranks. Peaks are at centres and at all points; the cells are
+    (n_cells, arms, 2).
     """
-    comm, a, coarse = partition.comm, cells.coefficients(loads), every(len(t))
+    comm, state = partition.comm, arm.current
+    fields = state.load_fields
+    stress = cell_stress(state, fields, arm.scene.objective.stress_margin)
+    operators = state.elastic.operators
+    points = stress_points(operators.cell)
+    A = fields.stress(stress_operator(operators, points))
+    solid = state.solid.modulus * stress.root * (stress.weights > 0.0)
+    A *= np.repeat(solid, len(points))[:, None]
+    places = places_of(operators, points).reshape(-1, state.mesh.dim)
+    peaks, cells = [], []
 
     def peak(found: Screened, places: np.ndarray) -> Peak:
         known = comm.allgather(places[found.point] if found.point >= 0 else None)
         place = next(one for one in known if one is not None)
         return Peak(found.largest, tuple(map(float, place)), float(t[found.instant]))
 
-    by_cell, when = maxima(comm, cells.A, a)
-    largest = screen(comm, cells.A, a, coarse)
-    # The map is right to a thousandth: of nearly equal cells the largest is that of the peak.
-    by_cell = np.minimum(by_cell, np.nextafter(largest.largest, 0.0))
-    if largest.point >= 0:
-        by_cell[largest.point], when[largest.point] = largest.largest, largest.instant
-    centre = peak(largest, state.mesh.centroid)
-    operators = state.elastic.operators
-    points = stress_points(operators.cell)
-    A = cells.fields.stress(stress_operator(operators, points))
-    solid = state.solid.modulus * cells.root * (cells.weights > 0.0)
-    A *= np.repeat(solid, len(points))[:, None]
-    places = places_of(operators, points).reshape(-1, state.mesh.dim)
-    return centre, peak(screen(comm, A, a, coarse), places), np.column_stack([by_cell, t[when]])
+    for one in every:
+        a = one.coefficients
+        by_cell, when = maxima(comm, stress.A, a)
+        largest = screen(comm, stress.A, a)
+        if largest.point >= 0:  # the map is right to a thousandth
+            by_cell[largest.point], when[largest.point] = largest.largest, largest.instant
+        peaks.append((peak(largest, state.mesh.centroid), peak(screen(comm, A, a), places)))
+        cells.append(np.column_stack([by_cell, t[when]]))
+    return peaks, np.stack(cells, axis=1)
 
 
 def unjudged(scene: Scene) -> list[str]:

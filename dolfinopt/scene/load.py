@@ -1,6 +1,6 @@
 """From a TOML file, or plain data, and overrides to a scene.
 
-`load_scene` reads a file, `scene_from_dict` plain data; both return a `Scene` or raise one
+`read_scene` reads a file, `scene_from_dict` plain data; both return a `Scene` or raise one
 `InputError` of one line that names file, key, value and remedy. The keys themselves stand in
 `schema.py` and `tables/`.
 """
@@ -34,9 +34,9 @@ from dolfinopt.scene.messages import (
     model_at,
     unknown_key,
 )
-from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name
+from dolfinopt.scene.old_words import OLD_KEYS, read_old_words, rows, scaled
+from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name, file_in
 from dolfinopt.scene.tables.arms import (
-    GEAR_KEYS,
     MAX_ARMS,
     MAX_CELLS,
     MESH_KEYS,
@@ -46,7 +46,6 @@ from dolfinopt.scene.tables.arms import (
     SIZE_KEYS,
     SIZE_PARAMETER,
     SOLID_SHAPES,
-    SPRING_KEYS,
     WALL_KEYS,
     Arm,
 )
@@ -59,11 +58,12 @@ from dolfinopt.scene.tables.closures import (
     take_old_keys,
 )
 from dolfinopt.scene.tables.design import Law
+from dolfinopt.scene.tables.joints import DRIVE_KEYS, INBOARD, OF_BEARINGS, OUTBOARD
 from dolfinopt.scene.tables.machine import Force, Joint
 from dolfinopt.scene.tables.material import material_keys
 from dolfinopt.scene.tables.motion import Motion, Reduction
 from dolfinopt.scene.tables.objective import Objective, WorstBy
-from dolfinopt.scene.tables.responses import DECLARED, current_key, read_old_names
+from dolfinopt.scene.tables.responses import DECLARED
 
 __all__ = [
     "FILE_KEYS",
@@ -75,8 +75,8 @@ __all__ = [
     "Scene",
     "WorstBy",
     "describe_keys",
-    "load_scene",
     "pose_scenarios",
+    "read_scene",
     "resolve_file",
     "scene_from_dict",
 ]
@@ -96,7 +96,7 @@ NAMED: dict[str, type[Table]] = {
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
-def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
+def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
     """Read, complete and validate the scene file `path` (TOML, UTF-8).
 
     `overrides` are strings "key.path=value" as given to --set. The value is read as TOML, or else
@@ -108,7 +108,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         InputError: one line that names file, key, value and what is allowed.
     """
     source = os.fspath(path)
-    return _build(_read_toml(source), source, overrides, _default_name(source))
+    return _build(read_toml(source), source, overrides, _default_name(source))
 
 
 def scene_from_dict(
@@ -116,7 +116,7 @@ def scene_from_dict(
 ) -> Scene:
     """Complete and validate a scene given as nested dictionaries and lists, left unchanged.
 
-    `source` stands for the file in messages; `overrides` as in `load_scene`.
+    `source` stands for the file in messages; `overrides` as in `read_scene`.
 
     Raises:
         InputError: one line that names source, key, value and what is allowed.
@@ -144,15 +144,15 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     tree.setdefault("material", {})  # so that the message names the first key missing in it
     _name_material(tree)
     read_old_closure(tree, source)
+    told = read_old_words(tree, source)
     inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
     sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
-    told: list[str] = []
-    changes = [_override(tree, current_key(text, told), source) for text in overrides]
+    changes = [_override(tree, text, source) for text in overrides]
     for change in changes:
         sizes.difference_update(change.locs)
         inherited.difference_update(change.locs[:1])
         inherited.update(change.locs[1:])
-    told += read_old_names(tree)
+    told += read_old_words(tree, source, anew=True)
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
@@ -170,7 +170,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
         raise InputError(message) from None
     scene._source = source
     scene._derived = derived
-    scene._old_words = (*told, *[OLD_CLOSURE] * (data.get(OLD) is not None))
+    scene._old_words = (*dict.fromkeys(told), *[OLD_CLOSURE] * (data.get(OLD) is not None))
     pose_scenarios(scene)
     return scene
 
@@ -216,7 +216,7 @@ def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -
             continue
         for i, row in enumerate(node if isinstance(node, list) else [node]):
             value = row.get(key) if isinstance(row, dict) else None
-            if not isinstance(value, str):
+            if not isinstance(value, str) or not file_in(key, value):
                 continue
             loc = (table, i, key) if isinstance(node, list) else (table, key)
             where = blamed(source, changes, (loc,))
@@ -317,7 +317,7 @@ def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
     )
 
 
-def _read_toml(source: str) -> dict[str, Any]:
+def read_toml(source: str) -> dict[str, Any]:
     """Return the data of the TOML file `source`; raise InputError if there is none."""
     text = _read_text(source)
     try:
@@ -381,16 +381,34 @@ def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
     inherited: set[Loc] = set()
     if not isinstance(arms, list):
         return inherited
+    fixed = [one.get("child") for one in rows(tree, "joints") if one.get("type") == "fixed"]
     for i in range(1, len(arms)):
         before, arm = arms[i - 1], arms[i]
         if not (isinstance(before, dict) and isinstance(arm, dict)):
             continue
         taken = {key for keys in _replaced(arm) for key in keys}
+        if arm.get("name") in fixed:
+            taken.update(key for key in DRIVE_KEYS if key not in OF_BEARINGS)
         for key in keys:
             if key in before and key not in arm and key not in taken:
                 arm[key] = _copied(before[key])
                 inherited.add(("arms", i, key))
+        if ("arms", i, "mesh") in inherited:
+            _take_bores(before, arm)
     return inherited
+
+
+def _take_bores(before: Mapping[str, Any], arm: dict[str, Any]) -> None:
+    """Give an arm with the mesh of the arm before the bores at its ends, too."""
+    others = before.get("interfaces")
+    ends = [one for one in others or () if isinstance(one, dict) and _is_end(one)]
+    if isinstance(others, list) and ends and not any(map(_is_end, arm.get("interfaces") or ())):
+        arm["interfaces"] = [*_copied(ends), *(arm.get("interfaces") or ())]
+
+
+def _is_end(row: Any) -> bool:
+    name = row.get("name") if isinstance(row, Mapping) else None
+    return str(name).strip().casefold() in (INBOARD, OUTBOARD)
 
 
 def _replaced(arm: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -405,10 +423,6 @@ def _replaced(arm: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         yield ["material", *material_keys()]
     if "pattern" in arm:
         yield PATTERN_KEYS
-    if "gear_stiffness" in arm:
-        yield SPRING_KEYS
-    if "joint_stiffness" in arm:
-        yield GEAR_KEYS
     if arm.get("rigid") is True or "sid" in arm:
         yield ("regions",)
     if arm.get("hollow") is False:
@@ -422,6 +436,7 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
     """Apply one "key.path=value" to `tree`; raise InputError if there is no such key."""
     where = f"{source} with --set {cut(text)}"
     path, equals, value = text.partition("=")
+    path, times = path.rstrip().removesuffix("*"), path.rstrip().endswith("*")
     parts = tuple(part.strip() for part in path.split("."))
     if not equals or not all(parts):
         raise input_error(where, "expected key.path=value, for example payload.mass=4.0")
@@ -435,8 +450,25 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
             _drop_mesh(tree, loc)
         if loc == ("material", "name") or (loc[0] == "arms" and loc[2:] == ("material",)):
             _drop_values(tree, loc)
-        _store(tree, loc, _parse_value(value.strip()))
-    return Override(text, locs)
+        given = _parse_value(value.strip())
+        _store(tree, loc, scaled(_value_at(tree, loc), given) if times else given)
+    return Override(text, tuple(loc[:2] if _is_old(loc) else loc for loc in locs))
+
+
+def _value_at(tree: Any, loc: Loc) -> Any:
+    """Return what the tree states at `loc`, or else the key's default."""
+    for part in loc:
+        try:
+            tree = tree[part]
+        except (KeyError, IndexError, TypeError):
+            return field_at(loc).default
+    return tree
+
+
+def _is_old(loc: Loc) -> bool:
+    """Tell whether `loc` is the path of an older key, or lies below one."""
+    keys = [part for part in loc if not isinstance(part, int)]
+    return ".".join(map(str, keys[:2])) in OLD_KEYS
 
 
 def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
@@ -473,7 +505,7 @@ def _override_locs(tree: dict[str, Any], parts: tuple[str, ...], where: str) -> 
         if not isinstance(members, list):  # validation will say so
             return ()
         fields = NAMED[table].model_fields
-        if len(parts) == 2 and parts[1] in fields:
+        if len(parts) == 2 and (parts[1] in fields or _is_old(parts)):
             locs = tuple((table, i, parts[1]) for i in range(len(members)))
         else:
             numbers = {str(i): i for i in range(len(members))}
@@ -491,7 +523,7 @@ def _override_locs(tree: dict[str, Any], parts: tuple[str, ...], where: str) -> 
 
 def _check_known(tree: dict[str, Any], loc: Loc, where: str) -> None:
     """Raise InputError unless `loc` is the path of a key or a table of a scene."""
-    for depth in range(1, len(loc) + 1):
+    for depth in range(1, 1 if _is_old(loc) else len(loc) + 1):
         above, key = loc[: depth - 1], loc[depth - 1]
         parent = model_at(above)
         if isinstance(key, int):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import UnionType
@@ -11,6 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 
+from dolfinopt.progress import with_unit
 from dolfinopt.scene.schema import Scene
 from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import (
@@ -25,7 +27,8 @@ from dolfinopt.scene.tables.base import (
     without_none,
 )
 from dolfinopt.scene.tables.closures import as_written
-from dolfinopt.scene.tables.material import Material, check_material
+from dolfinopt.scene.tables.joints import DRIVE_KEYS
+from dolfinopt.scene.tables.material import Material, check_material, material_keys
 from dolfinopt.scene.tables.responses import need_of
 
 _COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
@@ -174,6 +177,12 @@ def _meaning(field: FieldInfo) -> str:
     return str(field.description).removesuffix(" [-]")
 
 
+def unit_of(field: FieldInfo) -> str:
+    """Return the unit at the end of a field's description, "-" where it has none."""
+    found = re.search(r" \[([^\]]*)\]$", str(field.description))
+    return found[1] if found else "-"
+
+
 def allowed_words(field: FieldInfo) -> str:
     """Return in words what `field` accepts."""
     return _allowed_type(field.annotation, field.metadata)
@@ -256,12 +265,21 @@ def arm_name(tree: dict[str, Any], index: Any, table: str = "arms") -> str | Non
 
 
 class KeyInfo(NamedTuple):
-    """One key of a scene as documentation lists it; `default` is "" where there is none."""
+    """One key of a scene as documentation lists it.
+
+    Attributes:
+        key: dotted.
+        allowed: in words.
+        default: "" where there is none.
+        description: meaning and unit.
+        also: other tables that take the key with the same meaning.
+    """
 
     key: str
     allowed: str
     default: str
     description: str
+    also: tuple[str, ...] = ()
 
 
 def describe_keys() -> list[KeyInfo]:
@@ -271,13 +289,58 @@ def describe_keys() -> list[KeyInfo]:
 
 def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
     for key, field in model.model_fields.items():
-        below = table_in(field.annotation)
+        below, path = table_in(field.annotation), f"{prefix}{key}"
         if below is not None:
-            yield from _describe(below, f"{prefix}{key}.")
-            continue
-        default = "" if field.is_required() else shown(field.default)
-        default = "none" if default == "None" else default
-        yield KeyInfo(f"{prefix}{key}", allowed_words(field), default, str(field.description))
+            yield from _describe(below, f"{path}.")
+        elif not is_explained_elsewhere(path):
+            default = "" if field.is_required() else shown(field.default)
+            default = "none" if default == "None" else default
+            also = tuple(one for one in ("arms", "joints") if _explains(path, f"{one}.{key}"))
+            told = allowed_words(field), default, str(field.description)
+            yield KeyInfo(path, *told, also)
+
+
+def is_explained_elsewhere(path: str) -> bool:
+    """Return whether a key means what that of another table means, where it is explained.
+
+    Arms state their own material, and [[joints]] the drives that arms state in the plane.
+    """
+    table, _, key = path.rpartition(".")
+    return (table == "arms" and key in material_keys()) or (table == "joints" and key in DRIVE_KEYS)
+
+
+def _explains(path: str, other: str) -> bool:
+    """Return whether what one key means is told at another one."""
+    place = {"arms": "material", "joints": "arms"}[other.partition(".")[0]]
+    return path.rpartition(".")[0] == place and is_explained_elsewhere(other)
+
+
+# -- what a scene does not state and its results depend on --------------------------------------
+
+# Defaults that an engineer would want to know of.
+PHYSICAL = (("motion", "gravity"), ("damping", "stiffness_proportional"), ("motion", "horizon"),
+            ("design", "volume_fraction"))  # fmt: skip
+
+
+def assumed(scene: Scene) -> str:
+    """Return in one line what is not stated: lengths by the arms, times, gravity, damping."""
+    physical = [loc for loc in PHYSICAL if loc[1] not in getattr(scene, loc[0]).model_fields_set]
+    found = [_with_value(scene, loc) for loc in dict.fromkeys((*scene.derived, *physical))]
+    ends = {
+        f"arms.{arm.name}.passive = {arm.solid_ends:.4g} m"
+        for arm in scene.arms
+        if arm.designed and arm.passive is None and arm.solid_ends > 0.0
+    }
+    told = [one for one in (*found, *sorted(ends)) if one]
+    return f"assumed: {', '.join(told)}" if told else ""
+
+
+def _with_value(scene: Scene, loc: tuple[str, str]) -> str:
+    value, unit = getattr(getattr(scene, loc[0]), loc[1]), unit_of(field_at(loc))
+    if value is None or loc == ("objective", "gradient"):
+        return ""
+    text = f"{value:.4g}" if isinstance(value, float) else shown(value)
+    return with_unit(f"{loc[0]}.{loc[1]} = {text}", unit)
 
 
 # -- what is possible in a scene, but hardly meant: a sentence each, told before the run ---------
@@ -309,17 +372,11 @@ def implausible(scene: Scene) -> list[str]:
 
 
 def _old_words(scene: Scene) -> list[str]:
-    """Tell words that are translated, and keys that are read without effect."""
-    keys = sorted({"integrator", "rho_inf"} & scene.simulation.model_fields_set)
-    return [
-        *scene.old_words,
-        *(
-            f"simulation.{key} is read without effect: every motion is integrated by Radau IIA, "
-            "see simulation.tolerance"
-            for key in keys
-            if key == "rho_inf" or scene.simulation.integrator != "radau"
-        ),
-    ]
+    """Tell older words, in one line."""
+    if not scene.old_words:
+        return []
+    rewrite = f"dolfinopt keys --upgrade {scene.source} rewrites the scene"
+    return [f"older words: {'; '.join(scene.old_words)}; {rewrite}"]
 
 
 def _materials(scene: Scene) -> list[str]:

@@ -52,15 +52,15 @@ class Cells:
 def region_cells(arm: Arm, centroid: np.ndarray) -> RegionCells:
     """Return the cells whose centroids (n_cells, d), m, are in the arm's regions.
 
-    On an arm with `symmetric` a region stands for its mirror image about y = 0, too; with
-    `symmetric_z` for that about z = 0.
+    On an arm with `symmetric = true` a region stands for its mirror image about y = 0, too; with
+    `"z"` for that about z = 0.
     """
     x, y = centroid.T[:2]
     z = centroid[:, 2] if centroid.shape[1] == 3 else np.zeros(len(x))
     sides = [(y, z)]
-    if arm.symmetric:
+    if arm.symmetric_about[0]:
         sides += [(-b, c) for b, c in sides]
-    if arm.symmetric_z:
+    if arm.symmetric_about[1]:
         sides += [(b, -c) for b, c in sides]
     each = [np.any([r.covers(x, b, c) for b, c in sides], axis=0) for r in arm.regions]
     nothing = np.zeros(len(centroid), dtype=bool)

@@ -21,10 +21,10 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
-from dolfinopt.scene.tables.closures import Closures, closing_site
+from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
-from dolfinopt.scene.tables.joints import interface_number
+from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
 from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
@@ -45,7 +45,7 @@ class Scene(Table):
         description="title of the scene; default: the file's name without extension [-]"
     )
     material: Material = Field(description="the solid material")
-    interpolation: Interpolation = Field(default=Interpolation(), description="material law")
+    interpolation: Interpolation = Field(default_factory=Interpolation, description="material law")
     arms: tuple[Arm, ...] = Field(description="arms from the cart outwards")
     joints: tuple[Joint, ...] = Field(
         default=(),
@@ -62,7 +62,8 @@ class Scene(Table):
         "motion exactly",
     )
     feed_forward: FeedForward = Field(
-        default=FeedForward(), description="corrections of joints that keep the tip on its path"
+        default_factory=FeedForward,
+        description="corrections of joints that keep the tip on its path",
     )
     closures: tuple[Closures, ...] = Field(
         default=(),
@@ -76,14 +77,16 @@ class Scene(Table):
     forces: tuple[Force, ...] = Field(
         default=(), description="given forces on interfaces of arms; none without this table"
     )
-    damping: Damping = Field(default=Damping(), description="structural damping")
-    reduction: Reduction = Field(default=Reduction(), description="model reduction")
-    simulation: Simulation = Field(default=Simulation(), description="time integration")
-    objective: Objective = Field(default=Objective(), description="what is minimised")
-    constraints: Constraints = Field(default=Constraints(), description="limits besides the volume")
-    design: Design = Field(default=Design(), description="design variables")
-    optimizer: Optimizer = Field(default=Optimizer(), description="optimiser")
-    part: Part = Field(default=Part(), description="parts for the workshop")
+    damping: Damping = Field(default_factory=Damping, description="structural damping")
+    reduction: Reduction = Field(default_factory=Reduction, description="model reduction")
+    simulation: Simulation = Field(default_factory=Simulation, description="time integration")
+    objective: Objective = Field(default_factory=Objective, description="what is minimised")
+    constraints: Constraints = Field(
+        default_factory=Constraints, description="limits besides the volume"
+    )
+    design: Design = Field(default_factory=Design, description="design variables")
+    optimizer: Optimizer = Field(default_factory=Optimizer, description="optimiser")
+    part: Part = Field(default_factory=Part, description="parts for the workshop")
     scenarios: tuple[Scenario, ...] = Field(
         default=(), description="scenarios that the objective combines; none: the scene itself"
     )
@@ -96,6 +99,11 @@ class Scene(Table):
     def source(self) -> str:
         """Return the path of the scene's file as messages show it."""
         return self._source
+
+    @property
+    def derived(self) -> tuple[tuple[str, str], ...]:
+        """Return table and key of what is not stated and follows from other values."""
+        return self._derived
 
     @property
     def old_words(self) -> tuple[str, ...]:
@@ -226,23 +234,16 @@ class Scene(Table):
     @property
     def end_effector(self) -> tuple[int, int]:
         """Return the arm that carries the payload and the number of its interface, 0 outboard."""
-        names = [arm.name for arm in self.arms]
-        arm = len(names) - 1 if self.payload.arm is None else names.index(self.payload.arm)
-        return arm, interface_number(self.arms[arm], self.payload.interface) or 0
+        return place_of(self, self.payload.arm or self.arms[-1].name) or (len(self.arms) - 1, 0)
 
     @property
     def used_interfaces(self) -> frozenset[tuple[int, int]]:
         """Return the interfaces, as of `end_effector`, of joints, forces and the payload."""
-        index = {arm.name: i for i, arm in enumerate(self.arms)}
-        found = {self.end_effector}
-        for force in self.forces:
-            if (k := index.get(force.arm)) is not None:
-                found.add((k, interface_number(self.arms[k], force.interface) or 0))
-        for joint in self.joints:
-            if (k := index.get(joint.parent)) is not None:
-                found.add((k, interface_number(self.arms[k], joint.parent_interface) or 0))
-        ends = [closing_site(self, one, which) for one in self.closures for which in (0, 1)]
-        return frozenset(found).union(end for end in ends if end is not None)
+        sites = [force.arm for force in self.forces]
+        sites += [joint.parent for joint in self.joints]
+        sites += [end for one in self.closures for end in one.between]
+        places = {place_of(self, site) for site in sites}
+        return frozenset({self.end_effector, *(place for place in places if place is not None)})
 
     @property
     def dependent_joints(self) -> int:
@@ -316,13 +317,13 @@ class Scene(Table):
         An arm of another kind states all values itself.
         """
         arm, solid = self.arms[index], self.material
-        own = {key: getattr(arm, key) for key in material_keys()}
+        own = {key: getattr(arm, key, None) for key in material_keys()}  # a law may be newer
         if arm.material is not None:
             solid = Material(name=arm.material, **CATALOGUE[arm.material].values)
         elif own["kind"] not in (None, solid.kind):
             solid = Material.model_construct(**dict.fromkeys(own))
         given = {key: value for key, value in own.items() if value is not None}
-        return solid.model_copy(update=given)
+        return solid.unchecked_copy(given)
 
     @property
     def without_strength(self) -> dict[str, str]:
@@ -378,6 +379,11 @@ FILE_KEYS = tuple(
     for key, value in getattr(table_in(field.annotation), "model_fields", {}).items()
     if NAMES_FILE in getattr(without_none(value.annotation), "__metadata__", ())
 )
+
+
+def file_in(key: str, value: str) -> bool:
+    """Return whether the value of one of `FILE_KEYS` is a file, not a word as "tube" is."""
+    return key != "section" or Path(value).suffix != ""
 
 
 # -- the keys of a scene as JSON schema, from which editors complete and check scene files -------
@@ -448,7 +454,8 @@ def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], 
         node = data.get(table)
         rows = node if isinstance(node, list) else [node]
         for k, row in enumerate(rows):
-            if isinstance(row, dict) and isinstance(row.get(key), str):
+            value = row.get(key) if isinstance(row, dict) else None
+            if isinstance(value, str) and file_in(key, value):
                 name = f"{table}.{k}.{key}" if isinstance(node, list) else f"{table}.{key}"
                 yield name, row, key
 

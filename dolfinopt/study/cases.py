@@ -18,7 +18,6 @@ import json
 import math
 import os
 import shutil
-import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -45,6 +44,7 @@ from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.output.summary import figures, versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Counts, Profile
+from dolfinopt.progress import log
 from dolfinopt.responses.evaluation import evaluate
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.responses.order_selection import choose_coordinates
@@ -323,7 +323,7 @@ class _Place:
         """Tell of cases that have ended meanwhile, a line each."""
         for case in [case for case in self.untold if self.has(case)]:
             self.untold.remove(case)
-            print(f"{_read(case, self)}; {len(self.untold)} to go", file=sys.stderr, flush=True)
+            log.info("%s; %d to go", _read(case, self), len(self.untold))
 
     def check(self) -> None:
         """Tell what has ended; raise OthersFailed if another rank has failed."""
@@ -540,7 +540,7 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
 
 def _unnamed(case: Case) -> Scene:
     """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
-    return case.scene.model_copy(update={"name": case.key})
+    return case.scene.unchecked_copy({"name": case.key})
 
 
 def _read(case: Case, place: _Place) -> Outcome:

@@ -31,6 +31,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.hollow import KINDS, Section, member
 from dolfinopt.mesh.solid_cells import msh_bytes
 from dolfinopt.parallel import on_root, together
+from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
@@ -154,7 +155,8 @@ class Members:
             ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive", "pattern",
              "interface_offset")
         )  # fmt: skip
-        row |= {"symmetric": False, "symmetric_z": False, "extruded": False, "regions": []}
+        row |= {"symmetric": False, "extruded": False, "regions": [], "interfaces": []}
+        row["mesh_scale"] = 1.0
         row |= {"hollow": False, **dict.fromkeys(WALL_KEYS)}
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
@@ -413,8 +415,64 @@ def study_sections(
     return Study(NAME, (found_table,), figures, (), computed + done.computed)
 
 
+AHEAD = ("solid bar", "rectangular tube", "round tube")  # whose figures come before a design
+
+
+def ahead(scene: Scene, folder: Path, world: MPI.Comm) -> list[str]:
+    """Return what straight tubes and bars reach in place of solid links, a line each (collective).
+
+    The lightest that hold the limits, where the scene has some; else those of the links' mass at
+    the start. [] of machines in the plane, and where no straight member can take a link's place.
+    """
+    try:
+        on_root(world, _check_replaceable, scene)
+    except InputError:
+        return []
+    if not any(scene.arms[k].is_solid and not scene.arms[k].hollow for k in scene.designed):
+        return []
+    every = [Members(scene, kind, KINDS[3][kind], folder / NAME) for kind in AHEAD]
+    start = Case(scene, label="start")
+    [first] = run_cases([start], folder, world, shown=False).by_case.values()
+    if first.failure:
+        return []
+    asked: list[tuple[Members, Shares]] = []
+    if limited(first):
+        found, _ = _searched(every, folder, world, 0, shown=False)
+        asked = [(one, shares) for one, _, shares, holds in found if holds]
+    else:
+        masses = first.summary()["mass"]
+        by_arm = {k: masses[arm.name] for k, arm in enumerate(scene.arms) if arm.name in masses}
+        asked = [(one, shares) for one in every if (shares := one.of_mass(by_arm)) is not None]
+    cases = on_root(world, lambda: [one.case(shares) for one, shares in asked])
+    done = run_cases(cases, folder, world, shown=False)
+    pairs = [(one, done[case]) for (one, _), case in zip(asked, cases, strict=True)]
+    lines = [_reached(scene, one, found) for one, found in pairs if not found.failure]
+    tubes = [found for one, found in pairs if one.section.plane is not None and not found.failure]
+    if tubes:
+        lines.append("with walls, arms.hollow = true, a link keeps a tube's outer surface")
+    return lines
+
+
+def _reached(scene: Scene, members: Members, found: Outcome) -> str:
+    """Return mass and objective of members in words."""
+    response, what = scene.objective.response, "has the links' mass at the start"
+    if limited(found):
+        what = "holds the limits"
+    mass = found.summary().get("designed_mass", math.nan)
+    value = with_unit(f"{response.label} {found.objective:.4g}", response.unit)
+    return f"a straight {members.kind} of {mass:.3g} kg {what}: {value}"
+
+
 def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
     """Return the design and its label; raise InputError where no member can take an arm's place."""
+    _check_replaceable(scene)
+    if len(designs) > 1:
+        raise InputError(f"--design: expected one file with compare sections, found {len(designs)}")
+    return [*given_designs(scene, designs).items()][-1]
+
+
+def _check_replaceable(scene: Scene) -> None:
+    """Raise InputError where no straight member can take an arm's place."""
     if not any(owner is not None for owner in scene.owners):
         raise InputError(f"{scene.source}: sections: expected arms with a design, found none")
     for index, arm in enumerate(scene.arms):
@@ -423,14 +481,11 @@ def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
                 f"{scene.source}: arms.{arm.name}.angle: sections: expected 0 in space, found "
                 f"{scene.material_of(index).angle:.4g} rad; the fibres of a member are along it"
             )
-        if arm.flexible and arm.interfaces:
+        if arm.flexible and arm.further_interfaces:
             raise InputError(
                 f"{scene.source}: arms.{arm.name}.interfaces: sections: expected one outboard "
                 "interface, found more; a straight member has one end"
             )
-    if len(designs) > 1:
-        raise InputError(f"--design: expected one file with compare sections, found {len(designs)}")
-    return [*given_designs(scene, designs).items()][-1]
 
 
 def _searched(

@@ -23,8 +23,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.parallel import on_root
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
+from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.tables.base import without_none
-from dolfinopt.scene.tables.closures import in_new_words
 from dolfinopt.study.cases import SAMPLED, Case, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
@@ -510,6 +510,8 @@ def parse_input(scene: Scene, text: str) -> Input:
             )
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
+        if key.endswith("*"):
+            return Input(named, 1.0, distribution.within(0.0, math.inf))
         field = field_at((parts[0], parts[-1]))
         try:
             return Input(named, nominal_value(scene, key), distribution.within(*_range(field)))
@@ -519,6 +521,8 @@ def parse_input(scene: Scene, text: str) -> Input:
 
 def nominal_value(scene: Scene, key: str) -> object:
     """Return the scene's value of a key, None where arms differ in it."""
+    if key.endswith("*"):
+        return 1.0
     table, *which, name = in_new_words(key).split(".")
     rows = getattr(scene, table)
     if not isinstance(rows, tuple):

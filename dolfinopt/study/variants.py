@@ -12,7 +12,10 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.load import Reduction, Scene, describe_keys, scene_from_dict
+from dolfinopt.loading import load_scene
+from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.messages import model_at, unit_of
+from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.tables.responses import DECLARED, unused_options
 
 # Label; kind, and the settings that make it.
@@ -75,11 +78,11 @@ class Vary:
 
 
 def axis_of(key: str) -> str:
-    """Return a key with its unit, "[-]" where it has none."""
-    name = re.sub(r"^(arms)\.[^.]+\.(?=[^.]+$)", r"\1.", key)
-    texts = {info.key: info.description for info in describe_keys()}
-    unit = re.search(r"\[([^\]]*)\]$", texts.get(name, ""))
-    return f"{key} [{unit[1] if unit else '-'}]"
+    """Return a key with its unit, "[-]" where it has none; "key*" is a factor."""
+    table, *_, name = in_new_words(key).split(".")
+    model = model_at((table,))
+    field = model.model_fields.get(name) if model else None
+    return f"{key} [{unit_of(field) if field and not name.endswith('*') else '-'}]"
 
 
 def parse_vary(text: str) -> Vary:
@@ -114,12 +117,7 @@ def changed(scene: Scene, *overrides: str) -> Scene:
 
     InputError where there is no such key, or it does not allow the value.
     """
-    from dolfinopt.dynamics.build import check_forces, check_motion
-
-    other = scene_from_dict(scene.to_tree(), scene.source, overrides)
-    check_motion(other)
-    check_forces(other)
-    return other
+    return load_scene(scene, overrides)
 
 
 @contextmanager
@@ -200,12 +198,11 @@ def reduced(scene: Scene, method: str, coordinates: int) -> Scene:
 
     InputError where the arms have fewer degrees of freedom, or the method needs more coordinates.
     """
-    options = Reduction.model_fields
-    settings = []
-    if scene.reduction.method != method:
-        settings = [f"reduction.{key}={list(options[key].default)}" for key in ("shifts", "band")]
-    settings.append(f"reduction.tolerance={options['tolerance'].default!r}")  # of "auto" alone
-    return changed(scene, f"reduction.method={method}", f"{COORDINATES}={coordinates}", *settings)
+    tree = scene.to_tree()
+    same = scene.reduction.method == method
+    kept = {"frequencies": scene.reduction.frequencies} if same else {}
+    tree["reduction"] = kept | {"method": method, "coordinates": coordinates}
+    return scene_from_dict(tree, scene.source)
 
 
 def reference_scene(scene: Scene) -> Scene:

@@ -1,6 +1,7 @@
 """What helps to write a scene: templates, keys, the schema; and a script's interpreter."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -13,7 +14,7 @@ import dolfinopt
 from dolfinopt.cli.main import TEMPLATES
 from dolfinopt.data import template_folder
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.scene.load import describe_keys, load_scene
+from dolfinopt.scene.load import describe_keys, read_scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.schema import scene_schema
 
@@ -50,9 +51,9 @@ def test_a_template_is_a_scene(tmp_path, capsys, template):
     assert errors(tomllib.loads(scene.read_text())) == []
     if template == "step":
         assert str(tmp_path / "arm.step") in said
-        refusal(lambda: load_scene(scene), "arm.step")
+        refusal(lambda: read_scene(scene), "arm.step")
         (tmp_path / "arm.step").write_text("ISO-10303-21;")
-    loaded = load_scene(scene)
+    loaded = read_scene(scene)
     assert loaded.name == 'my "machine"'
     check_motion(loaded)
     assert implausible(loaded) == []
@@ -63,7 +64,7 @@ def test_a_template_is_a_scene(tmp_path, capsys, template):
 def test_a_template_is_improved_by_its_optimisation(tmp_path, template):
     """On its own mesh; pick-and-place ended softer than it began with its exact gradient."""
     run("init", tmp_path / "machine", "--template", template)
-    scene = load_scene(tmp_path / "machine.toml", ["optimizer.max_iterations=30"])
+    scene = read_scene(tmp_path / "machine.toml", ["optimizer.max_iterations=30"])
     history = dolfinopt.optimize(scene).history
     assert history[-1].objective < history[0].objective / 3.0
 
@@ -78,7 +79,7 @@ def test_init_replaces_nothing(tmp_path):
         refusal(lambda: run(*line), word)  # noqa: B023
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == mine
     run("init", tmp_path / "deep" / "c.toml")
-    assert load_scene(tmp_path / "deep" / "c.toml").name == "c"
+    assert read_scene(tmp_path / "deep" / "c.toml").name == "c"
 
 
 def test_keys_are_explained_by_pattern(capsys):
@@ -91,10 +92,51 @@ def test_keys_are_explained_by_pattern(capsys):
     assert head.endswith("required") and meaning.strip() == "point mass at the end-effector"
     run("keys", "arms.*")
     heads = [line for line in capsys.readouterr().out.splitlines() if not line.startswith(" ")]
-    names = [info.key for info in describe_keys() if info.key.startswith("arms.")]
-    assert "arms.regions.circle" in names
+    names = [i.key for i in describe_keys() if i.key.startswith("arms.") or "arms" in i.also]
+    assert {"arms.regions.circle", "material.density"} <= {*names}
     assert [line.split(":")[0].split(" ")[0] for line in heads] == names
     refusal(lambda: run("keys", "payload.mas2"), "payload.mas2", "payload.mass")
+
+
+OLDER = """\
+[reduction]
+method = "krylov"
+shifts = [
+  0.0, 9.0,
+]               # Hz
+coordinates = 6
+[simulation]
+rho_inf = 0.5   # of another integrator
+sample = 2e-3
+[closure]
+kind = "slider" # on a line
+force = -10.0
+"""
+
+
+def test_older_words_are_rewritten(tmp_path, capsys):
+    """Comments and order stay, the scene is the same, the file as it was is kept."""
+    file = tmp_path / "old.toml"
+    loop = 'path = "rotation"\nbase = "fixed"\n'
+    run("init", file)
+    text = re.sub(r'path = "arc".*\nradius.*\n', loop, file.read_text()) + OLDER
+    text = text.replace('"arm2"  ', '"arm2"\njoint_stiffness = 0.0\nsymmetric_z = false\n')
+    file.write_text(text.replace("[[arms]]  ", "[[arms]]\njoint_stiffness = 1e4  # N m/rad\n", 1))
+    before, text = read_scene(file), file.read_text()
+    capsys.readouterr()
+    run("keys", "--upgrade", file)
+    assert "arms.joint_stiffness -> arms.gear_stiffness" in capsys.readouterr().out
+    assert read_scene(file) == before and read_scene(file).old_words == ()
+    assert file.with_name("old.toml.old").read_text() == text
+    new = file.read_text()
+    for line in (
+        "gear_stiffness = 10000.0  # N m/rad",
+        "frequencies = [0.0, 9.0]               # Hz",
+    ):
+        assert line in new
+    assert "rho_inf" not in new and "[[forces]]" in new and "[closure]" not in new
+    run("keys", "--upgrade", file)
+    assert "no older words" in capsys.readouterr().out
 
 
 def test_schema_knows_every_key_with_its_meaning(capsys):

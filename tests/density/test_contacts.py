@@ -182,6 +182,7 @@ def test_contacts_are_told_and_robust_designs_have_none(projection, radius, tmp_
         assert not told and "falls into" not in printed.out
         return
     assert summary["connected"] == own["pieces"] > 1 and own["edges"] == 0
+    # Four, of which the three worst are told.
     assert own["corners"] >= 4 and len(own["places"]) == 3 and own["left_out"] > 0.0
     (text,) = told
     x, y = own["places"][0]

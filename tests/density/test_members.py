@@ -11,7 +11,7 @@ from solids import grid, sixths, solid_scene
 
 import dolfinopt as do
 from dolfinopt.density.filter import HelmholtzFilter
-from dolfinopt.density.members import thinnest, thinnest_solid
+from dolfinopt.density.members import WIDE, thinnest
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.problem import problem_of
@@ -25,10 +25,10 @@ def cells(along=200, across=12, triangles=False):
     """Return corners (n, 3 or 4, 2) and the cells' column and row."""
     x, y = np.arange(along + 1) * CELL, np.arange(across + 1) * CELL
     p = np.stack(np.meshgrid(x, y, indexing="ij"), axis=2)
-    quads = np.stack([p[:-1, :-1], p[1:, :-1], p[1:, 1:], p[:-1, 1:]], axis=2).reshape(-1, 4, 2)
+    quads = np.stack([p[:-1, :-1], p[1:, :-1], p[:-1, 1:], p[1:, 1:]], axis=2).reshape(-1, 4, 2)
     corners = quads
     if triangles:
-        corners = np.concatenate([quads[:, [0, 1, 2]], quads[:, [2, 3, 0]]])
+        corners = np.concatenate([quads[:, [0, 1, 3]], quads[:, [3, 2, 0]]])
     i, j = (quads.mean(axis=1) / CELL).astype(int).T
     return corners, i, j
 
@@ -44,7 +44,7 @@ DRAWN = [  # solid by column and row; member and gap in cells
     ("slots", lambda i, j: flanges(j, 3) | (i % 20 > 4), 3.0, 5.0),
     ("diagonal webs", lambda i, j: flanges(j, 4) | ((i - j) % 30 < 6), 4.0, 4.0),
     ("islands", lambda i, j: (i % 20 < 3) & (j % 6 < 3), 3.0, 3.0),
-    ("neck", lambda i, j: (abs(i - 100) > 1) | (abs(2 * j - 11) < 3), 2.0, 12.0),
+    ("neck", lambda i, j: (abs(i - 100) > 1) | (abs(2 * j - 11) < 3), 2.0, None),
     ("chain by corners", lambda i, j: flanges(j, 2) | (i % 12 == j), 0.0, None),
     ("solid", lambda i, j: i >= 0, 12.0, None),
 ]
@@ -175,17 +175,18 @@ def test_widths_of_solids():
     solid = ends | (j < 3) | (j >= 7)
     # The side of a tetrahedron's cube is twice that of its own volume: voxels are as fine.
     for corners, filled, asked in ((boxes, solid, 3.3), (sixths(boxes), np.tile(solid, 6), 1.0)):
-        member, gap = thinnest_solid(corners, filled, asked * CELL)
+        member, gap = thinnest(corners, filled, WIDE * asked * CELL)
         assert member.size == pytest.approx(2.0 * CELL, abs=CELL / 4.0)
         x, y, z = np.array(member.place) / CELL
         assert 2.0 < x < 8.0 and y == pytest.approx(8.0, abs=0.5) and 0.0 < z < 3.0
         if asked < 2.0:  # gaps are looked for up to one and a half times that
             assert gap is None
             continue
-        assert gap.size == pytest.approx(4.0 * CELL, abs=CELL / 4.0)
+        # A ball that is a little wider reaches through it from both sides.
+        assert gap.size == pytest.approx(4.0 * CELL, abs=CELL / 3.0)
         assert gap.place[1] / CELL == pytest.approx(5.0, abs=0.5)
-    assert thinnest_solid(boxes, np.zeros(len(boxes), dtype=bool), CELL) == (None, None)
-    whole, none = thinnest_solid(boxes, np.ones(len(boxes), dtype=bool), CELL)
+    assert thinnest(boxes, np.zeros(len(boxes), dtype=bool), CELL) == (None, None)
+    whole, none = thinnest(boxes, np.ones(len(boxes), dtype=bool), CELL)
     assert none is None and whole.size == pytest.approx(3.0 * CELL, abs=CELL / 4.0)
 
 
@@ -318,7 +319,9 @@ def test_widths_of_solid_arms_are_measured_where_they_are_asked_for(extruded):
     told = {"cells": (20, 12, 2), "height": 0.06, "thickness": 0.01, "extruded": extruded}
     scene = solid_scene(**told)
     width = {"projection": "robust", "minimum_member": 0.015}
-    asked = scene.model_copy(update={"design": scene.design.model_copy(update=width)})
+    asked = scene.unchecked_copy(
+        {"design": scene.design.model_copy(update=width | {"filter_radius": 0.0075})}
+    )
     for one in (scene, asked):
         arm = do.Arm(one, 0, MPI.COMM_SELF, do.Profile())
         partition = do.partition_arms(MPI.COMM_SELF, {0: 480})

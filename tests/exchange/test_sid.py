@@ -15,10 +15,10 @@ from readers import check_npz, read_as_mbdyn_does
 from runs import ROOT, overrides, refusal, run, tomllib
 
 import dolfinopt as do
-from dolfinopt.cli.shared import doubts_of_files
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.in_space import in_space
 from dolfinopt.exchange.standard_input import load_body, to_sid
+from dolfinopt.loading import doubts_of_files
 from dolfinopt.multibody.shape_integrals import rigid_bar
 from dolfinopt.scene.sid import (
     Node,

@@ -12,7 +12,7 @@ from runs import ROOT, refusal, run
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import implausible_inertias, read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 
 yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
@@ -27,7 +27,7 @@ def test_import_says_what_it_made(tmp_path, capsys):
     tree = tree_of(tmp_path / "a" / "robot.toml")
     assert [arm["name"] for arm in tree["arms"] if not arm.get("rigid")] == ["forearm"]
     assert tree["arms"][-1]["name"] == "tool" and tree["motion"]["file"] == "trajectory.csv"
-    scene = load_scene(tmp_path / "a" / "robot.toml")
+    scene = read_scene(tmp_path / "a" / "robot.toml")
     columns = DEMO_MOTION.read_text().splitlines()[1].replace(" ", "").split(",")
     assert scene.is_spatial and scene.driven == tuple(columns[1:])
     assert "7.879 kg" in (tmp_path / "a" / "robot.toml").read_text()
@@ -283,7 +283,7 @@ def test_limits_and_friction_come_into_the_scene(tmp_path):
     new += '<dynamics damping="0.4" friction="0.1"/>'
     (tmp_path / "r.urdf").write_text(text.replace(old, new, 1))
     run_import(tmp_path / "r.urdf", "forearm", DEMO_MOTION, tmp_path / "a")
-    robot, scene = read_robot(DEMO), load_scene(tmp_path / "a" / "r.toml")
+    robot, scene = read_robot(DEMO), read_scene(tmp_path / "a" / "r.toml")
     joints = {joint.name: joint for joint in robot.movable}
     none = [one.name for one in scene.movable if one.effort_limit is None]
     assert len(none) == 1
@@ -332,4 +332,4 @@ def test_an_inertia_that_no_body_has_is_to_be_corrected(tmp_path, capsys):
     run_import(file, "forearm", DEMO_MOTION, tmp_path / "a")
     said = capsys.readouterr().err
     assert "'wrist_3'" in said and "correct the scene" in said
-    refusal(lambda: load_scene(tmp_path / "a" / "robot.toml"), "inertia (wrist_3)")
+    refusal(lambda: read_scene(tmp_path / "a" / "robot.toml"), "inertia (wrist_3)")

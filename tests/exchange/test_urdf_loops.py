@@ -12,7 +12,7 @@ from runs import refused, run
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.scene import scene_of_robot
 from dolfinopt.motion.build import rigid_motion
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 
 pytestmark = pytest.mark.serial
 
@@ -74,7 +74,7 @@ def imported_to(folder: Path, table: str, motion: str = MOTION) -> Path:
 def test_a_linkage_is_closed(tmp_path) -> None:
     """Passive joints, the rocker's interface, the assembly by the table's first row."""
     path = imported_to(tmp_path, TABLE.format(kind="pin", link="rocker"))
-    tree, scene = tree_of(path), load_scene(path)
+    tree, scene = tree_of(path), read_scene(path)
     assert scene.driven == ("turn",)
     assert [one["name"] for one in tree["joints"] if one.get("passive")] == ["knee", "rock"]
     assert scene.closures[0].between == ("rocker.ankle", "ground")
@@ -90,7 +90,7 @@ def test_a_driven_rod_is_a_column(tmp_path) -> None:
     table = TABLE.replace("axis = [0, 0, 1]\n", "").replace("[[0.25, 0, 0],", "[[0, 0, 0],")
     table = table.replace('["knee", "rock"]', '["rock"]')
     motion = "t,turn,knee,ankle\n0,0.5,0.5,0.2\n1,0.6,0.5,0.25\n"
-    scene = load_scene(imported_to(tmp_path, table.format(kind="rod", link="foot"), motion))
+    scene = read_scene(imported_to(tmp_path, table.format(kind="rod", link="foot"), motion))
     assert scene.driven == ("turn", "knee", "ankle")
     assert scene.arms[2].interfaces[0].point == pytest.approx((0.2, 0.0, 0.0))
 

@@ -11,7 +11,7 @@ from solids import link_mesh, tensors_of
 
 from dolfinopt.fem import forms
 from dolfinopt.fem.assembly import Cells, StiffenedModes
-from dolfinopt.fem.interface import by_rigid_motions, rigid_motions
+from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.fem.stress import stress_operator
 from dolfinopt.fem.tensors import stress_points

@@ -213,8 +213,7 @@ def limit_rates(built: Built, steps: Sequence[float]) -> list[float]:
 def hold_instants(patch: pytest.MonkeyPatch) -> None:
     """Let buckling look at the same instants: where a peak goes on to the next its slope steps."""
 
-    def held(values: np.ndarray, share: float = 0.0) -> list[int]:
+    def held(values: np.ndarray) -> list[int]:
         return [len(values) // 5, len(values) // 2, 4 * len(values) // 5]
 
     patch.setattr("dolfinopt.responses.buckling.worst_instants", held)
-    patch.setattr("dolfinopt.responses.buckling.BUCKLING_ROUNDS", 1)

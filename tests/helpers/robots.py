@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dolfinopt.motion.machine import build_mechanism, rigid_link
 from dolfinopt.multibody.shape_integrals import rigid_spatial_body
 from dolfinopt.multibody.tree import GROUND, Mechanism
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 
 DEMO = ROOT / "demos" / "robot.urdf"
 DEMO_MOTION = ROOT / "demos" / "robot_motion.csv"
@@ -113,7 +113,7 @@ def tree_of(scene: Path) -> dict[str, Any]:
 
 def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> Mechanism:
     """Return a scene's rigid mechanism, by mass, centre and inertia (6,) of arms that are not."""
-    scene = load_scene(file)
+    scene = read_scene(file)
     bodies = [
         rigid_link(arm, 0.0) if arm.rigid
         else rigid_spatial_body(*solids[arm.name], (arm.length, 0.0, 0.0))

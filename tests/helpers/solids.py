@@ -20,7 +20,7 @@ from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.part.solid.surface import Surface
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.load import Scene, load_scene
+from dolfinopt.scene.load import Scene, read_scene
 
 LENGTH, HEIGHT, THICKNESS = 0.5, 0.04, 0.02  # m
 YOUNG, POISSON, DENSITY = 70e9, 0.33, 2700.0  # Pa, kg/m3
@@ -36,20 +36,24 @@ def solid_scene(
     **keys: Any,
 ) -> Scene:
     """Return a scene with this arm alone, whatever its motion would be."""
-    scene = load_scene(ROOT / "demos" / "two_arm.toml")
+    scene = read_scene(ROOT / "demos" / "two_arm.toml")
     size = {"length": LENGTH, "height": HEIGHT, "thickness": THICKNESS}
-    arm = scene.arms[0].model_copy(update=size | {"cells": cells, "passive": 0.02} | keys)
+    arm = scene.arms[0].unchecked_copy(size | {"cells": cells, "passive": 0.02} | keys)
     told = {
         "arms": (arm,),
-        "reduction": {"method": method, "coordinates": coordinates, "shifts": shifts},
+        "reduction": {
+            "method": method,
+            "coordinates": coordinates,
+            "frequencies": shifts if method == "krylov" else None,
+        },
         "simulation": {"stiffening": stiffening},
         "design": {"filter_radius": filter_radius},
     }
     changed = {
-        key: value if key == "arms" else getattr(scene, key).model_copy(update=value)
+        key: value if key == "arms" else getattr(scene, key).unchecked_copy(value)
         for key, value in told.items()
     }
-    return scene.model_copy(update=changed)
+    return scene.unchecked_copy(changed)
 
 
 def solid_arm(comm: MPI.Comm = MPI.COMM_WORLD, **told: Any) -> Arm:

@@ -15,7 +15,7 @@ from dolfinopt.mesh import budget
 from dolfinopt.mesh.budget import check_budget, free_memory
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.load import Arm, load_scene
+from dolfinopt.scene.load import Arm, read_scene
 
 COMM = MPI.COMM_WORLD
 
@@ -25,7 +25,7 @@ COMM = MPI.COMM_WORLD
     [["arms.cells=[100000,100000]"], ["arms.mesh=meshes/arm_bores.geo", "arms.mesh_size=1e-6"]],
 )
 def test_what_exceeds_the_memory_is_refused(changes, shared_tmp_path):
-    scene = load_scene(TWO_ARM, changes)
+    scene = read_scene(TWO_ARM, changes)
     out = shared_tmp_path / "out"
     for attempt in (
         lambda: check_budget(COMM, scene),
@@ -40,9 +40,9 @@ def test_what_exceeds_the_memory_is_refused(changes, shared_tmp_path):
     ("make", "low", "high", "words"),
     [
         # 2.28 GB beyond the libraries for two arms of 1600 x 96 cells on one rank.
-        (lambda: load_scene(TWO_ARM, ["arms.cells=[1600,96]"]), 2.0, 2.6, "3.07e+05 cells"),
+        (lambda: read_scene(TWO_ARM, ["arms.cells=[1600,96]"]), 2.0, 2.6, "3.07e+05 cells"),
         # As many nodes as of four times the cells, and 1.3 times the memory.
-        (lambda: load_scene(TWO_ARM, ["arms.cells=[800,48]", "arms.element=quadratic"]),
+        (lambda: read_scene(TWO_ARM, ["arms.cells=[800,48]", "arms.element=quadratic"]),
          2.0, 3.4, "7.68e+04 cells"),
         # By conjugate gradients 8.2 GB for a link of 996 000 degrees of freedom.
         pytest.param(lambda: solid_scene(cells=(360, 36, 24)), 8.0, 9.5, "3.11e+05 cells",

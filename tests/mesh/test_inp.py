@@ -82,10 +82,13 @@ def link(folder: Path, name: str, **keys) -> ArmMesh:
     return arm_mesh(COMM, Arm(mesh=str(folder / name), cell_shape="tetrahedron", **SIZE | keys))
 
 
-def bore(x: float, radius: float = RADIUS, sign: float = 1.0) -> dict:
+def bore(name: str, x: float, radius: float = RADIUS, sign: float = 1.0) -> dict:
     """Return a bore of the turned link."""
     point, axis = TURNED @ [x, 0.0, 0.0] + MOVED, sign * 3.0 * TURNED[:, 2]
-    return {"point": tuple(point), "axis": tuple(axis), "radius": radius}
+    return {"name": name, "point": tuple(point), "axis": tuple(axis), "radius": radius}
+
+
+BEGIN, END = bore("inboard", 0.0), bore("outboard", LENGTH)
 
 
 def same(mesh: ArmMesh, other: ArmMesh) -> bool:
@@ -107,18 +110,17 @@ def test_file_of_abaqus_is_that_of_gmsh(folder) -> None:
 
 def test_link_is_found_by_its_bores_wherever_it_lies(folder) -> None:
     """Turned, in mm, cells of second order and no sets: the same arm to rounding."""
-    bores = {"inboard_bore": bore(0.0), "outboard_bore": bore(LENGTH)}
-    turned = link(folder, "turned.inp", mesh_scale=1e-3, **bores)
+    turned = link(folder, "turned.inp", mesh_scale=1e-3, interfaces=(BEGIN, END))
     assert same(turned, link(folder, "link.msh"))
     # An axis the other way turns the link over about x: its mirror image in y and z together.
     over = link(folder, "turned.inp", mesh_scale=1e-3,
-                inboard_bore=bore(0.0, sign=-1.0), outboard_bore=bore(LENGTH))  # fmt: skip
+                interfaces=(bore("inboard", 0.0, sign=-1.0), END))  # fmt: skip
     mirrored = np.sort(over.centroid * [1.0, -1.0, -1.0], axis=0)
     assert np.allclose(mirrored, np.sort(turned.centroid, axis=0), atol=1e-9)
     # A .msh file alike, where its groups are not asked for.
-    there = {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0), "radius": RADIUS}
-    beyond = there | {"point": (LENGTH, 0.0, 0.0)}
-    again = link(folder, "link.msh", inboard_bore=there, outboard_bore=beyond)
+    there = BEGIN | {"point": (0.0, 0.0, 0.0), "axis": (0.0, 0.0, 1.0)}
+    beyond = there | {"name": "outboard", "point": (LENGTH, 0.0, 0.0)}
+    again = link(folder, "link.msh", interfaces=(there, beyond))
     assert same(again, link(folder, "link.msh"))
 
 
@@ -223,20 +225,20 @@ def test_nodes_of_an_element_set_and_faces_of_a_surface() -> None:
 
 def test_what_is_missing_is_told(folder) -> None:
     """Sets of other names, bores of other radii or places, with what the file has."""
-    with refused('node set "inboard" is missing', "*NSET, NSET=inboard", "inboard_bore"):
+    with refused('node set "inboard" is missing', "*NSET, NSET=inboard", "state its bore"):
         link(folder, "turned.inp")
-    keys = {"mesh_scale": 1e-3, "outboard_bore": bore(LENGTH)}
     with refused("no bore of radius 0.01 m", '"inboard"', "0.012 m from the axis", "mesh_scale"):
-        link(folder, "turned.inp", inboard_bore=bore(0.0, 0.01), **keys)
+        bores = bore("inboard", 0.0, 0.01), END
+        link(folder, "turned.inp", mesh_scale=1e-3, interfaces=bores)
 
 
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"inboard_bore": bore(0.0)}, ["outboard_bore", "the arm's frame"]),
-        ({"inboard_bore": bore(0.0), "outboard_bore": bore(0.31)}, ["0.31 [m]", "distance"]),
-        ({"inboard_bore": bore(0.0) | {"axis": (0.0, 0.0, 0.0)}, "outboard_bore": bore(LENGTH)},
-         ["not of length zero"]),
+        ({"interfaces": (BEGIN,)}, ['"outboard"', "the arm's frame"]),
+        ({"interfaces": (BEGIN, bore("outboard", 0.31))}, ["0.31 [m]", "distance"]),
+        ({"interfaces": (BEGIN | {"axis": (0.0, 0.0, 0.0)}, END)}, ["not of length zero"]),
+        ({"interfaces": (BEGIN | {"axis": None}, END)}, ["expected those of the bore"]),
         ({"cell_shape": None}, ["tetrahedron", ".inp"]),
         ({"mesh": None, "cells": (20, 4), "cell_shape": None, "mesh_scale": 0.001},
          ["only with mesh"]),

@@ -208,8 +208,8 @@ HOLLOW = ("arms.link1.hollow=true", "arms.link1.wall=0.002")
 def test_the_wall_has_the_volume_of_its_section(hull, area):
     """To rounding: mitred corners of a box, and a circle's area of a polygon."""
     mesh = hull.member(WALL)
-    check_cells(mesh.points, mesh.cells[:, TENSOR[8]])
-    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[8]]]).sum() == pytest.approx(area * 0.5)
+    check_cells(mesh.points, mesh.cells[:, TENSOR[3, 8]])
+    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[3, 8]]]).sum() == pytest.approx(area * 0.5)
     assert len(mesh.inboard) == len(mesh.outboard) == hull.shape[1]
 
 
@@ -320,7 +320,7 @@ def hull_arm(tmp_path, mesh: Member, **keys):
     path = tmp_path / "hull.msh"
     path.write_bytes(msh_bytes(mesh))
     size = {"height": 0.06, "thickness": 0.04, "cells": (10, 4, 4)}
-    told = {"hollow": True, "hull": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
+    told = {"hollow": True, "section": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
     return solid_arm(MPI.COMM_SELF, **(size | told | keys))
 
 

@@ -14,7 +14,7 @@ from dolfinopt.motion.build import breakpoints, rigid_motion, target_of
 from dolfinopt.motion.machine import skeleton
 from dolfinopt.motion.poses import relative_vectors
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.scene.load import load_scene, scene_from_dict
+from dolfinopt.scene.load import read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial
 ARM, ROBOT = "demos/spatial_arm.toml", "demos/robot_link.toml"
@@ -30,7 +30,7 @@ def write(file, names, *columns):
 
 
 def scene_of(demo, *changes):
-    return load_scene(demo, ["motion.path=points", *changes])
+    return read_scene(demo, ["motion.path=points", *changes])
 
 
 def differences(scene, t, key, h=1e-3):
@@ -111,7 +111,7 @@ def test_six_axes(kind, tmp_path):
     """Poses of a robot with an offset wrist: forward of inverse, and the joints they were of."""
     t = np.linspace(0.0, 1.8, 5)
     q = JOINTS + ((t / 1.8) ** 2 * (3.0 - 2.0 * t / 1.8))[:, None] * TURNED
-    place, R = end_of(load_scene(ROBOT), q)
+    place, R = end_of(read_scene(ROBOT), q)
     turned = Rotation.from_matrix(R)
     rows = turned.as_euler("xyz") if kind == "roll,pitch,yaw" else turned.as_rotvec()
     file = write(tmp_path / "poses.csv", f"t,x,y,z,{kind}", t, place, rows)
@@ -129,7 +129,7 @@ def test_six_axes(kind, tmp_path):
 
 def test_turn_on_the_spot(tmp_path):
     """From stop to stop by a law with limits, which are of the speed along the path: not here."""
-    place, R = end_of(load_scene(ROBOT), JOINTS[None])
+    place, R = end_of(read_scene(ROBOT), JOINTS[None])
     start = Rotation.from_matrix(R)
     turned = Rotation.from_rotvec([0.0, 0.0, 0.4]) * start
     rows = np.vstack([start.as_rotvec(), turned.as_rotvec()])

@@ -17,7 +17,7 @@ from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
 from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
 from dolfinopt.scene.csv_table import Table, read_table
 from dolfinopt.scene.laws import Law, Limits, law_for
-from dolfinopt.scene.load import Scene, load_scene, scene_from_dict
+from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -157,7 +157,7 @@ def test_fastest(name: str, limits: dict[str, float], expected: float) -> None:
 
 def posed(**motion: Any) -> Scene:
     """Return the example with another motion."""
-    data = load_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
+    data = read_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
     return scene_from_dict(data | {"motion": {"path": "arc"} | motion}, "test.toml")
 
 

@@ -49,7 +49,7 @@ from dolfinopt.multibody.tree import (
     Rotor,
 )
 from dolfinopt.reduction import Options, craig_bampton, modal
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 
 MANY = (9, 8, 9)  # more than a motion and a load have numbers
 DIFFERENCES = 1e-11  # relative: what those of sixth order leave on functions of size one
@@ -289,7 +289,7 @@ def test_few_instants_do_not_depend_on_memory() -> None:
 
     Arrays of all small sizes that come and go make the allocator choose other places every time.
     """
-    scene = load_scene(ROOT / "demos" / "three_arm.toml")
+    scene = read_scene(ROOT / "demos" / "three_arm.toml")
     for count in (1, 2, 3, 4):
         one, found = machine_of("3 arms", count), set()
         weights, t = np.random.default_rng(3).normal(size=(count, 2)), np.linspace(0.2, 0.7, count)

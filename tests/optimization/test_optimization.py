@@ -145,7 +145,7 @@ def test_a_step_without_a_motion_is_made_shorter(monkeypatch):
         if self.solutions:
             lengths.append(x)
             if len(lengths) <= fails[0]:
-                self.initial_solutions = self.solutions
+                self.start = self.solutions, {}
                 raise ConvergenceError("too weak")
         return tried(self, x)
 
@@ -165,8 +165,8 @@ def test_a_step_without_a_motion_is_made_shorter(monkeypatch):
 
 
 @pytest.mark.slow
-# With one threshold grey edges stay that are as good as any: 0.10; it keeps no width.
-@pytest.mark.parametrize(("kind", "grayness"), [("heaviside", 0.12), ("robust", 0.02)])
+# With one threshold grey edges stay that are as good as any: 0.103; it keeps no width.
+@pytest.mark.parametrize(("kind", "grayness"), [("heaviside", 0.11), ("robust", 0.02)])
 def test_projection_ends_crisp(kind, grayness):
     """From all grey to no grey with volumes kept, and as good as without a projection or better."""
     # Cut it is the same design, but for cells that meet in corners alone: cut it is without them.

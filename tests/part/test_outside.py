@@ -23,7 +23,7 @@ from dolfinopt.parallel import partition_arms
 from dolfinopt.part.part import Curves, make_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.sensitivity import static_response
-from dolfinopt.scene.load import load_scene
+from dolfinopt.scene.load import read_scene
 
 skfem = pytest.importorskip("skfem", reason="needs the extra 'outside' (scikit-fem)")
 pytestmark = pytest.mark.serial
@@ -54,7 +54,7 @@ def made(tmp_path_factory):
 def state_of(folder, name, mesh):
     """Return the arm with a mesh of its part, of solid material."""
     mesh.write(folder / "part" / f"{name}.msh")
-    scene = load_scene(folder / "part" / "part.toml")
+    scene = read_scene(folder / "part" / "part.toml")
     arms = build_arms(scene, partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile())
     [arm] = [arm for k, arm in arms.items() if scene.arms[k].name == name]
     return arm.state(np.ones(arm.mesh.num_cells))

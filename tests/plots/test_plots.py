@@ -497,9 +497,9 @@ def test_units_of_drives_in_space(slides):
     kinds = ["prismatic" if k in slides else one.type for k, one in enumerate(scene.movable)]
     count = len(kinds)
     assert count == 3
-    joints = [one.model_copy(update={"type": t}) for one, t in zip(scene.movable, kinds)]
+    joints = [one.unchecked_copy({"type": t}) for one, t in zip(scene.movable, kinds)]
     control = SimpleNamespace(stiffness=(1.0,) * count, damping=(1.0,) * count)
-    scene = scene.model_copy(update={"joints": (*joints,), "control": control})
+    scene = scene.unchecked_copy({"joints": (*joints,), "control": control})
     zero = np.zeros((4, count))
     trajectory = SimpleNamespace(
         scene=scene, q_r=zero, desired=SimpleNamespace(q=zero), joint_forces=zero,

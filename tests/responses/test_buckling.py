@@ -130,7 +130,6 @@ def test_worst_instants_are_peaks():
     t = np.linspace(0.0, 5.0, 501)
     values = np.sin(np.pi * t) ** 2 * (1.0 + t)
     assert t[worst_instants(values)] == pytest.approx([4.5, 3.5, 2.5], abs=0.03)
-    assert t[worst_instants(values, 0.8)] == pytest.approx([4.5, 3.5], abs=0.03)
     assert worst_instants(np.array([3.0, 1.0, 2.0])) == [0, 2]  # ends count
     assert worst_instants(np.zeros(3)) == worst_instants(-np.ones(3)) == []
 
@@ -142,11 +141,11 @@ def test_pressure_is_found_between_stronger_tension(bar):
     t = np.linspace(0.0, 1.0, 101)
     size = 3e3 * np.sin(4.0 * np.pi * t) ** 2 * np.where((t > 0.5) & (t < 0.75), -0.3, 1.0)
     a = size[:, None] * under(state, FORCE, 1.0).a
-    found = pressed(state, ArmLoads(0, 0, a), 1.0)
+    found = pressed(state, ArmLoads(0, 0, a, 1.0, np.arange(101)))
     assert [t[one.instant] for one in found] == pytest.approx([0.63], abs=0.011)
     assert found[0].modes.inverse[0] == pytest.approx(1.0 / factor_of(state, FORCE, size.min()))
     # Twice as stiff under the same stress: half as near to buckling.
-    (stiffer,) = pressed(state, ArmLoads(0, 0, a), 2.0)
+    (stiffer,) = pressed(state, ArmLoads(0, 0, a, 2.0, np.arange(101)))
     assert stiffer.modes.inverse[0] == pytest.approx(0.5 * found[0].modes.inverse[0])
 
 

@@ -6,7 +6,7 @@ import pytest
 from runs import ROOT, TWO_ARM, overrides, run, summary_of, tomllib
 from scenes import minimal, refused
 
-from dolfinopt.scene.load import load_scene, pose_scenarios, scene_from_dict
+from dolfinopt.scene.load import pose_scenarios, read_scene, scene_from_dict
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.messages import implausible
 from dolfinopt.scene.schema import scene_schema
@@ -56,10 +56,10 @@ def test_numbers_take_the_place_of_the_catalogue():
     assert (scene.material.young_modulus, scene.material.density) == (70e9, 2810.0)
     for key in ("material", "material.name"):  # numbers of the file do not outlive another name
         known = {"name": "steel S355", **CATALOGUE["steel S355"].values}
-        found = load_scene(TWO_ARM, [f"{key}=steel S355"]).material
+        found = read_scene(TWO_ARM, [f"{key}=steel S355"]).material
         assert found.model_dump(exclude_none=True) == known
-    assert load_scene(TWO_ARM).material.yield_strength is None
-    assert load_scene(TWO_ARM, ["material.yield_strength=95e6"]).material.yield_strength == 95e6
+    assert read_scene(TWO_ARM).material.yield_strength is None
+    assert read_scene(TWO_ARM, ["material.yield_strength=95e6"]).material.yield_strength == 95e6
 
 
 def test_an_arm_has_its_own_material():
@@ -175,7 +175,7 @@ DEMOS = sorted((ROOT / "demos").glob("*.toml"))
 
 @pytest.mark.parametrize("demo", DEMOS, ids=lambda path: path.stem)
 def test_demos_are_plausible(demo):
-    assert implausible(load_scene(demo)) == []
+    assert implausible(read_scene(demo)) == []
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_demos_are_plausible(demo):
     ],
 )
 def test_what_is_hardly_meant_is_told(change, words):
-    found = implausible(load_scene(TWO_ARM, [change]))
+    found = implausible(read_scene(TWO_ARM, [change]))
     assert len(set(found)) == len(found)
     assert found == [] if words is None else all(word in found[0] for word in words)
 
@@ -206,11 +206,11 @@ def test_cells_too_coarse_for_solid_ends(tmp_path):
     """0.015 m of them; a cell's centre lies within it from 34 cells along the metre on."""
     scene = tmp_path / "scene.toml"
     scene.write_text(TWO_ARM.read_text().replace("passive = 0.0 ", "# "))
-    coarse = implausible(load_scene(scene, ["arms.cells=[33, 2]"]))
+    coarse = implausible(read_scene(scene, ["arms.cells=[33, 2]"]))
     names = [line.split(":")[0] for line in coarse]
     assert names == ["arms.arm1.cells = [33, 2]", "arms.arm2.cells = [33, 2]"]
-    assert implausible(load_scene(scene, ["arms.cells=[34, 2]"])) == []
-    assert implausible(load_scene(scene, ["arms.cells=[33, 2]", "arms.passive=0"])) == []
+    assert implausible(read_scene(scene, ["arms.cells=[34, 2]"])) == []
+    assert implausible(read_scene(scene, ["arms.cells=[33, 2]", "arms.passive=0"])) == []
 
 
 def test_warnings_come_before_the_run_once_and_are_kept(tmp_path, capsys):

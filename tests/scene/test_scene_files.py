@@ -16,7 +16,7 @@ from dolfinopt.scene.load import (
     Arm,
     Scene,
     describe_keys,
-    load_scene,
+    read_scene,
     resolve_file,
     scene_from_dict,
 )
@@ -141,7 +141,7 @@ def test_kinds_of_mesh_files(tmp_path, suffix, keys, words):
 
 
 def load_error(path, *words):
-    return refusal(lambda: load_scene(path), str(path), *words)
+    return refusal(lambda: read_scene(path), str(path), *words)
 
 
 def toml(head, keys):
@@ -176,7 +176,7 @@ def test_bad_file_content(tmp_path, text, words):
     path.write_text(text, errors="surrogateescape")
     load_error(path, *words)
     path.write_text(REQUIRED + toml("[payload]", {"mass": 6.0}))  # is enough
-    assert load_scene(path) == scene_from_dict(minimal(1, name="one"))
+    assert read_scene(path) == scene_from_dict(minimal(1, name="one"))
 
 
 def test_files_that_cannot_be_read(tmp_path, monkeypatch):
@@ -190,7 +190,7 @@ def test_files_that_cannot_be_read(tmp_path, monkeypatch):
     ):
         load_error(path, reason)
     with pytest.raises(InputError, match=r"a\\x00b: not a file name"):
-        load_scene("a\0b")
+        read_scene("a\0b")
 
     # The superuser may read every file, so that file modes cannot make this happen.
     def deny(self):
@@ -267,4 +267,4 @@ def test_any_override_is_accepted_or_refused(pairs):
 def test_any_file_is_accepted_or_refused(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "any.toml"
     path.write_bytes(content + REQUIRED.encode())
-    accept_or_refuse(lambda: load_scene(path))
+    accept_or_refuse(lambda: read_scene(path))

@@ -1,5 +1,6 @@
 """Cases: known by what they compute, done once, resumed, and the same on any number of ranks."""
 
+import logging
 import shutil
 
 import numpy as np
@@ -353,11 +354,15 @@ def test_another_run_is_refused(plan, tmp_path, monkeypatch):
     refusal(lambda: run_cases(plan, tmp_path, SELF, shown=False), str(tmp_path), "another run")
 
 
-def test_plain_lines_tell_of_every_case(plan, shared_tmp_path, capsys):
-    run_cases(plan[3:5], shared_tmp_path, WORLD)
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == (2 if WORLD.rank == 0 else 0)
-    for left, line in zip((1, 0), lines):
-        assert "N m" in line and line.endswith(f"; {left} to go")
-    run_cases(plan[3:5], shared_tmp_path, WORLD)
-    assert capsys.readouterr().err == ""
+def test_every_case_is_logged(plan, shared_tmp_path, caplog):
+    log = logging.getLogger("dolfinopt.progress")
+    log.propagate = True
+    with caplog.at_level(logging.INFO, "dolfinopt.progress"):
+        run_cases(plan[3:5], shared_tmp_path, WORLD)
+        lines = [record.getMessage() for record in caplog.records]
+        assert len(lines) == (2 if WORLD.rank == 0 else 0)
+        for left, line in zip((1, 0), lines):
+            assert "N m" in line and line.endswith(f"; {left} to go")
+        caplog.clear()
+        run_cases(plan[3:5], shared_tmp_path, WORLD)
+        assert not caplog.records

@@ -20,6 +20,7 @@ from dolfinopt.study.sections import (
     WORTH,
     Members,
     Row,
+    ahead,
     lightest,
     sections_of,
     study_sections,
@@ -205,6 +206,9 @@ def test_tubes_in_space(tmp_path, capsys):
     deviation = dict(zip(kinds, column(rows, "maximal deviation [mm]"), strict=True))
     assert deviation["rectangular tube"] < 0.5 * deviation["solid bar"]
     assert "the rectangular tube wins" in capsys.readouterr().out
+    bar, tube, *_, walls = ahead(do.load_scene(SPATIAL, scene[1::2]), tmp_path / "a", MPI.COMM_SELF)
+    value = [float(line.split("load cases ")[1].split()[0]) for line in (bar, tube)]
+    assert value[1] < 0.5 * value[0] and "hollow" in walls
     assert (tmp_path / "sections_deviation.png").exists()
 
 
@@ -227,14 +231,15 @@ def test_arms_that_no_member_replaces(shared_tmp_path):
     scene = do.load_scene(SPATIAL)
     column, link, other = scene.arms
     side = Interface(name="side", point=(0.1, 0.0, 0.0), radius=0.01)
-    branched = link.model_copy(update={"interfaces": (side,)})
-    rigid = [one.model_copy(update={"rigid": True}) for one in (link, other)]
+    branched = link.unchecked_copy({"interfaces": (side,)})
+    rigid = [one.unchecked_copy({"rigid": True}) for one in (link, other)]
     for arms, words in (
         ((column, branched, other), ("arms.link1.interfaces", "one outboard interface")),
         ((column, *rigid), ("expected arms with a design",)),
     ):
-        changed = scene.model_copy(update={"arms": arms})
+        changed = scene.unchecked_copy({"arms": arms})
         refusal(lambda: study_sections(changed, (), shared_tmp_path / "o", WORLD), *words)  # noqa: B023
+        assert ahead(changed, shared_tmp_path / "o", WORLD) == []
     assert not (shared_tmp_path / "o").exists()
 
 

@@ -68,7 +68,10 @@ def test_vary_refuses_and_axes_bear_units():
         refusal(lambda: parse_vary(text), "--vary", "expected")  # noqa: B023
     with pytest.raises(click.UsageError, match="what"):
         run_command("compare", TWO_ARM)
-    for axis in ("payload.mass [kg]", "arms.arm2.length [m]", "motion.flattening [-]"):
+    for axis in ("payload.mass [kg]", "arms.arm2.length [m]", "motion.flattening [-]",
+                 "joints.elbow.gear_stiffness [N m/rad, N/m]", "forces.pull.force [N]",
+                 "closures.0.length [m]", "closure.point [m]",
+                 "control.stiffness* [-]"):  # fmt: skip
         assert parse_vary(f"{axis.split()[0]}=1,2").axis == axis
 
 

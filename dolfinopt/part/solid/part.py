@@ -269,7 +269,7 @@ class SolidPart:
             "height": height,
             "thickness": thickness,
             "cell_shape": "tetrahedron",
-            "symmetric_z": False,
+            "symmetric": False,
             "extruded": False,
         }
 

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
+    NAMES_FILE,
     FileName,
     Length,
     Loc,
@@ -23,19 +24,16 @@ from dolfinopt.scene.tables.base import (
 )
 from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
+    DRIVE_KEYS,
     FRICTION_SPEED,
-    PART_KEYS,
     BearingDamping,
     BearingStiffness,
-    Bore,
     Friction,
     FrictionSpeed,
     GearDamping,
     GearRatio,
     GearStiffness,
     Interface,
-    JointDamping,
-    JointStiffness,
     Point,
     RotorInertia,
     check_bores,
@@ -43,7 +41,6 @@ from dolfinopt.scene.tables.joints import (
     check_motor,
     check_parts,
     check_plane_bearing,
-    check_springs,
     in_frame,
 )
 from dolfinopt.scene.tables.material import (
@@ -105,9 +102,10 @@ SIMPLICES = ("triangle", "tetrahedron")
 SOLID_SHAPES = ("hexahedron", "tetrahedron")
 SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
-SectionName = Literal["box", "tube"]
+SECTIONS = ("box", "tube")
+SectionOrFile = Annotated[str, NAMES_FILE, Field(json_schema_extra={"examples": list(SECTIONS)})]
 WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
-WALL_KEYS = ("section", "hull", "wall", "min_wall", "max_wall", "ribs")
+WALL_KEYS = ("section", "wall", "min_wall", "max_wall", "ribs")
 RIB_LENGTH, RIB_PITCH = 2, 4  # cells along a hollow arm: of a rib; from one to the next at least
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
@@ -119,18 +117,12 @@ STEP_FILES = (".step", ".stp")
 MESH_FILES = (".geo", ".msh", ".inp", *STEP_FILES)
 
 # What sits at an arm's ends; arms of one design may differ in it.
-JOINT_KEYS = (
-    "joint_mass", "joint_inertia", "rotor_inertia", "gear_ratio", "joint_stiffness",
-    "joint_damping", *PART_KEYS,
-)  # fmt: skip
-SPRING_KEYS = "joint_stiffness", "joint_damping"  # the same spring by either pair of keys
-GEAR_KEYS = "gear_stiffness", "gear_damping"
+JOINT_KEYS = ("joint_mass", "joint_inertia", *DRIVE_KEYS)
 SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
-BORE_KEYS = ("mesh_scale", "inboard_bore", "outboard_bore")
-MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset", *BORE_KEYS)
+MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset", "mesh_scale")
 # What an arm with a mesh of its own does not take.
-OF_OTHER_MESHES = ("cells", "interface_offset", *BORE_KEYS)
+OF_OTHER_MESHES = ("cells", "interface_offset", "mesh_scale")
 SIZE_PARAMETER = "mesh size (m)"  # its name in a .geo file
 CELLS_ACROSS = 12  # the height of an arm from a STEP file without mesh_size
 SOLID_CELLS_ACROSS = 4  # the smaller of height and thickness of a solid one
@@ -139,7 +131,7 @@ OWN_KEYS = (
     "name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
 )  # fmt: skip
 # What an arm with a pattern has from there.
-PATTERN_KEYS = ("passive", "symmetric", "symmetric_z", "extruded", "regions")
+PATTERN_KEYS = ("passive", "symmetric", "extruded", "regions")
 
 
 def check_arm_name(name: str) -> str:
@@ -211,11 +203,10 @@ class Arm(Table):
         "height, at most a tenth of the length; with a mesh file 0, its own groups "
         "[m]",
     )
-    symmetric: bool = Field(
-        default=False, description="keep the design symmetric about the arm's axis y = 0 [-]"
-    )
-    symmetric_z: bool = Field(
-        default=False, description="keep the design of a solid arm symmetric about z = 0 [-]"
+    symmetric: bool | Literal["z", "yz"] = Field(
+        default=False,
+        description="keep the design symmetric about the arm's axis: true, about y = 0; of a solid "
+        'arm also "z", about z = 0, and "yz", about both [-]',
     )
     extruded: bool = Field(
         default=False,
@@ -227,15 +218,11 @@ class Arm(Table):
         "is the thickness of the wall; in space, with cells = [nx, ny, nz], of which those on the "
         "surface count [-]",
     )
-    section: SectionName | None = Field(
+    section: SectionOrFile | None = Field(
         default=None,
-        description='section of a hollow arm; default: "box"; "tube" is round, height = thickness '
-        "[-]",
-    )
-    hull: FileName | None = Field(
-        default=None,
-        description="mesh file (.msh) of a solid whose outer surface a hollow arm has in place of "
-        "a section; every ray from the arm's axis meets it once [-]",
+        description='section of a hollow arm: "box" by default; "tube" is round, height = '
+        "thickness; or a mesh file (.msh) of a solid whose outer surface the arm has, which every "
+        "ray from the arm's axis meets once [-]",
     )
     wall: WallThickness | None = Field(
         default=None, description="initial thickness of the wall of a hollow arm [m]"
@@ -297,8 +284,6 @@ class Arm(Table):
     gear_ratio: GearRatio = None
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0
-    joint_stiffness: JointStiffness = 0.0
-    joint_damping: JointDamping = 0.0
     bearing_stiffness: BearingStiffness = None
     bearing_damping: BearingDamping = None
     friction: Friction = None
@@ -317,15 +302,8 @@ class Arm(Table):
     interfaces: tuple[Interface, ...] = Field(
         default=(),
         description="in space: further outboard interfaces, each with six coordinates, on which "
-        "joints or the payload sit; taken from the arm whose design this one shares alone",
-    )
-    inboard_bore: Bore | None = Field(
-        default=None,
-        description="of a solid arm with a mesh file: the bore that is the inboard interface. It "
-        "and outboard_bore place the arm's frame, wherever the file has the arm",
-    )
-    outboard_bore: Bore | None = Field(
-        default=None, description="the bore that is the outboard interface"
+        "joints or the payload sit, and the bores at the ends of a mesh file; taken from the arm "
+        "whose design this one shares alone, the bores with the mesh of the arm before",
     )
 
     @model_validator(mode="after")
@@ -349,8 +327,8 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_thickness(self) -> Arm:
-        for key in ("symmetric_z", "extruded"):
-            if getattr(self, key) and not self.is_solid:
+        for key in ("symmetric", "extruded"):
+            if getattr(self, key) and not self.is_solid and (key, self.symmetric) != (key, True):
                 raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", (key,))
         if self.extruded and self.cells is None:
             raise Refusal("expected only with cells = [nx, ny, nz]", ("extruded",), ("mesh",))
@@ -417,11 +395,9 @@ class Arm(Table):
     def _check_wall(self) -> None:
         """Refuse limits of the wall that leave no room or no hollow."""
         least, most = self.wall_limits
-        if self.hull is not None:
-            if self.section is not None:
-                raise Refusal("expected none with hull", ("section",), ("hull",))
-            if Path(self.hull).suffix.lower() != ".msh":
-                raise Refusal("expected a file that ends in .msh", ("hull",))
+        if self.hull is not None and Path(self.hull).suffix.lower() != ".msh":
+            words = " | ".join(map(shown, SECTIONS))
+            raise Refusal(f"expected {words}, or a file that ends in .msh", ("section",))
         if self.section == "tube" and self.height != self.thickness:
             raise Refusal(
                 f'expected thickness = {self.thickness} [m], the diameter, with section = "tube"',
@@ -451,6 +427,11 @@ class Arm(Table):
             )
 
     @property
+    def hull(self) -> str | None:
+        """Mesh file of the solid whose outer surface a hollow arm has; None of a box or a tube."""
+        return None if self.section in (None, *SECTIONS) else self.section
+
+    @property
     def wall_limits(self) -> tuple[float, float]:
         """Least and largest thickness of a hollow arm's wall, m."""
         assert self.wall is not None
@@ -475,7 +456,6 @@ class Arm(Table):
         for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
                 raise Refusal("expected only with rigid = true", (key,), ("rigid",))
-        check_springs(self)
         check_parts(self, "arms")
         return self
 
@@ -570,6 +550,11 @@ class Arm(Table):
         if self.cells is not None:
             return len(self.cells) == 3
         return self.cell_shape in SOLID_SHAPES
+
+    @property
+    def symmetric_about(self) -> tuple[bool, bool]:
+        """Whether the design is symmetric about y = 0 and about z = 0."""
+        return self.symmetric in (True, "yz"), self.symmetric in ("z", "yz")
 
     @property
     def depth(self) -> float:
@@ -683,12 +668,23 @@ class Arm(Table):
     @property
     def num_outboard(self) -> int:
         """Count the coordinates of the arm's outboard interfaces: 3, in space 6 of each."""
-        return 6 * (1 + len(self.interfaces)) if self.is_solid else 3
+        return 6 * (1 + len(self.further_interfaces)) if self.is_solid else 3
+
+    @property
+    def further_interfaces(self) -> tuple[Interface, ...]:
+        """Return the outboard interfaces besides the arm's end."""
+        return tuple(one for one in self.interfaces if not one.is_end)
+
+    def end_bore(self, name: str) -> Interface | None:
+        """Return the bore at an end of a mesh file's arm, "inboard" or "outboard"; None: none."""
+        return next((one for one in self.interfaces if one.is_end == name), None)
 
     @property
     def interface_points(self) -> tuple[Point, ...]:
         """Return the reference points of all outboard interfaces in the arm's frame, m."""
-        return (self.length, 0.0, 0.0), *(in_frame(self, one.point) for one in self.interfaces)
+        return (self.length, 0.0, 0.0), *(
+            in_frame(self, one.point) for one in self.further_interfaces
+        )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse a name that is taken, and what does not fit the arm whose design it has."""
@@ -851,7 +847,6 @@ def _add_material_keys() -> None:
 
 
 _add_material_keys()
-Arm.model_rebuild(force=True)
 
 
 def declare_law(one: LawDeclaration, words: Mapping[str, str]) -> None:

@@ -8,11 +8,20 @@ from collections.abc import Mapping
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
+    from typing_extensions import Self
+
     from dolfinopt.scene.schema import Scene
 
 # Ranges far beyond what machines need, within which products and quotients of all quantities stay
@@ -44,7 +53,31 @@ class Refusal(ValueError):
 class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    # Validators are built at first use, once for the whole scene, not when a table is imported.
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True
+    )
+
+    def unchecked_copy(self, update: Mapping[str, Any]) -> Self:
+        """Return a copy with other values, which are known to fit."""
+        return super().model_copy(update=update)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with other values, checked as those of a file are.
+
+        Raises:
+            InputError: the table has no such key, or cannot have the value.
+        """
+        copy = super().model_copy(deep=deep)
+        if not update:
+            return copy
+        values = {key: getattr(self, key) for key in type(self).model_fields} | {**update}
+        try:
+            checked = self.model_validate(values)
+        except ValidationError as error:
+            raise input_error(type(self).__name__.lower(), problem(error)) from None
+        object.__setattr__(checked, "__pydantic_private__", copy.__pydantic_private__)
+        return checked
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Check what this table at `at` and other tables of `scene` must agree on.
@@ -78,6 +111,16 @@ class Table(BaseModel):
         if get_origin(annotation) is Literal and value is not None and type(value) not in types:
             raise ValueError
         return value
+
+
+def problem(error: ValidationError) -> str:
+    """Return key and reason of the first problem of a table on its own."""
+    first = error.errors(include_url=False)[0]
+    refusal = first.get("ctx", {}).get("error")
+    keys = refusal.keys[:1] if isinstance(refusal, Refusal) else ()
+    key = ".".join(map(str, (*first["loc"], *(part for key in keys for part in key))))
+    reason = refusal.reason if isinstance(refusal, Refusal) else first["msg"]
+    return f"{key} = {shown(first['input'])}: {reason}" if not keys else f"{key}: {reason}"
 
 
 def without_none(annotation: Any) -> Any:

@@ -15,14 +15,13 @@ from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
     input_error,
-    shown,
 )
 from dolfinopt.scene.tables.joints import (
-    OUTBOARD,
     Components,
     check_direction,
-    interface_number,
-    refuse_unknown,
+    check_site,
+    place_of,
+    site_of,
 )
 from dolfinopt.scene.tables.machine import (
     GROUND,
@@ -123,11 +122,6 @@ class Closures(Table):
         """Return what is positive of every equation's force, in the joint's frame, and its unit."""
         return (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
 
-    def site(self, which: int) -> tuple[str, str]:
-        """Return arm and interface of the first (0) or second (1) end."""
-        arm, _, interface = self.between[which].partition(".")
-        return arm, interface or OUTBOARD
-
     @field_validator("axis")
     @classmethod
     def _check_axis(cls, axis: Components | None) -> Components | None:
@@ -204,7 +198,7 @@ class Closures(Table):
 
     def _check_in_plane(self, scene: Scene, at: Loc) -> None:
         """Refuse all but one pin or slider at the chain's end, and what it rules out."""
-        ends = [closing_site(scene, self, which) for which in (0, 1)]
+        ends = [place_of(scene, end) for end in self.between]
         alone = ends == [(len(scene.arms) - 1, 0), None] and len(scene.closures) == 1
         if not alone or self.kind not in IN_PLANE or any(self.rpy):
             raise Refusal(
@@ -243,14 +237,13 @@ class Closures(Table):
         """Refuse springs between drive and arm at joints of the plane that have no drive."""
         first = len(scene.arms) - scene.dependent_joints
         for index, arm in enumerate(scene.arms):
-            for key in ("joint_stiffness", "gear_stiffness"):
-                if index >= first and getattr(arm, key) > 0.0:
-                    raise Refusal(
-                        f"expected 0: the joint of {arm.name} follows from the others in the "
-                        "closed loop and has no drive",
-                        ("arms", index, key),
-                        (*at, "kind"),
-                    )
+            if index >= first and arm.gear_stiffness > 0.0:
+                raise Refusal(
+                    f"expected 0: the joint of {arm.name} follows from the others in the closed "
+                    "loop and has no drive",
+                    ("arms", index, "gear_stiffness"),
+                    (*at, "kind"),
+                )
             if arm.bearing_stiffness is not None:
                 raise Refusal(
                     "expected none with [[closures]] without [[joints]]: state [[joints]] about "
@@ -275,31 +268,10 @@ class Closures(Table):
             )
 
     def _check_ends(self, scene: Scene, at: Loc) -> None:
-        where, names = (*at, "between"), [arm.name for arm in scene.arms]
-        for which in (0, 1):
-            name, interface = self.site(which)
-            allowed = names if which == 0 else [*names, GROUND]
-            if name not in allowed:
-                told = " | ".join(shown(f"{one}.{OUTBOARD}" if one != GROUND else one)
-                                  for one in allowed)  # fmt: skip
-                first = "first" if which == 0 else "then"
-                raise Refusal(f"expected {first} an interface of an arm: {told}", where)
-            if name == GROUND:
-                if self.between[1] != GROUND:
-                    raise Refusal(f"expected {shown(GROUND)} alone", where)
-                continue
-            refuse_unknown(scene.arms[names.index(name)], interface, where)
-        if self.site(0)[0] == self.site(1)[0]:
-            raise Refusal("expected interfaces of two arms", where)
-
-
-def closing_site(scene: Scene, one: Closures, which: int) -> tuple[int, int] | None:
-    """Return arm and interface number of an end of a closure; None for the ground."""
-    name, interface = one.site(which)
-    if name == GROUND:
-        return None
-    k = [arm.name for arm in scene.arms].index(name)
-    return k, interface_number(scene.arms[k], interface) or 0
+        check_site(scene, self.between[0], (*at, "between"))
+        check_site(scene, self.between[1], (*at, "between"), (GROUND,))
+        if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
+            raise Refusal("expected interfaces of two arms", (*at, "between"))
 
 
 # -- `[closure]`, an older word -------------------------------------------------------------------
@@ -316,14 +288,11 @@ OLD_CLOSURE = (
 
 
 def read_old_closure(tree: dict[str, Any], source: str) -> None:
-    """Put [closure] of a scene in its places; `direction` is another word for `axis`.
+    """Put [closure] of a scene in its places.
 
     Raises:
         InputError: it is no table, or stands beside [[closures]] or [[joints]].
     """
-    for one in _rows(tree, "closures"):
-        if "direction" in one and "axis" not in one:
-            one["axis"] = one.pop("direction")
     if (table := tree.pop(OLD, None)) is not None:
         others = tree.get("closures") or tree.get("joints")
         take_old_keys(tree, None if others else table, source)

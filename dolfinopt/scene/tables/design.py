@@ -485,9 +485,18 @@ class Optimizer(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse further iterations where there is no exact gradient to iterate with."""
-        if not self.exact_iterations or not need_of(scene, "motion"):
-            return
         own = ("optimizer", "exact_iterations")
+        if self.exact_iterations and (
+            scene.objective.gradient == "exact" or not need_of(scene, "motion")
+        ):
+            raise Refusal(
+                'expected 0, the default: used only with objective.gradient = "esl" of a motion, '
+                "whose frozen loads it replaces",
+                own,
+                ("objective", "gradient"),
+            )
+        if not self.exact_iterations:
+            return
         if scene.reduction.method == "balanced":
             raise Refusal(
                 'expected "craig-bampton", "modal" or "krylov" with optimizer.exact_iterations: '

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -13,6 +14,7 @@ from dolfinopt.scene.tables.base import Length, Loc, Position, Refusal, Table, s
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
     from dolfinopt.scene.tables.arms import Arm
+    from dolfinopt.scene.tables.machine import Joint
 
 INBOARD, OUTBOARD = "inboard", "outboard"
 Point = tuple[Position, Position, Position]
@@ -31,24 +33,23 @@ Axis = Annotated[Vector, AfterValidator(check_direction)]
 
 
 def _check_name(name: str) -> str:
-    """Return `name` if it can name a group of faces besides those of the arm's ends."""
+    """Return `name` if it can name a group of faces."""
     if not name.strip() or len(name) > 64 or not name.isprintable():
         raise Refusal("expected 1 to 64 printable characters")
-    if name.strip().casefold() in (INBOARD, OUTBOARD):
-        raise Refusal(f'expected another name: "{INBOARD}" and "{OUTBOARD}" are the arm\'s ends')
     return name
 
 
 class Interface(Table):
-    """A rigid part of an arm's surface besides its outboard interface."""
+    """A rigid part of an arm's surface: one more, or the bore that is one of the arm's ends."""
 
     name: Annotated[str, AfterValidator(_check_name)] = Field(
         description="unique name of the arm's interface, also that of its faces in a mesh file and "
-        "of its node in a SID file [-]"
+        'of its node in a SID file; "inboard" and "outboard" are the bores at the ends of a solid '
+        "arm with a mesh file: they place the arm's frame, wherever the file has the arm [-]"
     )
     point: Point = Field(
-        description="its reference point in the arm's frame; with arms.inboard_bore in the mesh "
-        "file's [m]"
+        description="its reference point in the arm's frame, of a bore the middle of its axis; "
+        'with an interface "inboard" in the mesh file\'s frame [m]'
     )
     radius: Length | None = Field(
         default=None,
@@ -62,18 +63,45 @@ class Interface(Table):
         "the line through the point along this direction, of any length, in the point's frame [-]",
     )
 
+    @property
+    def is_end(self) -> str:
+        """Return "inboard" or "outboard" of the bore at an end, "" of another interface."""
+        name = self.name.strip().casefold()
+        return name if name in (INBOARD, OUTBOARD) else ""
+
+
+def site_of(text: str) -> tuple[str, str]:
+    """Return arm and interface of "arm.interface"; "arm" stands for its outboard one."""
+    arm, _, interface = text.partition(".")
+    return arm, interface or OUTBOARD
+
 
 def interface_number(arm: Arm, name: str) -> int | None:
-    """Return 0 for the outboard interface, 1 ... for `arms.interfaces`; None for another name."""
-    names = [OUTBOARD, *(one.name.casefold() for one in arm.interfaces)]
+    """Return 0 for the outboard interface, 1 ... for further ones; None for another name."""
+    names = [OUTBOARD, *(one.name.casefold() for one in arm.further_interfaces)]
     return names.index(name.casefold()) if name.casefold() in names else None
 
 
-def refuse_unknown(arm: Arm, name: str, at: Loc) -> None:
-    """Refuse a name that none of an arm's interfaces has."""
-    if interface_number(arm, name) is None:
-        allowed = " | ".join(shown(one) for one in (OUTBOARD, *(x.name for x in arm.interfaces)))
-        raise Refusal(f"expected the name of an interface of {arm.name}: {allowed}", at)
+def place_of(scene: Scene, text: str) -> tuple[int, int] | None:
+    """Return arm and interface number of "arm.interface"; None for the ground."""
+    name, interface = site_of(text)
+    k = next((k for k, arm in enumerate(scene.arms) if arm.name == name), None)
+    return None if k is None else (k, interface_number(scene.arms[k], interface) or 0)
+
+
+def check_site(scene: Scene, text: str, at: Loc, also: tuple[str, ...] = ()) -> None:
+    """Refuse what is no interface of an arm, nor one of the words `also`, such as "ground"."""
+    name, interface = site_of(text)
+    arms = {arm.name: arm for arm in scene.arms}
+    if text in also:
+        return
+    if name not in arms:
+        allowed = " | ".join(map(shown, (*also, *arms)))
+        raise Refusal(f'expected the name of an arm, or "arm.interface": {allowed}', at)
+    if interface_number(arms[name], interface) is None:
+        known = (OUTBOARD, *(one.name for one in arms[name].further_interfaces))
+        allowed = " | ".join(shown(f"{name}.{one}") for one in known)
+        raise Refusal(f"expected an interface of {name}: {allowed}", at)
 
 
 def check_interfaces(scene: Scene, index: int) -> None:
@@ -114,12 +142,12 @@ def check_used(scene: Scene) -> None:
         if arm.design is not None:
             continue
         sharing = [index, *(k for k, one in enumerate(scene.arms) if one.design == arm.name)]
-        for number, one in enumerate(arm.interfaces, start=1):
+        for number, one in enumerate(arm.further_interfaces, start=1):
             if not scene.used_interfaces & {(k, number) for k in sharing}:
                 raise Refusal(
-                    f'expected a joint with parent_interface = "{one.name}", one of [[closures]], '
+                    f'expected a joint with parent = "{arm.name}.{one.name}", one of [[closures]], '
                     "the payload or one of [[forces]] there: nothing sits on it",
-                    ("arms", index, "interfaces", number - 1, "name"),
+                    ("arms", index, "interfaces", arm.interfaces.index(one), "name"),
                     ("joints",),
                 )
 
@@ -131,39 +159,36 @@ SAME_LENGTH = 1e-3
 ALONG = 1e-3  # sine of the angle from an axis to the arm's, below which they are parallel
 
 
-class Bore(Table):
-    """The bore that is an interface of an arm with a mesh file, in the file's frame."""
-
-    point: Point = Field(description="the middle of the bore on its axis, in the file's frame [m]")
-    axis: Axis = Field(description="direction of its axis, of any length, in the file's frame [-]")
-    radius: Length = Field(description="its radius [m]")
-
-
 def check_bores(arm: Arm) -> None:
-    """Refuse bores that an arm cannot have, or that are not its length apart.
+    """Refuse bores at the ends that an arm cannot have, or that are not its length apart.
 
     Raises:
         Refusal: its keys are paths from the arm.
     """
-    bores = {key: getattr(arm, key) for key in ("inboard_bore", "outboard_bore")}
-    stated = [key for key, bore in bores.items() if bore is not None]
-    if arm.mesh is None or not arm.is_solid:
-        if stated:
+    ends = {one.name.strip().casefold(): k for k, one in enumerate(arm.interfaces)}
+    bores = [ends[name] for name in (INBOARD, OUTBOARD) if name in ends]
+    for k in bores:
+        at = ("interfaces", k)
+        if arm.mesh is None or not arm.is_solid:
             raise Refusal(
-                "expected only with the mesh file of a solid arm", (stated[0],), ("mesh",)
+                "expected only with the mesh file of a solid arm", (*at, "name"), ("mesh",)
             )
-        return
-    if len(stated) == 1:
-        (other,) = set(bores) - set(stated)
-        raise Refusal(f"expected {other} with it: both place the arm's frame", (stated[0],))
-    if stated:
-        apart = math.dist(arm.inboard_bore.point, arm.outboard_bore.point)  # type: ignore[union-attr]
+        if len(bores) == 1:
+            raise Refusal(
+                f'expected interfaces "{INBOARD}" and "{OUTBOARD}": both place the arm\'s frame',
+                (*at, "name"),
+            )
+        for key in ("axis", "radius"):
+            if getattr(arm.interfaces[k], key) is None:
+                raise Refusal("expected those of the bore", (*at, key), (*at, "name"))
+    if bores:
+        apart = math.dist(*(arm.interfaces[k].point for k in bores))
         if abs(apart - arm.length) > SAME_LENGTH * arm.length:
             raise Refusal(
-                f"expected {apart:.6g} [m], the distance of the points of inboard_bore and "
-                "outboard_bore",
+                f"expected {apart:.6g} [m], the distance of the points of the interfaces "
+                f'"{INBOARD}" and "{OUTBOARD}"',
                 ("length",),
-                ("outboard_bore",),
+                ("interfaces", bores[1], "point"),
             )
 
 
@@ -174,11 +199,12 @@ def frame_of(arm: Arm) -> tuple[Vector, tuple[Vector, Vector, Vector]] | None:
     bore's axis, as far as it is normal to x. Where it is along x, z is that of the file's axes
     which is normal to it best, as far as it is normal to x.
     """
-    if arm.inboard_bore is None or arm.outboard_bore is None:
+    inboard, outboard = arm.end_bore(INBOARD), arm.end_bore(OUTBOARD)
+    if inboard is None or outboard is None or inboard.axis is None:
         return None
-    o = arm.inboard_bore.point
-    x = _unit(tuple(b - a for a, b in zip(o, arm.outboard_bore.point)))
-    z = _unit(arm.inboard_bore.axis)
+    o = inboard.point
+    x = _unit(tuple(b - a for a, b in zip(o, outboard.point)))
+    z = _unit(inboard.axis)
     if math.hypot(*_cross(x, z)) < ALONG:
         best = min((2, 1, 0), key=lambda k: abs(x[k]))
         z = (float(best == 0), float(best == 1), float(best == 2))
@@ -217,16 +243,15 @@ Ratio = Annotated[float, Field(ge=1e-3, le=1e6)]
 RotorInertia = Annotated[
     Inertia,
     Field(
-        description="moment of inertia of the rotor that drives the inboard joint, about its own "
-        "axis, which is the joint's; not part of joint_inertia [kg m2]",
+        description="moment of inertia of the rotor that drives the joint, about its own axis, "
+        "which is the joint's; not part of joint_inertia [kg m2]",
     ),
 ]
 GearRatio = Annotated[
     Ratio | None,
     Field(
-        description="revolutions of the rotor per revolution of the inboard joint, against what "
-        "the joint sits on; of a prismatic joint in space radians per metre; stated with "
-        "rotor_inertia [-]",
+        description="revolutions of the rotor per revolution of the joint, against what the joint "
+        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]",
     ),
 ]
 GearStiffness = Annotated[
@@ -234,7 +259,7 @@ GearStiffness = Annotated[
     Field(
         ge=0,
         le=1e15,
-        description="stiffness of the gear between motor and inboard joint, about or along the "
+        description="stiffness of the gear between motor and joint, about or along the "
         "joint's axis, as the joint feels it; 0: none, the joint follows the motor exactly "
         "[N m/rad, N/m]",
     ),
@@ -242,16 +267,6 @@ GearStiffness = Annotated[
 GearDamping = Annotated[
     float,
     Field(ge=0, le=1e15, description="damper beside gear_stiffness [N m s/rad, N s/m]"),
-]
-
-
-# The same spring and damper by the names that arms have had.
-JointStiffness = Annotated[
-    float,
-    Field(ge=0, le=1e15, description="the same as gear_stiffness, in space, too [N m/rad, N/m]"),
-]
-JointDamping = Annotated[
-    float, Field(ge=0, le=1e15, description="damper beside that spring [N m s/rad, N s/m]")
 ]
 
 
@@ -268,7 +283,7 @@ BearingStiffness = Annotated[
     _Six | None,
     BeforeValidator(_zero_for_inf),
     Field(
-        description="springs of the inboard joint's bearing along x, y, z and about x, y, z of the "
+        description="springs of the joint's bearing along x, y, z and about x, y, z of the "
         "joint's frame, between what the joint sits on and the joint; 0 or inf: rigid in that "
         "direction. In the plane along x, y and about z alone [N/m, N m/rad]"
     ),
@@ -334,22 +349,6 @@ def check_parts(one: _Table, table: str) -> None:
             )
 
 
-def check_springs(arm: Any) -> None:
-    """Refuse a damper beside no spring, and the gear's spring by both of its names."""
-    if arm.joint_damping > 0.0 and arm.joint_stiffness == 0.0:
-        raise Refusal(
-            "expected 0 without arms.joint_stiffness, beside whose spring the damper acts",
-            ("joint_damping",),
-            ("joint_stiffness",),
-        )
-    if arm.joint_stiffness > 0.0 and arm.gear_stiffness > 0.0:
-        raise Refusal(
-            "expected only one of gear_stiffness and joint_stiffness: they are the same spring",
-            ("joint_stiffness",),
-            ("gear_stiffness",),
-        )
-
-
 def check_plane_bearing(one: _Table, at: Loc) -> None:
     """Refuse springs of a bearing in directions that the plane does not have."""
     for i, direction in OUT_OF_PLANE.items():
@@ -381,34 +380,70 @@ class JointParts:
     friction: tuple[float, float, float] | None
 
 
-def _motor(one: Any, arm: Any) -> tuple[float, float | None]:
-    """Return the rotor's inertia and the gear's ratio, of the joint or of the arm that it holds."""
-    inertia = arm.rotor_inertia if one.rotor_inertia is None else one.rotor_inertia
-    return inertia, arm.gear_ratio if one.gear_ratio is None else one.gear_ratio
+DRIVE_KEYS = ("rotor_inertia", "gear_ratio", *PART_KEYS)
+OF_BEARINGS = ("bearing_stiffness", "bearing_damping")  # which fixed joints have, too
+
+
+def stated_at(table: Any, key: str) -> bool:
+    """Return whether an arm or a joint states a key of its drive, bearing or friction."""
+    return getattr(table, key) not in (None, 0.0, type(table).model_fields[key].default)
+
+
+def _part(arm: Arm, joint: Joint | None, key: str) -> Any:
+    """Return a part of the joint that holds an arm: the joint's own, or else that of the arm."""
+    return getattr(joint if joint is not None and stated_at(joint, key) else arm, key)
 
 
 def check_motor(scene: Scene, index: int) -> None:
     """Refuse a rotor of unknown speed, and a motor's gear at a joint that nothing drives."""
-    arm = scene.arms[index]
-    found = [(k, one) for k, one in enumerate(scene.joints) if one.child == arm.name]
-    at, one = (("joints", found[0][0]), found[0][1]) if found else (("arms", index), arm)
-    inertia, ratio = _motor(one, arm)
-    if inertia > 0.0 and ratio is None:
-        where = at if one.rotor_inertia else ("arms", index)
+    arm, at = scene.arms[index], ("arms", index)
+    held = [(k, one) for k, one in enumerate(scene.joints) if one.child == arm.name]
+    joint = held[0][1] if held else None
+    if _part(arm, joint, "rotor_inertia") and _part(arm, joint, "gear_ratio") is None:
+        if joint is not None and stated_at(joint, "rotor_inertia"):
+            at = ("joints", held[0][0])
         raise Refusal(
             "expected gear_ratio with it, the rotor's revolutions per revolution of the joint; "
             "1 of a motor without a gear",
-            (*where, "rotor_inertia"),
-            (*where, "gear_ratio"),
+            (*at, "rotor_inertia"),
+            (*at, "gear_ratio"),
         )
-    soft = [(*at, "gear_stiffness")] * (one.gear_stiffness > 0.0)
-    soft += [("arms", index, "joint_stiffness")] * (arm.joint_stiffness > 0.0)
-    if found and one.passive and soft:
+    rotors = [one.rotor_inertia for one in scene.arms] + [j.rotor_inertia for j in scene.joints]
+    if stated_at(arm, "gear_ratio") and not any(rotors):
         raise Refusal(
-            f"expected 0: the joint {one.name} has passive = true and no motor behind a spring",
-            soft[0],
-            (*at, "passive"),
+            "expected none: used only with rotor_inertia, whose turns it counts",
+            ("arms", index, "gear_ratio"),
+            ("arms", index, "rotor_inertia"),
         )
+    if held:
+        _check_in_space(arm, at, *held[0])
+
+
+def _check_in_space(arm: Arm, at: Loc, number: int, joint: Joint) -> None:
+    """Refuse parts of a joint that arm and joint state, or that it cannot have."""
+    own = ("joints", number)
+    if joint.passive and _part(arm, joint, "gear_stiffness"):
+        raise Refusal(
+            f"expected 0: the joint {joint.name} has passive = true and no motor behind a spring",
+            (*(own if joint.gear_stiffness else at), "gear_stiffness"),
+            (*own, "passive"),
+        )
+    for key in DRIVE_KEYS:
+        if not stated_at(arm, key):
+            continue
+        if not joint.moves and key not in OF_BEARINGS:
+            raise Refusal(
+                f"expected none: the joint {joint.name} that holds the arm is fixed",
+                (*at, key),
+                (*own, "type"),
+            )
+        if stated_at(joint, key):
+            raise Refusal(
+                f"expected only one of joints.{number}.{key} and arms.{at[1]}.{key}, which mean "
+                "the same joint",
+                (*own, key),
+                (*at, key),
+            )
 
 
 def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
@@ -416,15 +451,13 @@ def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
     joints = {joint.child: joint for joint in scene.joints}
     found = []
     for arm in scene.arms:
-        one: Any = joints.get(arm.name, arm)
-        soft = (arm.joint_stiffness, arm.joint_damping)
-        stiffness, damping = soft if soft[0] > 0.0 else (one.gear_stiffness, one.gear_damping)
-        inertia, ratio = _motor(one, arm)
-        bearing = None
-        if one.bearing_stiffness is not None and any(one.bearing_stiffness):
-            bearing = one.bearing_stiffness, one.bearing_damping or (0.0,) * 6
-        friction = None
-        if one.friction is not None and any(one.friction):
-            friction = (*one.friction, one.friction_speed)
-        found.append(JointParts(stiffness, damping, inertia, ratio or 1.0, bearing, friction))
+        part = partial(_part, arm, joints.get(arm.name))
+        bearing = friction = None
+        if any(part("bearing_stiffness") or ()):
+            bearing = part("bearing_stiffness"), part("bearing_damping") or (0.0,) * 6
+        if any(part("friction") or ()):
+            friction = (*part("friction"), part("friction_speed"))
+        gear = part("gear_stiffness"), part("gear_damping")
+        motor = part("rotor_inertia"), part("gear_ratio") or 1.0
+        found.append(JointParts(*gear, *motor, bearing, friction))
     return tuple(found)

@@ -9,22 +9,24 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, shown
 from dolfinopt.scene.tables.joints import (
+    DRIVE_KEYS,
     FRICTION_SPEED,
-    OUTBOARD,
-    PART_KEYS,
+    OF_BEARINGS,
     BearingDamping,
     BearingStiffness,
     Friction,
     FrictionSpeed,
     GearDamping,
+    GearRatio,
     GearStiffness,
-    Inertia,
-    Ratio,
+    RotorInertia,
     check_direction,
     check_parts,
+    check_site,
     check_used,
     joint_parts,
-    refuse_unknown,
+    site_of,
+    stated_at,
 )
 
 if TYPE_CHECKING:
@@ -37,8 +39,6 @@ Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
 Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
 LIMITS = ("position_limits", "velocity_limit", "effort_limit")
-OF_MOTORS = ("rotor_inertia", "gear_ratio")
-OF_BEARINGS = ("bearing_stiffness", "bearing_damping")
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
 # What a machine in the plane has instead of joints.
@@ -60,11 +60,8 @@ class Joint(Table):
     )
     type: JointType = Field(description="what moves: an angle, a distance, or nothing [-]")
     parent: str = Field(
-        description='name of the arm whose outboard interface it sits on, or "ground" [-]'
-    )
-    parent_interface: str = Field(
-        default=OUTBOARD,
-        description="name of the parent's interface that it sits on, one of arms.interfaces [-]",
+        description='what it sits on: "arm" for its outboard interface, "arm.interface" for one of '
+        'arms.interfaces, or "ground" [-]'
     )
     child: str = Field(description="name of the arm that it holds, whose frame is the joint's [-]")
     axis: Direction | None = Field(
@@ -86,17 +83,8 @@ class Joint(Table):
         description="whether it has no drive and follows from the others by [[closures]] [-]",
     )
 
-    rotor_inertia: Inertia | None = Field(
-        default=None,
-        description="moment of inertia of the rotor that drives the joint, about its own axis; "
-        "default: arms.rotor_inertia of the arm that it holds [kg m2]",
-    )
-    gear_ratio: Ratio | None = Field(
-        default=None,
-        description="revolutions of the rotor per revolution of the joint, against what the joint "
-        "sits on; radians per metre of a prismatic one; default: arms.gear_ratio of the arm that "
-        "it holds; stated with rotor_inertia [-]",
-    )
+    rotor_inertia: RotorInertia = 0.0
+    gear_ratio: GearRatio = None
     gear_stiffness: GearStiffness = 0.0
     gear_damping: GearDamping = 0.0
     bearing_stiffness: BearingStiffness = None
@@ -122,6 +110,11 @@ class Joint(Table):
     )
 
     @property
+    def parent_arm(self) -> str:
+        """Name of the arm that it sits on, or "ground"."""
+        return site_of(self.parent)[0]
+
+    @property
     def moves(self) -> bool:
         """Whether it has a coordinate."""
         return self.type != "fixed"
@@ -137,9 +130,8 @@ class Joint(Table):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Joint:
-        others = [key for key in (*OF_MOTORS, *PART_KEYS) if key not in OF_BEARINGS]
-        for key in others if not self.moves else ():
-            if getattr(self, key) != type(self).model_fields[key].default:
+        for key in DRIVE_KEYS if not self.moves else ():
+            if key not in OF_BEARINGS and stated_at(self, key):
                 raise Refusal("expected none with a fixed joint", (key,), ("type",))
         check_parts(self, "joints")
         return self
@@ -167,10 +159,7 @@ class Joint(Table):
         if self.child not in names:
             allowed = " | ".join(map(shown, names))
             raise Refusal(f"expected the name of an arm: {allowed}", (*at, "child"))
-        if self.parent not in (GROUND, *names):
-            allowed = " | ".join(map(shown, (GROUND, *names)))
-            raise Refusal(f"expected the ground or the name of an arm: {allowed}", (*at, "parent"))
-        self._check_interface(scene, at)
+        check_site(scene, self.parent, (*at, "parent"), (GROUND,))
         for other in before:
             if other.child == self.child:
                 raise Refusal(
@@ -183,18 +172,10 @@ class Joint(Table):
             _check_passive(scene)
             _check_machine(scene)
 
-    def _check_interface(self, scene: Scene, at: Loc) -> None:
-        """Refuse an interface that the parent does not have."""
-        if self.parent != GROUND:
-            parent = next(arm for arm in scene.arms if arm.name == self.parent)
-            refuse_unknown(parent, self.parent_interface, (*at, "parent_interface"))
-        elif self.parent_interface != OUTBOARD:
-            raise Refusal("expected none on the ground", (*at, "parent_interface"), (*at, "parent"))
-
 
 def _check_tree(scene: Scene) -> None:
     """Refuse arms without a joint, and joints that do not lead to the ground."""
-    parents = {joint.child: joint.parent for joint in scene.joints}
+    parents = {joint.child: joint.parent_arm for joint in scene.joints}
     for k, arm in enumerate(scene.arms):
         if arm.name == GROUND:
             raise Refusal(
@@ -206,7 +187,7 @@ def _check_tree(scene: Scene) -> None:
                 "expected one of [[joints]] whose child it is", ("arms", k, "name"), ("joints",)
             )
     for i, joint in enumerate(scene.joints):
-        passed, above = [joint.child], joint.parent
+        passed, above = [joint.child], joint.parent_arm
         while above != GROUND and above not in passed:
             passed.append(above)
             above = parents[above]
@@ -274,7 +255,6 @@ def _check_machine(scene: Scene) -> None:
             ("objective", "elbow_angle"),
             ("joints",),
         )
-    _check_joint_parts(scene)
     for k, arm in enumerate(scene.arms):
         if arm.flexible and not arm.is_solid:
             raise Refusal(
@@ -285,41 +265,11 @@ def _check_machine(scene: Scene) -> None:
             )
 
 
-def _check_joint_parts(scene: Scene) -> None:
-    """Refuse parts of joints that arms state in space, and those that are stated twice."""
-    joints = {joint.child: (i, joint) for i, joint in enumerate(scene.joints)}
-    for k, arm in enumerate(scene.arms):
-        i, joint = joints[arm.name]
-        for key in PART_KEYS:
-            if getattr(arm, key) != type(arm).model_fields[key].default:
-                raise Refusal(
-                    f"expected none with [[joints]]: state joints.{i}.{key}, of the joint "
-                    f"{joint.name} that holds the arm",
-                    ("arms", k, key),
-                    ("joints",),
-                )
-        if arm.joint_stiffness > 0.0 and not joint.moves:
-            raise Refusal(
-                f"expected 0: the joint {joint.name} that holds the arm is fixed",
-                ("arms", k, "joint_stiffness"),
-                ("joints", i, "type"),
-            )
-        for mine, its in (("joint_stiffness", "gear_stiffness"), ("rotor_inertia",) * 2):
-            if getattr(arm, mine) > 0.0 and getattr(joint, its):
-                raise Refusal(
-                    f"expected only one of joints.{i}.{its} and arms.{k}.{mine}, which mean the "
-                    "same joint",
-                    ("joints", i, its),
-                    ("arms", k, mine),
-                )
-
-
 # -- `[control]` ---------------------------------------------------------------------------------
 
 FeedForward = Literal["rigid", "elastic", "tip", "none"]
 Gain = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; N s/m, N m s/rad
 DriveForce = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
-Factor = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class Control(Table):
@@ -339,10 +289,6 @@ class Control(Table):
     damping: tuple[Gain, ...] = Field(
         description="derivative gain of every driven coordinate [N s/m, N m s/rad]"
     )
-    stiffness_factor: Factor = Field(
-        default=1.0, description="factor on all of control.stiffness, to be varied in studies [-]"
-    )
-    damping_factor: Factor = Field(default=1.0, description="factor on all of control.damping [-]")
     limits: tuple[DriveForce, ...] | None = Field(
         default=None,
         description="largest force of every drive: up to 95 % of its limit a drive gives what the "
@@ -403,12 +349,8 @@ class Payload(Table):
     )
     arm: str | None = Field(
         default=None,
-        description="name of the arm that carries it and is the end-effector, whose deviation "
-        "and path count; default: the last one; in space [-]",
-    )
-    interface: str = Field(
-        default=OUTBOARD,
-        description="name of that arm's interface where it sits, one of arms.interfaces [-]",
+        description='"arm" or "arm.interface" that carries it and is the end-effector, whose '
+        "deviation and path count; default: the last one; in space [-]",
     )
 
     @property
@@ -428,20 +370,15 @@ class Payload(Table):
                 raise Refusal(
                     "expected [0, 0, 0], the default, without [[joints]]", (*at, "offset")
                 )
-            for key in ("arm", "interface"):
-                if getattr(self, key) != type(self).model_fields[key].default:
-                    raise Refusal(
-                        "expected none without [[joints]]: the last arm carries it", (*at, key)
-                    )
+            if self.arm is not None:
+                raise Refusal(
+                    "expected none without [[joints]]: the last arm carries it", (*at, "arm")
+                )
             return
         if problem := tensor_problem(self.inertia):
             raise Refusal(problem, (*at, "inertia"))
-        names = [arm.name for arm in scene.arms]
-        if self.arm is not None and self.arm not in names:
-            allowed = " | ".join(map(shown, names))
-            raise Refusal(f"expected the name of an arm: {allowed}", (*at, "arm"))
-        carrier = scene.arms[-1 if self.arm is None else names.index(self.arm)]
-        refuse_unknown(carrier, self.interface, (*at, "interface"))
+        if self.arm is not None:
+            check_site(scene, self.arm, (*at, "arm"))
         check_used(scene)
 
 
@@ -464,10 +401,8 @@ class Force(Table):
     name: Annotated[str, AfterValidator(check_joint_name)] | None = Field(
         default=None, description="unique name, by which changes may call it [-]"
     )
-    arm: str = Field(description="name of the arm on which it acts [-]")
-    interface: str = Field(
-        default=OUTBOARD,
-        description="name of the arm's interface on which it acts, one of arms.interfaces [-]",
+    arm: str = Field(
+        description='what it acts on: "arm" for its outboard interface, or "arm.interface" [-]'
     )
     force: Vector | None = Field(
         default=None,
@@ -519,11 +454,7 @@ class Force(Table):
         """Refuse what acts nowhere, has another dimension, or a key that nothing uses."""
         if self.name and self.name in [one.name for one in scene.forces[: at[-1]]]:
             raise Refusal("expected a name that no other force has", (*at, "name"))
-        names = [arm.name for arm in scene.arms]
-        if self.arm not in names:
-            allowed = " | ".join(map(shown, names))
-            raise Refusal(f"expected the name of an arm: {allowed}", (*at, "arm"))
-        refuse_unknown(scene.arms[names.index(self.arm)], self.interface, (*at, "interface"))
+        check_site(scene, self.arm, (*at, "arm"))
         where = "with [[joints]]" if scene.is_spatial else "without [[joints]]: in the plane"
         if self.force is not None and len(self.force) != scene.dimension:
             numbers = "three numbers" if scene.is_spatial else "two numbers"

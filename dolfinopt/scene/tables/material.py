@@ -159,7 +159,7 @@ class Material(Table):
         """
         kind = f"with kind = {shown(self.kind)}"
         for key in material_keys():
-            given, optional = getattr(self, key) is not None, key not in OF_ALL
+            given, optional = getattr(self, key, None) is not None, key not in OF_ALL
             if given and optional and key not in self.law.used:
                 raise Refusal(f"expected none {kind}", (key,), ("kind",))
             if not given and (not optional or key in self.law.keys):

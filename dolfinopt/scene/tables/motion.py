@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from dolfinopt.scene.tables.base import (
     Duration,
@@ -282,7 +282,6 @@ class Motion(Table):
 
 # -- `[simulation]` ------------------------------------------------------------------------------
 
-Integrator = Literal["radau", "generalized-alpha"]
 MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a workstation
 
 
@@ -294,12 +293,6 @@ class Simulation(Table):
         ge=1e-12,
         le=0.1,
         description="relative error allowed in the elastic coordinates [-]",
-    )
-    integrator: Integrator = Field(
-        default="radau", description="without effect: every motion is integrated by Radau IIA [-]"
-    )
-    rho_inf: float = Field(
-        default=0.8, ge=0, le=1, description="without effect, see simulation.integrator [-]"
     )
     stages: int = Field(default=4, ge=2, le=5, description="stages of the Radau IIA method [-]")
     stiffening: bool | Literal["auto"] = Field(
@@ -332,6 +325,7 @@ class Simulation(Table):
 
 # -- `[reduction]` -------------------------------------------------------------------------------
 
+SHIFTS, BAND = (0.0,), (0.0, 50.0)  # Hz; defaults
 ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
 Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
 
@@ -353,26 +347,33 @@ class Reduction(Table):
         le=0.5,
         description='with "auto": allowed relative error of the reduction, energy norm [-]',
     )
-    shifts: tuple[Frequency, ...] = Field(
-        default=(0.0,), description='frequencies at which "krylov" matches moments [Hz]'
-    )
-    band: tuple[Frequency, Frequency] = Field(
-        default=(0.0, 50.0), description='frequency band whose responses "balanced" weights [Hz]'
+    frequencies: tuple[Frequency, ...] | None = Field(
+        default=None,
+        description='frequencies at which "krylov" matches moments, by default 0; least and '
+        'largest one whose responses "balanced" weights, by default 0 and 50 [Hz]',
     )
 
-    @field_validator("shifts")
-    @classmethod
-    def _check_shifts(cls, shifts: tuple[float, ...]) -> tuple[float, ...]:
-        if not shifts or len(set(shifts)) < len(shifts):
-            raise Refusal("expected at least one number >= 0, none of them twice")
-        return shifts
+    @property
+    def shifts(self) -> tuple[float, ...]:
+        """Frequencies at which "krylov" matches moments, Hz."""
+        return self.frequencies or SHIFTS
 
-    @field_validator("band")
-    @classmethod
-    def _check_band(cls, band: tuple[float, float]) -> tuple[float, float]:
-        if band[0] >= band[1]:
-            raise Refusal("expected the lower of the two frequencies first")
-        return band
+    @property
+    def band(self) -> tuple[float, float]:
+        """Frequency band whose responses "balanced" weights, Hz."""
+        return (self.frequencies[0], self.frequencies[-1]) if self.frequencies else BAND
+
+    @model_validator(mode="after")
+    def _check_frequencies(self) -> Reduction:
+        self.refuse_unused(self.method in ("krylov", "balanced"), "method", "frequencies")
+        given = self.frequencies
+        if given is None:
+            return self
+        if self.method == "krylov" and (not given or len(set(given)) < len(given)):
+            raise Refusal("expected at least one number >= 0, none of them twice", ("frequencies",))
+        if self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
+            raise Refusal("expected two frequencies, the lower one first", ("frequencies",))
+        return self
 
     @model_validator(mode="after")
     def _check_coordinates(self) -> Reduction:
@@ -387,10 +388,10 @@ class Reduction(Table):
             )
         raise Refusal(
             f'expected an integer >= {self.fewest} with reduction.method = "krylov" '
-            "(the interface loads at each of reduction.shifts)",
+            "(the interface loads at each of reduction.frequencies)",
             ("coordinates",),
             ("method",),
-            ("shifts",),
+            ("frequencies",),
         )
 
     @property
@@ -411,8 +412,6 @@ class Reduction(Table):
 
     @model_validator(mode="after")
     def _check_unused(self) -> Reduction:
-        self.refuse_unused(self.method == "krylov", "method", "shifts")
-        self.refuse_unused(self.method == "balanced", "method", "band")
         self.refuse_unused(self.coordinates == "auto", "coordinates", "tolerance")
         return self
 
@@ -422,8 +421,10 @@ class Reduction(Table):
             least = self.fewest_of(arm)
             if arm.flexible and 0 < self.count < least and arm.is_solid:
                 has = "interface has six coordinates"
-                if arm.interfaces:
-                    has = f"interfaces, {1 + len(arm.interfaces)}, have six coordinates each"
+                if arm.further_interfaces:
+                    has = (
+                        f"interfaces, {1 + len(arm.further_interfaces)}, have six coordinates each"
+                    )
                 raise Refusal(
                     f"expected an integer >= {least} with a solid arm: its outboard {has}",
                     ("reduction", "coordinates"),

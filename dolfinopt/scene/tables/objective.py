@@ -447,7 +447,6 @@ def _add_key(one: Declaration) -> None:
 
 for _one in DECLARED.values():
     _add_key(_one)
-Constraints.model_rebuild(force=True)
 
 
 def declare(one: Declaration) -> None:

@@ -437,26 +437,3 @@ def unused_options(scene_options: Iterable[str], kind: str, limited: Iterable[st
     for key in limited:
         used |= {*limited_by(key).limit_options}
     return [one for one in scene_options if any(users_of(one)) and one not in used]
-
-
-def read_old_names(tree: dict[str, Any]) -> list[str]:
-    """Put older words of a scene's data in the place of which they are; say so, a line each."""
-    objective, limits = tree.get("objective"), tree.get("constraints")
-    told = []
-    if isinstance(objective, dict) and (kind := OLD_KINDS.get(str(objective.get("kind")))):
-        told.append(f'objective.kind = "{objective["kind"]}" is read as "{kind}"; state that')
-        objective["kind"] = kind
-    for old, key in OLD_LIMITS.items():
-        if isinstance(limits, dict) and old in limits:
-            told.append(f"constraints.{old} is read as constraints.{key}; state that")
-            limits.setdefault(key, limits.pop(old))
-    return told
-
-
-def current_key(change: str, told: list[str]) -> str:
-    """Return a change "key=value" with the newer word of an older key; say so in `told`."""
-    for old, key in OLD_LIMITS.items():
-        if change.startswith(f"constraints.{old}="):
-            told.append(f"constraints.{old} is read as constraints.{key}; state that")
-            return f"constraints.{key}={change.partition('=')[2]}"
-    return change
