@@ -488,11 +488,11 @@ _Links = Mapping[str, tuple["ShapeIntegrals", "np.ndarray"]]
 
 def _links(world: MPI.Comm, run: _Run) -> _Links:
     """Return the links of a run: the parts that `dolfinopt part` made, or parts of its design."""
+    from dolfinopt.loading import load_scene
     from dolfinopt.output.folders import PARTS, stale_parts
     from dolfinopt.parallel import on_root
     from dolfinopt.part.folder import SCENE
     from dolfinopt.part.part import make_parts
-    from dolfinopt.scene.load import load_scene
 
     made = run.folder / PARTS
     if not on_root(world, lambda: (made / SCENE).is_file() and not stale_parts(made)):
