@@ -57,8 +57,6 @@ def doubts_of_files(scene: Scene) -> list[str]:
     for index, arm in enumerate(scene.arms):
         if arm.sid is None:
             continue
-        from dolfinopt.arms.arm import fixed_body  # not of scenes without files
-
         body = fixed_body(scene, index)
         if scene.simulation.stiffening is True and not body.is_stiffened:
             found.append(

@@ -22,7 +22,7 @@ from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import checkpoint, design, run_folder, summary
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
-from dolfinopt.responses import evaluation, frequency, motion, reductions, static
+from dolfinopt.responses import evaluation, frequency, motion, order_selection, static
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import read_scene
 from dolfinopt.study import cases as computing
@@ -234,8 +234,8 @@ PLACES = [
     (gradients, LONE, static, "tip_gradient", TIP),
     (gradients, LONE, frequency, "period_gradient", FREQUENCY),
     (choosing, LONE, arm.Arm, "set_design"),
-    (choosing, LONE, reductions, "shape_integrals"),
-    (choosing, LONE, reductions, "_leading"),
+    (choosing, LONE, order_selection, "shape_integrals"),
+    (choosing, LONE, order_selection, "_leading"),
     (choosing, 0, coordinates, "_distance"),
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes

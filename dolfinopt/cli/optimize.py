@@ -79,7 +79,7 @@ def optimize(
         on_root(world, checkpoint.check, folder, loaded)
     else:
         claim(world, folder, overwrite, resume=checkpoint.NAME, scene=loaded)
-    if loaded.is_spatial and not resume:
+    if loaded.is_spatial and not resume and loaded.optimizer.max_iterations:
         _tell_ahead(world, loaded)
     with working_alone(world, folder):  # until all files of the run are written
         try:

@@ -61,11 +61,11 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     if alone():
         read_scene(path, overrides)
     world = start()
+    # On all ranks: DOLFINx ends PETSc together with the others that have imported it.
+    from dolfinopt.loading import doubts, load_scene
     from dolfinopt.parallel import on_root
 
     def load() -> Scene:
-        from dolfinopt.loading import doubts, load_scene
-
         scene = load_scene(path, overrides)
         warn(doubts(scene))
         if path.name == "part.toml" and (stale := stale_parts(path.parent)):

@@ -30,6 +30,7 @@ from dolfinopt.dynamics.measured import (
     MARCH_ERROR_SHARE,
     ROUNDING,
     STEPS_LIMIT,
+    USUAL_TOLERANCE,
 )
 from dolfinopt.dynamics.newton import Limits, newton_in_chunks
 from dolfinopt.dynamics.newton_matrix import NewtonMatrix
@@ -68,7 +69,8 @@ def integrate(
     if system.num_coordinates == 0:
         return _prescribed(system, stages)
     if guess is not None and guess.held:
-        return replace(on_grid(system, guess.time_grid, tolerance, stages, guess), held=True)
+        close = min(tolerance, USUAL_TOLERANCE)  # differences of like motions are looked at
+        return replace(on_grid(system, guess.time_grid, close, stages, guess), held=True)
     preconditioner = system.preconditioner()
     grid = None
     if guess is not None and guess.a.shape[2] == system.num_coordinates:

@@ -309,10 +309,14 @@ def forced_rest(scene: Scene) -> str | None:
     if not beyond.any():
         return None
     worst = int(np.argmax(forced * beyond))
+    if motion.path == "joints":
+        unit = scene.rigid_units[scene.driven[worst]]
+    else:
+        unit = "m" if worst < scene.dimension else "rad"
     return (
         f"motion: {motion.file} moves in its first or last row; the rest that is put there needs "
-        f"an acceleration of {forced[worst]:.3g} where its rows have {own[worst]:.3g}: let it rest "
-        'there, or take its own rates, motion.table_ends = "moving"'
+        f"an acceleration of {forced[worst]:.3g} {unit}/s2 where its rows have {own[worst]:.3g}: "
+        'let it rest there, or take its own rates, motion.table_ends = "moving"'
     )
 
 

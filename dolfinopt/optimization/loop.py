@@ -18,7 +18,6 @@ from dolfinopt.optimization.assessment import (
     straight_bars,
 )
 from dolfinopt.optimization.certificate import certify
-from dolfinopt.optimization.conflicts import conflict_sentences
 from dolfinopt.optimization.evaluator import Evaluator, densities
 from dolfinopt.optimization.iterate import Iterate
 from dolfinopt.optimization.measured import (
@@ -28,6 +27,7 @@ from dolfinopt.optimization.measured import (
     FROZEN_GAIN,
     WINDOW,
 )
+from dolfinopt.optimization.residual import conflict_sentences
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory, fields_of
 from dolfinopt.optimization.stopping import StopCode, ending, stop_code

@@ -377,32 +377,32 @@ def _krylov_schur(
         product: None for the lowest modes of K phi = lambda M phi; A times columns for the largest
             mu of A phi = mu K phi, descending.
     """
-    with _solver(pencil, product) as eps:
-        vector = eps.getOperators()[0].createVecLeft()
-        given = [_filled(vector, first)]
-        eps.setInitialSpace(given)
-        if known is not None:
-            space = [_filled(vector, column) for column in known.T]
-            eps.setDeflationSpace(space)
-            given += space
-        # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
-        # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material
-        # have, need more vectors, not more restarts.
-        for size, restarts in ((max(count + 4, 2 * count), 25), (4 * count + 100, 100)):
+    # Few extra vectors at first, as the search looks at its residuals once a sweep: 4 take the
+    # fewest solves. Bundles of modes equal to 1e-7, as equal windows of nearly no material have,
+    # need more vectors, not more restarts, and a solver that begins anew.
+    for size, restarts in ((max(count + 4, 2 * count), 25), (4 * count + 100, 100)):
+        with _solver(pencil, product) as eps:
+            vector = eps.getOperators()[0].createVecLeft()
+            given = [_filled(vector, first)]
+            eps.setInitialSpace(given)
+            if known is not None:
+                space = [_filled(vector, column) for column in known.T]
+                eps.setDeflationSpace(space)
+                given += space
             eps.setDimensions(min(count, pencil.size), min(size, pencil.size))
             eps.setTolerances(tolerance, restarts)
             with obeying_options(OPTIONS):
                 eps.setFromOptions()
                 eps.solve()
             converged = min(eps.getConverged(), count)
-            if converged == count:
-                break
-        values, vectors = np.empty(converged), np.empty((pencil.rows, converged))
-        for k in range(converged):
-            values[k] = eps.getEigenpair(k, vector).real
-            vectors[:, k] = vector.array
-        for each in (vector, *given):
-            each.destroy()
+            values, vectors = np.empty(converged), np.empty((pencil.rows, converged))
+            for k in range(converged):
+                values[k] = eps.getEigenpair(k, vector).real
+                vectors[:, k] = vector.array
+            for each in (vector, *given):
+                each.destroy()
+        if converged == count:
+            break
     return values, vectors
 
 

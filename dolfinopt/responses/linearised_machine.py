@@ -25,7 +25,7 @@ from dolfinopt.responses.measured import (
     POLE_ERROR,
     RICHER_RATIO,
 )
-from dolfinopt.responses.reductions import RICHER_METHOD, Reductions, fewest
+from dolfinopt.responses.order_selection import RICHER_METHOD, Reductions, fewest
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:

@@ -7,8 +7,9 @@ count as they are, and so does what a basis without constraint modes misses of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from sys import maxsize
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,9 +17,10 @@ import numpy as np
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
 from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import Basis
+from dolfinopt.reduction import METHODS, Basis
 from dolfinopt.responses.evaluation import decide_stiffening, moved
 from dolfinopt.responses.measured import (
     RICHER_COORDINATES,
@@ -26,12 +28,14 @@ from dolfinopt.responses.measured import (
     TIME_ERROR_SHARE,
     TRIED_COORDINATES_LIMIT,
 )
-from dolfinopt.responses.reductions import RICHER_METHOD, Reductions, fewest
 from dolfinopt.responses.response import factors
 from dolfinopt.scene.load import Scene, pose_scenarios
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
+
+
+RICHER_METHOD = "craig-bampton"  # of what motions and poles are compared with
 
 
 @dataclass(frozen=True)
@@ -226,3 +230,90 @@ def _distance(
 def _norm(K: np.ndarray, q: np.ndarray) -> float:
     """Return the largest sqrt(q' K q) over the instants; q is (n, k)."""
     return float(np.sqrt(max(np.einsum("nk,nk->n", q @ K, q).max(initial=0.0), 0.0)))
+
+
+# -- bases of any number of coordinates: Craig-Bampton bases of fewer are the leading part of more
+
+
+class Reductions:
+    """Bases of the arms' present designs.
+
+    Attributes:
+        limit: of coordinates that all arms can have.
+    """
+
+    def __init__(
+        self, scene: Scene, partition: Partition, arms: Mapping[int, Arm], profile: Profile
+    ) -> None:
+        """Take this rank's arms, with a design (collective)."""
+        self.partition, self.arms, self.profile = partition, arms, profile
+        self._damping = scene.damping.stiffness_proportional
+        own = min((arm.elastic.num_dofs for arm in arms.values()), default=maxsize)
+        self.limit: int = partition.world.allreduce(own, min)
+        self._richest: dict[int, Basis] = {}
+        self._count = 0  # of its coordinates
+
+    def reduced(self, method: str, count: int) -> dict[int, Basis]:
+        """Return this rank's bases of so many coordinates (collective)."""
+        if method != RICHER_METHOD:
+            return self._reduce(method, count)
+        if count > self._count:
+            self._richest, self._count = self._reduce(method, count), count
+        with together(self.partition.world):
+            return {k: _leading(basis, count) for k, basis in self._richest.items()}
+
+    def _reduce(self, method: str, count: int) -> dict[int, Basis]:
+        reduce = METHODS[method].reduce
+        with self.profile.phase("choice of coordinates"), together(self.partition.world):
+            return {
+                k: reduce(arm.elastic, arm.options(count), None) for k, arm in self.arms.items()
+            }
+
+    def bodies(self, bases: Mapping[int, Basis]) -> dict[int, ShapeIntegrals]:
+        """Return the bodies of all arms with these bases, on the root (collective)."""
+        found = {}
+        with together(self.partition.world):
+            for k, basis in bases.items():
+                arm, loads = self.arms[k], None
+                if arm.stiffened:
+                    loads = arm.current.unit_loads.with_modes(basis.V, basis.MV)
+                found[k] = shape_integrals(arm.elastic, basis, self._damping, loads)
+        return gather_arms(self.partition, found)
+
+    def energies(
+        self, bases: Mapping[int, Basis], others: Mapping[int, Basis]
+    ) -> dict[int, np.ndarray]:
+        """Return V' K V of the modes V of two bases, one behind the other (collective)."""
+        with together(self.partition.world):
+            return {
+                k: self.arms[k].elastic.energy_matrix(np.concatenate([a.V, others[k].V], axis=2))
+                for k, a in bases.items()
+            }
+
+
+def _leading(basis: Basis, count: int) -> Basis:
+    """Return the first Craig-Bampton coordinates: constraint modes, then fixed-interface modes."""
+    part = slice(count)
+    return Basis(
+        basis.V[:, :, part],
+        basis.MV[:, :, part],
+        basis.stiffness[part, part],
+        basis.outboard[:, part],
+        basis.start[:, : count - len(basis.outboard)],
+    )
+
+
+def fewest(first: int, most: int, holds: Callable[[int], bool]) -> int | None:
+    """Return the fewest coordinates from `first` to `most` that hold, None if none do.
+
+    In growing steps upwards, then by bisection.
+    """
+    low, high = first - 1, first
+    while not holds(high):
+        if high >= most:
+            return None
+        low, high = high, min(high + max(1, high - first), most)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high

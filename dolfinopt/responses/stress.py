@@ -536,7 +536,7 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
 # are further instants looked at; so none that is larger is missed, whatever the motion.
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Screened:
     """The largest |A_e a_n| of all, its instant n, and point e on this rank, -1 on others.
 

@@ -421,8 +421,8 @@ AHEAD = ("solid bar", "rectangular tube", "round tube")  # whose figures come be
 def ahead(scene: Scene, folder: Path, world: MPI.Comm) -> list[str]:
     """Return what straight tubes and bars reach in place of solid links, a line each (collective).
 
-    The lightest that hold the limits, where the scene has some; else those of the links' mass at
-    the start. [] of machines in the plane, and where no straight member can take a link's place.
+    Those of the links' mass at the start, and the limit that each uses most: three simulations.
+    [] of machines in the plane, and where no straight member can take a link's place.
     """
     try:
         on_root(world, _check_replaceable, scene)
@@ -435,14 +435,9 @@ def ahead(scene: Scene, folder: Path, world: MPI.Comm) -> list[str]:
     [first] = run_cases([start], folder, world, shown=False).by_case.values()
     if first.failure:
         return []
-    asked: list[tuple[Members, Shares]] = []
-    if limited(first):
-        found, _ = _searched(every, folder, world, 0, shown=False)
-        asked = [(one, shares) for one, _, shares, holds in found if holds]
-    else:
-        masses = first.summary()["mass"]
-        by_arm = {k: masses[arm.name] for k, arm in enumerate(scene.arms) if arm.name in masses}
-        asked = [(one, shares) for one in every if (shares := one.of_mass(by_arm)) is not None]
+    masses = first.summary()["mass"]
+    by_arm = {k: masses[arm.name] for k, arm in enumerate(scene.arms) if arm.name in masses}
+    asked = [(one, shares) for one in every if (shares := one.of_mass(by_arm)) is not None]
     cases = on_root(world, lambda: [one.case(shares) for one, shares in asked])
     done = run_cases(cases, folder, world, shown=False)
     pairs = [(one, done[case]) for (one, _), case in zip(asked, cases, strict=True)]
@@ -455,12 +450,15 @@ def ahead(scene: Scene, folder: Path, world: MPI.Comm) -> list[str]:
 
 def _reached(scene: Scene, members: Members, found: Outcome) -> str:
     """Return mass and objective of members in words."""
-    response, what = scene.objective.response, "has the links' mass at the start"
-    if limited(found):
-        what = "holds the limits"
-    mass = found.summary().get("designed_mass", math.nan)
+    summary, response = found.summary(), scene.objective.response
     value = with_unit(f"{response.label} {found.objective:.4g}", response.unit)
-    return f"a straight {members.kind} of {mass:.3g} kg {what}: {value}"
+    limits = _limits(summary)
+    if limits:
+        name, most = max(limits.items(), key=lambda one: _excess(one[1]))
+        used = f"{name.replace('_', ' ')} {most['value']:.3g} of {most['limit']:.3g}"
+        value = f"{value}, {with_unit(used, most['unit'])}"
+    mass = summary.get("designed_mass", math.nan)
+    return f"a straight {members.kind} of the links' mass at the start, {mass:.3g} kg: {value}"
 
 
 def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:

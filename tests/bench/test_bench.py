@@ -455,12 +455,12 @@ def test_command(tmp_path, monkeypatch, capsys):
     ("words", "told"),
     [
         (("field", "--case", "sling"), ("--case", "sling", "rod")),
-        (("field", "--case", "rod", "--all"), ("--case", "--all")),
+        (("field", "--case", "rod", "--all"), ("--case", "all")),
         (("field", "time"), ("field", "time")),
         (("field", "--quick"), ("field", "--quick")),
         (("field", "--case", "ur10e"), ("--records", "dynamic_calibration")),
         (("field", "--case", "ur10e", "--records", "nowhere"), ("nowhere", "ur10e.urdf")),
-        (("time", "--all"), ("--all", "field")),
+        (("time", "--all"), ("--case", "field")),
     ],
 )
 def test_wrong_words(words, told):

@@ -4,11 +4,13 @@ import dolfinx
 import numpy as np
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 from runs import STATED
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.density.filter import HelmholtzFilter
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 
@@ -255,3 +257,14 @@ Curve Loop(1) = {1, 2, 3, 4}; Plane Surface(1) = {1};
 Transfinite Curve {1, 3} = 41; Transfinite Curve {2, 4} = 5; Transfinite Surface {1};
 Physical Curve("inboard") = {4}; Physical Curve("outboard") = {2};
 """
+
+
+@pytest.mark.serial
+def test_a_filter_that_does_not_converge_is_told():
+    """One line of this program's, no error of PETSc's."""
+    options = PETSc.Options("dolfinopt_filter_")
+    options["ksp_max_it"] = 1
+    smooth = HelmholtzFilter(box_arm(MPI.COMM_SELF, "a", (1.0, 0.2, 0.2), (20, 4, 4)), 0.2)
+    del options["ksp_max_it"]
+    with pytest.raises(ConvergenceError, match=r"smaller design\.filter_radius"):
+        smooth.forward(np.linspace(0.0, 1.0, 320))

@@ -12,8 +12,8 @@ from petsc4py import PETSc
 from solids import elastic_link, link_mesh, solid_arm, solid_scene
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.errors import InputError
-from dolfinopt.fem import interior
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.fem import interior, multigrid
 from dolfinopt.fem.assembly import InteriorEntries, InteriorMatrix
 from dolfinopt.fem.interior import choose_solver
 from dolfinopt.fem.multigrid import MultigridSolver
@@ -67,6 +67,15 @@ def test_as_the_direct_solution(direct, iterative, void):
     largest = COMM.allreduce(np.abs(gradients[0]).max(initial=0.0), MPI.MAX)
     assert np.abs(gradients[0] - gradients[1]).max(initial=0.0) < 5e-6 * largest
     assert iterative.substructure.interior.solver.steps < 70
+
+
+@pytest.mark.serial
+def test_what_does_not_converge_is_told(iterative, monkeypatch):
+    """With cures that help: a stiffer void, or a factor."""
+    monkeypatch.setattr(multigrid, "SOLVER_ITERATIONS", 2)
+    elastic = iterative.state(hollow(iterative, 0.1)).elastic
+    with pytest.raises(ConvergenceError, match=r"interpolation\.floor.*pc_type cholesky"):
+        elastic.constraint_modes()
 
 
 @pytest.mark.serial

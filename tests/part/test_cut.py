@@ -51,7 +51,9 @@ def scara(design, tmp_path):
     changes = (f"arms.0.mesh={path}", "arms.0.length=0.325", "arms.0.height=0.12",
                "arms.0.mesh_size=0.004", "arms.0.passive=0.006",
                'arms.0.regions=[{kind="solid", circle=[0.16, 0.0, 0.012]}]')  # fmt: skip
-    return design(webbed, *changes, "motion.radius=0.4", "arms.1.length=1.0")
+    return design(
+        webbed, *changes, "motion.radius=0.4", "arms.1.length=0.325", "motion.joint_height=-0.1"
+    )
 
 
 @pytest.mark.slow

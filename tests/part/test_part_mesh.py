@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
-from runs import scene
+from parts import frame
+from runs import TWO_ARM
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.part.mesh import body_mesh, triangle_areas
 from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, Spline
 from dolfinopt.part.stress import corner_stress_in_plane, singular_points
 from dolfinopt.profiling import Profile
+from dolfinopt.scene.load import read_scene
 
 pytestmark = pytest.mark.serial
 
@@ -104,7 +106,7 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
         file = tmp_path / f"{k}.msh"
         mesh.write(file)
         arm1 = f"arms.0.mesh={file}", f"arms.0.length={LENGTH}", "arms.0.element=quadratic"
-        one = scene("arms.1.rigid=true", "design.filter_radius=0", *arm1)
+        one = read_scene(TWO_ARM, ("arms.1.rigid=true", "design.filter_radius=0", *arm1))
         arm = Arm(one, 0, MPI.COMM_SELF, Profile())
         assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=1e-6)
         arm.set_design(np.ones(arm.mesh.num_cells))

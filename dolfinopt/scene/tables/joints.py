@@ -408,8 +408,9 @@ def check_motor(scene: Scene, index: int) -> None:
             (*at, "rotor_inertia"),
             (*at, "gear_ratio"),
         )
-    rotors = [one.rotor_inertia for one in scene.arms] + [j.rotor_inertia for j in scene.joints]
-    if stated_at(arm, "gear_ratio") and not any(rotors):
+    rotors = ["rotor_inertia" in one.model_fields_set for one in (*scene.arms, *scene.joints)]
+    # Older files hold the ratio of 1 that was the default.
+    if stated_at(arm, "gear_ratio") and arm.gear_ratio != 1.0 and not any(rotors):
         raise Refusal(
             "expected none: used only with rotor_inertia, whose turns it counts",
             ("arms", index, "gear_ratio"),
