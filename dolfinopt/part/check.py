@@ -64,7 +64,7 @@ class Column:
         stressed: name of the arm that has it.
         limits: the scene's constraints, without that of the volume, which all forms share.
         trajectory: its motion.
-        buckling: of plane parts; None of other forms.
+        buckling: of plane parts on their last mesh; None of other forms.
     """
 
     values: Mapping[str, float]
@@ -207,14 +207,19 @@ def part_column(
     """Return the figures of a machine with parts, and their stress by their place in the chain."""
     found = stress_of_parts(one.arms, one.trajectory, parts)
     peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
-    plates = not any(arm.is_solid for arm in one.scene.arms)
-    buckling = lowest_buckling(one.arms, one.trajectory) if plates else None
-    return column_of(one, peak, arm, buckling), found
+    return column_of(one, peak, arm), found
 
 
-def column_of(
-    one: Simulated, peak: Peak | None, arm: str, buckling: LeastBuckling | None = None
-) -> Column:
+def _with_buckling(one: Simulated, column: Column) -> Column:
+    """Return the figures of plates with the lowest buckling factor."""
+    if BUCKLING not in column.values:
+        return column
+    found = lowest_buckling(one.arms, one.trajectory)
+    factor = float("nan") if found is None else found.factor
+    return replace(column, values={**column.values, BUCKLING: factor}, buckling=found)
+
+
+def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
     """Return the figures of a machine whose largest stress is known, with the arm that has it."""
     limits = [
         limit
@@ -227,10 +232,9 @@ def column_of(
             for limit in limits
         ]
     values = dict(_values(one, float("nan") if peak is None else peak.value))
-    if not any(arm.is_solid for arm in one.scene.arms):  # of densities it is not looked at
-        values[BUCKLING] = float("nan") if buckling is None else buckling.factor
-    objective = one.evaluation.objective
-    return Column(values, objective, peak, arm, tuple(limits), one.trajectory, buckling)
+    if not any(arm.is_solid for arm in one.scene.arms):  # it is looked at on the last mesh alone
+        values[BUCKLING] = float("nan")
+    return Column(values, one.evaluation.objective, peak, arm, tuple(limits), one.trajectory)
 
 
 def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
@@ -618,6 +622,7 @@ def check_parts(
         coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
     say("the machine with the parts")
     fine, column, stress, change, bodies = refined(scene, parts, meshes.fine, coarse)
+    column = _with_buckling(fine, column)
     cells = {place: one.cells for place, one in stress.items()}
     worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value

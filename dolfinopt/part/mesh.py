@@ -209,7 +209,8 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-TURN = 0.2  # of the outline along a side of a cell, rad
+TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
+FINE = 0.2  # rad, there; halved for every further time
 PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
 WALL = 1.0  # side of a cell over the width of the member
 LARGEST = 2.5  # side of a cell, cells of the design
@@ -234,8 +235,9 @@ def body_mesh(
         shape: m.
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
-        finer: places (n, 2), m, near each of which sides are halved, once for every array.
-        turn: of the outline along a side, rad; one for all pieces, or one each.
+        finer: places (n, 2), m, near each of which the outline turns by `FINE` along a side, and by
+            half as much for every further array.
+        turn: of the outline along a side elsewhere, rad; one for all pieces, or one each.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
@@ -336,14 +338,14 @@ def _sizes(
     points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
     inward = -np.vstack([normals(c, t) for c, t in zip(curves, samples, strict=True)])
     bend = np.abs(np.concatenate([curvature(c, t) for c, t in zip(curves, samples, strict=True)]))
+    bend = np.maximum(bend, 1e-9 / cell)
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
     turn = np.repeat(turns, [len(t) for t in samples])
-    size = np.minimum(WALL * wall, turn / np.maximum(bend, 1e-9 / cell))
-    size = np.clip(size, SMALLEST * cell, LARGEST * cell)
-    for places in finer:
-        away = cKDTree(places).query(points)[0]
-        size = np.where(away < np.maximum(2.0 * size, SAMPLES * cell), 0.5 * size, size)
+    for number, places in enumerate(finer):
+        here = cKDTree(places).query(points)[0] < np.maximum(turn / bend, SAMPLES * cell)
+        turn = np.where(here, np.minimum(turn, FINE * 0.5**number), turn)
+    size = np.clip(np.minimum(WALL * wall, turn / bend), SMALLEST * cell, LARGEST * cell)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])

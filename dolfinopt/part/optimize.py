@@ -306,6 +306,9 @@ class Descent:
             if self.done >= self.iterations or (kept and not self.search.spent):
                 break
             self._tighten(limits)
+        if self.search.met is not None and not all(one.met for one in found.limits):
+            self.state = self.search.met
+            found, _ = self._judged(start, ending)
         self._keep(ending)
         return replace(found, ending=ending)
 

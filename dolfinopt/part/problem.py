@@ -11,9 +11,9 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
-from dolfinopt.part.mesh import BodyMesh, PlateMesh
+from dolfinopt.part.mesh import FINE, TURN, BodyMesh, PlateMesh
 from dolfinopt.part.part import Part, PartMesh
-from dolfinopt.part.plane.free_sides import COARSE, FreeSides
+from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.solid.free_surface import FreeSurface
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
@@ -27,7 +27,6 @@ from dolfinopt.scene.load import Scene
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
-FINE, FINEST = 0.2, 0.1  # rad, turn of the outline along a side of a mesh there
 NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
 ALLOWED = (
     0.05  # excess of a limit that a state may have for a better objective: a later step ends it
@@ -240,7 +239,7 @@ class Problem:
         fresh = plain.evaluated(state.outlines, {}, state.solutions)
         if max(fresh.places.values(), default=-1.0) < NEAR:
             return plain, fresh
-        finest = replace(plain, turns=_turns(fresh, FINEST))
+        finest = replace(plain, turns=_turns(fresh, 0.5 * FINE))
         fine = finest.evaluated(state.outlines, {}, fresh.solutions).places
         places = {}
         for key, value in fresh.places.items():
@@ -346,7 +345,7 @@ def _turns(state: State, fine: float) -> dict[int, np.ndarray]:
     """Return the turns (n,) of all pieces along a side of a mesh, fine where stress is near."""
     found = {}
     for k, body in state.bodies.items():
-        found[k] = np.full(len(_face(body).shape.pieces), COARSE)
+        found[k] = np.full(len(_face(body).shape.pieces), TURN)
         near = [piece for (j, piece), value in state.places.items() if j == k and value > NEAR]
         found[k][near] = fine
     return found

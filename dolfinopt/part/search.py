@@ -117,7 +117,8 @@ class SidesSearch:
     """Steps within a trust region from one state on.
 
     Attributes:
-        best: the best state so far, on a mesh of its own.
+        best: the best state so far, on a mesh of its own; it may miss a limit by a little.
+        met: the best one that keeps all limits; None: there was none.
         passed: outlines of the last mesh and of those since then.
         steps: taken.
         spent: whether no more iterations were allowed.
@@ -126,6 +127,7 @@ class SidesSearch:
     def __init__(self, problem: Problem, state: State):
         """Begin at a state."""
         self.problem, self.state, self.best = problem, state, state.released
+        self.met: State | None = None
         self.passed = [dict(state.outlines)]
         # Without stress there is nothing that a finer mesh of the first state would tell.
         self.since, self.falls = FOLLOWED, list[float]()
@@ -175,6 +177,14 @@ class SidesSearch:
         if not self.falls or self.state.rank <= self.best.rank:
             self.best = self.state.released
         self.falls.append(self.best.values[0])
+        self._keep_met()
+
+    def _keep_met(self) -> None:
+        """Keep the state if it meets all limits and is better than those before."""
+        values = self.state.values
+        if values[1:].max(initial=0.0) <= EXCESS:
+            if self.met is None or values[0] < self.met.values[0]:
+                self.met = self.state.released
 
     def _simplified(self) -> bool:
         """Go on without sides that have vanished and holes that close, if that costs little."""
@@ -250,6 +260,7 @@ class SidesSearch:
         self.since += 1
         self.state = step.state
         self.passed.append(dict(step.state.outlines))
+        self._keep_met()
 
     def _learn(self, state: State, keys: list[Place]) -> None:
         """Find the derivatives of the stress at places."""

