@@ -52,6 +52,7 @@ REACH = 3.0  # cells from the ends of two sides within which they meet
 CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
 SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
+LEAVING = 1.2 * TURN  # between a line and a circle that stays solid, at least
 ROOM = 0.45  # share of a side that a fillet at one of its ends may take
 
 
@@ -278,7 +279,8 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
             drawn = [one for run in chain for one in _sides_along(run, edges, tolerance, closed)]
             drawn = _distinct([one.named(key=next(names)) for one in drawn], halved)
             drawn = _whole(drawn, names) if halved else drawn
-            drawn = cornered(cleaned(drawn, limits), limits, boundary, tolerance)
+            drawn = cleaned(_leaving(drawn, outer), limits)
+            drawn = _leaving(cornered(drawn, limits, boundary, tolerance), outer)
             if not drawn:
                 continue
             if _is_circle(drawn):
@@ -459,6 +461,36 @@ def _crossing(one: Drawn) -> Drawn:
     return replace(
         one, side=replace(side, point=side.point * [1.0, 0.0], angle=angle, twin=side.key)
     )
+
+
+def _leaving(drawn: Sequence[Drawn], outer: int) -> list[Drawn]:
+    """Return sides whose lines leave circles that stay solid in a corner that can be rounded.
+
+    A tangent has no corner there, and one that turns the other way would cut into the circle: it
+    is moved inwards until it leaves the circle at a little more than the least turn.
+    """
+    made, count = list(drawn), len(drawn)
+    for k, one in enumerate(drawn):
+        along = unit(one.side.angle)
+        out, touched = -left(along), []
+        for j, sense in (((k - 1) % count, 1.0), ((k + 1) % count, -1.0)):
+            arc = drawn[j].side.curve
+            if one.side.free and drawn[j].side.edge >= outer and isinstance(arc, Arc):
+                height = float((one.side.point - arc.centre) @ out)
+                above = height - arc.radius * np.cos(LEAVING)
+                if arc.sweep > 0.0 and 0.0 < above < arc.radius:
+                    touched.append((j, sense, arc, height, above))
+        if not touched:
+            continue
+        drop = max(above for *_, above in touched)
+        made[k] = replace(made[k], side=one.side.moved(-drop, 0.0))
+        for j, sense, arc, height, _ in touched:
+            reach = float(np.sqrt(arc.radius**2 - (height - drop) ** 2))
+            place = arc.centre + (height - drop) * out + sense * reach * along
+            ends = ("start", "end") if sense > 0.0 else ("end", "start")
+            made[k] = replace(made[k], **{ends[0]: place})
+            made[j] = replace(made[j], **{ends[1]: place})
+    return made
 
 
 # -- corners --------------------------------------------------------------------------------------
