@@ -557,7 +557,7 @@ def refined(
     meshes: Mapping[int, PartMesh],
     before: Column | None,
 ) -> tuple[Simulated, Column, dict[int, PartStress], float, Mapping[int, PartMesh]]:
-    """Return what parts do on meshes that are refined where their stress is largest.
+    """Return what parts do on meshes that are refined where their stress is largest, once at least.
 
     Args:
         scene, parts: as for `check_parts`.
@@ -579,7 +579,8 @@ def refined(
         change = float("nan")
         if before is not None:
             change = _ratio(column.values[STRESS], before.values[STRESS]) - 1.0
-        if round_ == most or not abs(change) > settled:
+        known = column.stress is None or (round_ > 0 and not abs(change) > settled)
+        if round_ == most or known:
             break
         for place, one in stress.items():
             owner = scene.owners[place]

@@ -19,7 +19,7 @@ import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.part.check import Column, part_column, refined, simulate_parts
+from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
 from dolfinopt.part.plane.fit import rough_sides
@@ -40,6 +40,7 @@ from dolfinopt.scene.load import Scene
 
 ITERATIONS = 80  # default, at most, from every start
 FIRST = 0.75  # of them, before a finer mesh has judged
+REPAIRS = 2  # times that limits missed in the end are met by further steps
 ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
 START = 1.2  # distance of the first sides from the densities' outline, cells
 STUB = 1.5  # width of members that go where they end nowhere, cells
@@ -247,11 +248,7 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
     """Return what parts do on refined meshes."""
-    refine = any(one.REFINEMENTS for one in parts.values())
-    meshes, coarse = mesh_parts(parts, refine), None
-    if meshes.coarse:  # by what it differs they are refined
-        coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
-    return refined(scene, parts, meshes.fine, coarse)[1]
+    return refined(scene, parts, mesh_parts(parts, coarse=False).fine, None)[1]
 
 
 # -- from one start ----------------------------------------------------------------------------
@@ -306,9 +303,10 @@ class Descent:
             if self.done >= self.iterations or (kept and not self.search.spent):
                 break
             self._tighten(limits)
-        if self.search.met is not None and not all(one.met for one in found.limits):
-            self.state = self.search.met
-            found, _ = self._judged(start, ending)
+        for _ in range(REPAIRS):
+            if all(one.met for one in found.limits) or not self._meets(limits):
+                break
+            found, limits = self._judged(start, ending)
         self._keep(ending)
         return replace(found, ending=ending)
 
@@ -323,7 +321,9 @@ class Descent:
 
     def _best_state(self) -> State:
         """Return the best state so far, that of the last step among them."""
-        return min(self.state, self.search.best, self.search.state, key=lambda one: one.rank)
+        search = self.search
+        every = self.state, search.best, search.state, search.met
+        return min((one for one in every if one is not None), key=lambda one: one.rank)
 
     def _told(self, line: str) -> None:
         """Tell of a step, which is kept first."""
@@ -390,6 +390,17 @@ class Descent:
         while self.best is None and self.done < most and self._without_struts(most):
             pass
         return ending
+
+    def _meets(self, limits: tuple[Limit, ...]) -> bool:
+        """Take further steps, which meet limits above all; return whether sides can."""
+        self._tighten(limits)
+        self.search = self._begun(self.state)
+        if not isinstance(self.search, SidesSearch):
+            return False
+        self.search.restore(self._told, self.done)
+        self.done, self.search.steps = self.done + self.search.steps, 0
+        self.state = self.search.state
+        return True
 
     def _without_struts(self, most: int) -> bool:
         """Go on from the best state without a strut, if a few steps make one that is better."""

@@ -32,6 +32,7 @@ SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the
 HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, steps that rows hold
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
+DEAR, RESTORING = 50.0, 3  # price of limits that shall be met above all; steps to that, at most
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
 HARDLY = 1e-5  # relative fall that a step must promise
@@ -158,6 +159,17 @@ class SidesSearch:
                     return "no step betters the parts"
                 self.since, self.radius = FOLLOWED, max(self.radius, 0.1)
                 continue
+            self.steps += 1
+            tell(self._line(first + self.steps))
+
+    def restore(self, tell: Tell, first: int) -> None:
+        """Take a few steps that meet the limits above all; as many as that needs."""
+        if self.since >= FOLLOWED:
+            self._mesh_anew()
+        for _ in range(RESTORING):
+            self.price = DEAR
+            if self.state.values[1:].max(initial=0.0) <= EXCESS or not self._step():
+                break
             self.steps += 1
             tell(self._line(first + self.steps))
 

@@ -20,7 +20,6 @@ from dolfinopt.part.plane.curves import MIRROR, Arc, Line
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import SidesSearch
-from dolfinopt.responses.constraints import EXCESS
 
 pytestmark = pytest.mark.serial
 
@@ -233,22 +232,24 @@ def test_command_writes_optimised_parts(made, tmp_path, capsys):
     assert row["optimised part"] == pytest.approx(found.best.value, rel=2e-2)
 
 
-@pytest.mark.slow
-def test_flanges_that_would_buckle_are_kept(tmp_path):
-    """The lightest frame of polymer within its deflection would buckle at 1.6 times its load."""
-    soft = ("material.young_modulus=2e9", "objective.kind=mass", "constraints.deviation=0.3")
+def test_flanges_that_would_buckle_are_kept(made):
+    """Two steps to less mass: a frame of polymer buckles earlier, or later where that is asked."""
+    _, scene, parts, _, _ = made
+    soft = with_tables(scene, material={"young_modulus": 2e9}, objective={"kind": "mass"},
+                       design={"volume_fraction": None})  # fmt: skip
     found = {}
-    for least in (0.01, 1.7):
-        told = (*SMALL, *soft, f"constraints.buckling={least}")
-        folder = folder_with(tmp_path / f"run{least}", frame, *told)
-        scene = scene_of(folder)
-        one = optimize_parts(scene, make_parts(scene, folder), 5, lambda line: None)
-        found[least] = one.best.value, {limit.name: limit.value for limit in one.best.limits}
-    assert found[0.01][1]["buckling"] < 1.6
-    mass, limits = found[1.7]
-    assert 1.7 * (1.0 - EXCESS) <= limits["buckling"] < 1.75
-    assert limits["deviation"] < 0.3
-    assert found[0.01][0] < 1.01 * mass  # after five steps
+    for least in (0.2, 1.9):
+        limits = {"deviation": 0.3, "buckling": least}
+        problem = Problem(with_tables(soft, constraints=limits), {}, {})
+        search = SidesSearch(problem, problem.evaluated({0: _free(scene, 0, parts[0])}, {}))
+        states = [search.state]
+        search.run(2, lambda line: None, 0)
+        states.append(search.state)
+        found[least] = [
+            next(limit.value for limit in one.limits if limit.name == "buckling") for one in states
+        ]
+    assert found[0.2][1] < 0.9 * found[0.2][0]
+    assert found[1.9][1] > 1.05 * found[1.9][0]
 
 
 SCARA = str(runs.ROOT / "demos" / "scara.toml")
@@ -283,13 +284,10 @@ def scara(tmp_path_factory):
 def test_cutter_and_smallest_member_of_a_scara_robot(scara):
     """Every concave corner takes the 6 mm cutter, and no member is thinner than 4 mm."""
     scene, parts = scara
-    problem = Problem(scene, parts, {}, by_places=True)
-    before = problem.evaluated({k: _free(scene, k, part) for k, part in parts.items()}, {})
-    search = SidesSearch(problem, before)
-    search.run(2, lambda line: None, 0)
-    assert search.state.values[0] < 0.995 * before.values[0]
+    found = optimize_parts(scene, parts, 2, lambda line: None)
+    assert found.best.value < 0.995 * found.before and all(one.met for one in found.best.limits)
     size = 1e-4
-    for part in problem.parts_of(search.state.outlines).values():
+    for part in found.parts.values():
         assert part.thinnest >= 0.99 * scene.part.minimum_member  # steps end a little within
         deep, _ = deepest_left(part.shape, scene.part.tool_radius, size)
         assert deep <= 1.5 * size  # the raster's own

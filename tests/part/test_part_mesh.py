@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
-from parts import frame
 from runs import TWO_ARM
 
 from dolfinopt.arms.arm import Arm
