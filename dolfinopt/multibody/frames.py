@@ -334,8 +334,8 @@ class MovingJoint(CarriedFrame):
         if self.rates is None or self.slides:
             return self.joint.rotation
         # Of a column NumPy takes other instructions, and another last bit, where the end of its
-        # stride touches the memory of the result.
-        angle = np.ascontiguousarray(self.rates[0])
+        # stride touches the memory of the result. One number keeps its stride unless it is copied.
+        angle = self.rates[0].copy()
         return self.joint.turns @ np.stack(
             [np.ones_like(angle), np.sin(angle), 1.0 - np.cos(angle)]
         )
