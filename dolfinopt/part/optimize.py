@@ -18,6 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
+from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
@@ -47,6 +48,7 @@ STUB = 1.5  # width of members that go where they end nowhere, cells
 START_STEPS = 40  # of Newton's to the first outline that keeps all limits
 TRIED, FEW = 3, 4  # struts that are left out in trial, the most promising; steps of each
 MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
+LONG = 4.0  # work of a simulation without a strut, over that with it, at most
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Tell = Callable[[str], None]
@@ -404,14 +406,16 @@ class Descent:
 
     def _without_struts(self, most: int) -> bool:
         """Go on from the best state without a strut, if a few steps make one that is better."""
-        promised = []
+        promised, state = [], self.state
         plain = replace(self.problem, local={})
-        for k, one in self.state.outlines.items():
+        with counted() as work:
+            plain.evaluated(state.outlines, {}, state.solutions)
+        for k, one in state.outlines.items():
             for other in one.without_struts() if isinstance(one, FreeSides) else ():
                 try:
-                    tried = plain.evaluated(
-                        {**self.state.outlines, k: other}, {}, self.state.solutions
-                    )
+                    with counted(LONG * work.done):  # what takes long hardly hangs together
+                        outlines = {**state.outlines, k: other}
+                        tried = plain.evaluated(outlines, {}, state.solutions).released
                 except (ConvergenceError, InputError):
                     continue
                 missed = np.maximum(tried.values[1:], 0.0).max(initial=0.0)

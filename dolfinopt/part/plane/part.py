@@ -16,7 +16,7 @@ from dolfinopt.part.mesh import TURN, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
-from dolfinopt.part.plane.limits import limits_of_part, rounded_radii
+from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
@@ -134,10 +134,11 @@ class PlanePart:
             found.append(
                 f"arm {one.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
             )
-        if self.thinnest is not None and self.thinnest < 0.9 * one.minimum_member:
+        least = one.minimum_member or THIN
+        if self.thinnest is not None and self.thinnest < 0.9 * least:
             found.append(
                 f"arm {one.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, below "
-                f"the smallest that the scene asks for, {1e3 * one.minimum_member:.3g} mm"
+                f"the smallest that is asked for, {1e3 * least:.3g} mm"
             )
         return found
 
