@@ -561,7 +561,7 @@ def refined(
 
     Args:
         scene, parts: as for `check_parts`.
-        meshes: fine ones.
+        meshes: of parts that are not refined.
         before: what they do on coarse ones; None: not known.
 
     Returns:
@@ -574,6 +574,8 @@ def refined(
     if most and scene.constraints.limit("stress") is not None:
         most, settled = ROUNDS_LIMITED, SETTLED_LIMITED
     for round_ in range(most + 1):
+        if most:
+            meshes = {k: part.mesh(finer=places[k]) for k, part in parts.items()}
         fine = simulate_parts(scene, parts, meshes)
         column, stress = part_column(scene, fine, parts)
         change = float("nan")
@@ -587,7 +589,6 @@ def refined(
             if owner is not None and one.peak.value > HOT * column.values[STRESS]:
                 places[owner].append(one.hot)
         before = column
-        meshes = {k: part.mesh(finer=places[k]) for k, part in parts.items()}
     return fine, column, stress, change, meshes
 
 

@@ -235,8 +235,8 @@ def body_mesh(
         shape: m.
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
-        finer: places (n, 2), m, near each of which the outline turns by `FINE` along a side, and by
-            half as much for every further array.
+        finer: places (n, 2), m, near which sides are half as long, and the outline turns by `FINE`
+            along them; half of both for every further array.
         turn: of the outline along a side elsewhere, rad; one for all pieces, or one each.
 
     Raises:
@@ -342,10 +342,13 @@ def _sizes(
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
     turn = np.repeat(turns, [len(t) for t in samples])
+    side = np.minimum(WALL * wall, LARGEST * cell)
     for number, places in enumerate(finer):
-        here = cKDTree(places).query(points)[0] < np.maximum(turn / bend, SAMPLES * cell)
+        size = np.minimum(side, turn / bend)
+        here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
         turn = np.where(here, np.minimum(turn, FINE * 0.5**number), turn)
-    size = np.clip(np.minimum(WALL * wall, turn / bend), SMALLEST * cell, LARGEST * cell)
+        side = np.where(here, 0.5 * side, side)
+    size = np.maximum(np.minimum(side, turn / bend), SMALLEST * cell)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])

@@ -250,7 +250,9 @@ def _tightened(fine: Limit, coarse: Limit) -> float:
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
     """Return what parts do on refined meshes."""
-    return refined(scene, parts, mesh_parts(parts, coarse=False).fine, None)[1]
+    refines = any(one.REFINEMENTS for one in parts.values())
+    meshes = {} if refines else mesh_parts(parts, coarse=False).fine
+    return refined(scene, parts, meshes, None)[1]
 
 
 # -- from one start ----------------------------------------------------------------------------

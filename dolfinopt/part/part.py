@@ -135,12 +135,13 @@ class Part(Protocol):
     def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
         """Yield how the names of its files end, and what they hold; `name` and title of it."""
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> PartMesh:
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> PartMesh:
         """Return a mesh of it, on this process alone.
 
         Args:
             coarser: factor of the sides of all cells.
-            finer: places (n, d), m, near each of which sides are halved, once for every array.
+            finer: places (n, d), m, near which arcs of a coarse mesh are divided finely, twice as
+                finely for every further array; None: finely everywhere.
 
         Raises:
             InputError: Gmsh cannot mesh it.
@@ -289,6 +290,6 @@ def mesh_parts(parts: Mapping[int, Part], coarse: bool = True) -> Meshes:
     """
     larger: dict[int, PartMesh] = {}
     with suppress(InputError):  # of walls thinner than such cells
-        larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
+        larger = {k: one.mesh(one.COARSER, ()) for k, one in parts.items() if coarse}
     fine = {k: one.mesh() for k, one in parts.items()}
     return Meshes(larger if len(larger) == len(fine) else {}, fine)

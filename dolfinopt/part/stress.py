@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from dolfinopt.responses.response import Analysis
     from dolfinopt.scene.tables.objective import Objective
 
-HOT = 0.8  # of the largest stress, from which on a place is worth a finer mesh
+HOT = 0.65  # of the largest stress, from which on a place is worth a finer mesh
 SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
 
 

@@ -150,8 +150,8 @@ class FreeSides:
         if self.solid is not None:
             return self, self.current.mesh()
         if turns is None or len(turns) != len(self.sides.shape.pieces):
-            return self, self.plane.mesh()
-        return self, self.plane.mesh(turn=turns)
+            return self, self.plane.mesh(finer=())
+        return self, self.plane.mesh(finer=(), turn=turns)
 
     def followed(self, mesh: Mesh) -> Mesh | None:
         """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.mesh import TURN, BodyMesh, body_mesh
+from dolfinopt.part.mesh import FINE, TURN, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
@@ -188,12 +188,13 @@ class PlanePart:
     def mesh(
         self,
         coarser: float = 1.0,
-        finer: Sequence[np.ndarray] = (),
+        finer: Sequence[np.ndarray] | None = None,
         turn: float | np.ndarray = TURN,
     ) -> BodyMesh:
         """Return triangles along its curves, see `part.Part`; `turn` as of `body_mesh`."""
+        turn = FINE if finer is None else turn
         try:
-            return body_mesh(self.shape, self.domain.cell, coarser, finer, turn)
+            return body_mesh(self.shape, self.domain.cell, coarser, finer or (), turn)
         except InputError as error:
             raise InputError(f"arm {self.name!r}: {error}") from None
 

@@ -282,7 +282,7 @@ class SolidPart:
             yield ".step", solid_text(shape, t, name, -0.5 * t)
             yield ".dxf", dxf_text(shape)
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> Tetrahedra:
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> Tetrahedra:
         """Return tetrahedra, all about as large, see `part.Part`."""
         size = coarser * mesh_size(self)
         try:
