@@ -653,16 +653,15 @@ class Model:
         Raises:
             InputError: something asked for is not possible.
         """
-        from dolfinopt.study.studies import study  # with pandas: a third of the import's time
+        from dolfinopt.study.cases import Runner  # with pandas: a third of the import's time
+        from dolfinopt.study.studies import study
 
         with self._folder(folder) as place:
             paths = [
                 self._design_file(one, place / f"design{k}.npz") for k, one in enumerate(designs, 1)
             ]
-            found = study(
-                self.scene, preset, vary, paths, place, self._world,
-                reoptimize=reoptimize, shown=shown,
-            )  # fmt: skip
+            runner = Runner(place, self._world, shown)
+            found = study(self.scene, preset, vary, paths, runner, reoptimize=reoptimize)
             frame: DataFrame = self._world.bcast(found.tables[0].frame, root=0)
         return frame
 

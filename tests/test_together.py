@@ -27,7 +27,7 @@ from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.scene.load import read_scene
 from dolfinopt.study import cases as computing
 from dolfinopt.study import studies as study
-from dolfinopt.study.cases import Case, run_cases
+from dolfinopt.study.cases import Case, Runner, run_cases
 from dolfinopt.study.uncertainty import sample_cases
 
 COMM = MPI.COMM_WORLD
@@ -305,10 +305,10 @@ def payloads(*overrides):
 
 
 @ON_RANKS
-@pytest.mark.parametrize("name", ["_optimise", "_read"])
-def test_cases(name, monkeypatch, shared_tmp_path):
+@pytest.mark.parametrize(("place", "name"), [(computing, "_optimise"), (computing._Place, "read")])
+def test_cases(place, name, monkeypatch, shared_tmp_path):
     """A rank that fails ends the others' work, too; what they have finished stays."""
-    fail_on(monkeypatch, LONE, computing, name)
+    fail_on(monkeypatch, LONE, place, name)
     with pytest.raises(Unusual, match=f"^{name}$"):
         run_cases(payloads(), shared_tmp_path, COMM, shown=False)
     COMM.Barrier()
@@ -339,7 +339,7 @@ def test_samples(monkeypatch, shared_tmp_path):
 def test_tables(monkeypatch, shared_tmp_path):
     fail_on(monkeypatch, LONE, study, "tabulated")
     with pytest.raises(Unusual, match=r"^tabulated$"):
-        study.study(coarse(), None, ["payload.mass=5,6"], [], shared_tmp_path, COMM, shown=False)
+        study.study(coarse(), None, ["payload.mass=5,6"], [], Runner(shared_tmp_path, COMM, False))
     COMM.Barrier()
 
 

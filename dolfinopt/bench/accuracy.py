@@ -307,23 +307,20 @@ def reference(problem: MachineSystem, start: Solution) -> Solution:
 def compared(cells: Row, problem: MachineSystem) -> Rows:
     """Yield a row for every tolerance: the case's estimated and true error, inf where it failed."""
     t = np.linspace(0.0, problem.breakpoints[-1], INSTANTS)
-    runs = {tolerance: _solved(problem, tolerance) for tolerance in CASE_TOLERANCES}
-    done = [one for one in runs.values() if one is not None]
+    runs: dict[float, Solution | None] = {}
+    for tolerance in CASE_TOLERANCES:  # from cold
+        try:
+            runs[tolerance] = radau.integrate(problem, tolerance, STAGES, Profile())
+        except ConvergenceError:
+            runs[tolerance] = None
+    done = [one for one in runs.values() if one]
     right = reference(problem, done[-1]).sample(t) if done else np.empty(0)
-    for tol, found in runs.items():
-        if found is not None:
+    for tolerance, found in runs.items():
+        row = np.inf, np.inf, 0
+        if found:
             true = relative_error(problem.mechanism, found.sample(t) - right, right)
-            yield *cells, tol, found.error, true, len(found.a)
-        else:
-            yield *cells, tol, np.inf, np.inf, 0
-
-
-def _solved(problem: MachineSystem, tolerance: float) -> Solution | None:
-    """Return the solution from cold, or None."""
-    try:
-        return radau.integrate(problem, tolerance, STAGES, Profile())
-    except ConvergenceError:
-        return None
+            row = found.error, true, len(found.a)
+        yield *cells, tolerance, *row
 
 
 def _cases(plan: Plan) -> Steps:

@@ -50,15 +50,18 @@ def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
     The root returns their median of CPU seconds and on the wall, how many, seconds of the whole.
     """
     clock: list[tuple[float, float]] = []
-
     begun = perf_counter()
-    result = optimize(
-        scene, world=comm, report=lambda _: clock.append((time.process_time(), perf_counter()))
-    )
+
+    def report(_: object) -> None:
+        clock.append((time.process_time(), perf_counter()))
+
+    result = optimize(scene, world=comm, report=report)
     elapsed = perf_counter() - begun
-    if comm.rank > 0:
-        return []
-    return [*np.median(np.diff(clock, axis=0), axis=0).tolist(), result.iterations, elapsed]
+    return (
+        []
+        if comm.rank
+        else [*np.median(np.diff(clock, axis=0), axis=0).tolist(), result.iterations, elapsed]
+    )
 
 
 def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:
@@ -66,11 +69,11 @@ def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:
     return changed(scene, f"arms.cells={list(cells)}", *settings)
 
 
-def plain_statics(scene: Scene, cells: Cells) -> PlainStatics:
+def plain_iteration(scene: Scene, cells: Cells) -> Iteration:
     """Return plain DOLFINx's iteration of the scene's first arm."""
     arm, solid = with_cells(scene, cells).arms[0], scene.material_of(0)
     mesh, modulus = arm_mesh(MPI.COMM_SELF, arm), solid.modulus * arm.thickness
-    return PlainStatics(mesh, modulus, solid.ratio, arm.height)
+    return plain_statics(mesh, modulus, solid.ratio, arm.height)
 
 
 def _iterations(plan: Plan) -> Steps:
@@ -86,7 +89,7 @@ def _iterations(plan: Plan) -> Steps:
         yield name, cells[0] * cells[1], *found, memory
 
     def theirs(name: str, cells: Cells) -> Rows:
-        make = plain_statics if name == PLAIN else pymoto_iteration
+        make = plain_iteration if name == PLAIN else pymoto_iteration
         if one := make(plan.scene, cells):
             x = np.full(cells[0] * cells[1], plan.scene.design.initial)
             one(x)  # what is compiled, ordered and allocated once a run
@@ -111,8 +114,7 @@ ITERATION = Diagram(
     "program",
     "CPU seconds of the first rank, waiting for others included: median of whole iterations. Other "
     "programs: K assembled and factorised anew (plain DOLFINx: MUMPS), one load, the gradient; the "
-    "least of the repeats. Memory is that of all ranks.",
-    uses=("pymoto",),
+    "least of the repeats. Memory is that of all ranks. pyMOTO: pip install 'dolfinopt[bench]'.",
 )
 
 
@@ -124,71 +126,68 @@ PENALTY, FLOOR = 3.0, 1e-6  # of the interpolation
 Iteration = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 
-class PlainStatics:
-    """Compliance of a cantilever as DOLFINx's own demos would find it (collective).
+def plain_statics(
+    arm: ArmMesh, modulus: float, nu: float, area: float, tolerance: float = 1e-7
+) -> Iteration:
+    """Return the compliance of a cantilever as DOLFINx's own demos would find it (collective).
 
-    Linear elements, no filter. In the plane MUMPS' Cholesky factor, in space CG with GAMG from 0.
+    Clamped at its inboard facets, 1 N over its end. Linear elements, no filter. In the plane MUMPS'
+    Cholesky factor, the modulus times the thickness, and the area the height; in space conjugate
+    gradients with GAMG from 0 to the tolerance, and energies of cells in place of the gradient.
     """
+    mesh, d, in_plane = arm.mesh, arm.dim, arm.dim == 2
+    space = compat.lagrange_space(mesh, 1, components=d)
+    cellwise = getattr(fem, "functionspace", fem.FunctionSpace)(mesh, ("DG", 0))
+    density, found = fem.Function(cellwise), fem.Function(space)
+    a, b, w = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.TestFunction(cellwise)
+    # In the plane the law stands in the form, as one writes it; that doubles what an iteration
+    # takes: quadrature allows for x**3.0 as if x varied in a cell. In space x is E itself.
+    young = modulus * (FLOOR + (1.0 - FLOOR) * density**PENALTY) if in_plane else density
+    slope = -modulus * PENALTY * (1.0 - FLOOR) * density ** (PENALTY - 1.0) if in_plane else 1.0
+    shear, rest = 1.0 / (1.0 + nu), 1.0 - nu if in_plane else 1.0 - 2.0 * nu
 
-    def __init__(
-        self, arm: ArmMesh, modulus: float, nu: float, area: float, tolerance: float = 1e-7
-    ) -> None:
-        """Compile the forms of an arm that is clamped at its inboard facets; 1 N over its end.
+    def energy(u: Any, v: Any) -> Any:  # of unit stiffness; plane stress in the plane
+        strain, other = ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))
+        stress = shear * strain + shear * nu / rest * ufl.tr(strain) * ufl.Identity(d)
+        return ufl.inner(stress, other)
 
-        In the plane the modulus is times the thickness, and the area the height; CG's tolerance.
-        """
-        mesh, d, self.modulus, self.count = arm.mesh, arm.dim, modulus, arm.num_cells
-        self.space = space = compat.lagrange_space(mesh, 1, components=d)
-        cellwise = getattr(fem, "functionspace", fem.FunctionSpace)(mesh, ("DG", 0))
-        self.x, self.u, self.in_plane = fem.Function(cellwise), fem.Function(space), d == 2
-        a, b, w = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.TestFunction(cellwise)
-        # In the plane the law stands in the form, as one writes it; that doubles what an iteration
-        # takes: quadrature allows for x**3.0 as if x varied in a cell. In space x is E itself.
-        young = modulus * (FLOOR + (1.0 - FLOOR) * self.x**PENALTY) if d == 2 else self.x
-        slope = -modulus * PENALTY * (1.0 - FLOOR) * self.x ** (PENALTY - 1.0) if d == 2 else 1.0
-        shear, rest = 1.0 / (1.0 + nu), 1.0 - nu if d == 2 else 1.0 - 2.0 * nu
+    end = ufl.gt(ufl.SpatialCoordinate(mesh)[0], (1.0 - 1e-9) * arm.outboard_point[0])
+    stiffness = compat.compile_form(young * energy(a, b) * ufl.dx)
+    gradient = compat.compile_form(slope * energy(found, found) * w * ufl.dx)
+    dofs = fem.locate_dofs_topological(space, d - 1, arm.inboard_facets)
+    clamp = fem.dirichletbc(np.zeros(d), dofs, space)
+    force = ufl.conditional(end, 1.0 / area, 0.0) * b[1] * ufl.ds
+    load = petsc.assemble_vector(compat.compile_form(force))
+    load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+    petsc.set_bc(load, [clamp])
+    solution, K = load.duplicate(), petsc.create_matrix(stiffness)
+    solver = PETSc.KSP().create(arm.comm)
+    solver.setType("preonly" if in_plane else "cg")
+    solver.getPC().setType("cholesky" if in_plane else "gamg")
+    if in_plane:
+        solver.getPC().setFactorSolverType("mumps")
+    solver.setTolerances(rtol=tolerance)
 
-        def energy(u: Any, v: Any) -> Any:  # of unit stiffness; plane stress in the plane
-            strain, other = ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))
-            stress = shear * strain + shear * nu / rest * ufl.tr(strain) * ufl.Identity(d)
-            return ufl.inner(stress, other)
-
-        end = ufl.gt(ufl.SpatialCoordinate(mesh)[0], (1.0 - 1e-9) * arm.outboard_point[0])
-        load = ufl.conditional(end, 1.0 / area, 0.0) * b[1] * ufl.ds
-        self._stiffness = compat.compile_form(young * energy(a, b) * ufl.dx)
-        self._gradient = compat.compile_form(slope * energy(self.u, self.u) * w * ufl.dx)
-        dofs = fem.locate_dofs_topological(space, d - 1, arm.inboard_facets)
-        self._clamp = fem.dirichletbc(np.zeros(d), dofs, space)
-        self.load = petsc.assemble_vector(compat.compile_form(load))
-        self.load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-        petsc.set_bc(self.load, [self._clamp])
-        self._solution, self.K = self.load.duplicate(), petsc.create_matrix(self._stiffness)
-        self._ksp = PETSc.KSP().create(arm.comm)
-        self._ksp.setType("preonly" if d == 2 else "cg")
-        self._ksp.getPC().setType("cholesky" if d == 2 else "gamg")
-        if d == 2:
-            self._ksp.getPC().setFactorSolverType("mumps")
-        self._ksp.setTolerances(rtol=tolerance)
-
-    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the compliance and its derivative (n_cells,) by x; in space energies of cells."""
-        self.x.x.array[: self.count] = x if self.in_plane else self.modulus * (FLOOR + x**PENALTY)
-        self.x.x.scatter_forward()
-        self.K.zeroEntries()
-        petsc.assemble_matrix(self.K, self._stiffness, bcs=[self._clamp])
-        self.K.assemble()
-        if self.in_plane:
-            self.K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            self.K.setOption(PETSc.Mat.Option.SPD, True)
+    def iterate(x: np.ndarray) -> tuple[float, np.ndarray]:
+        density.x.array[: len(x)] = x if in_plane else modulus * (FLOOR + x**PENALTY)
+        density.x.scatter_forward()
+        K.zeroEntries()
+        petsc.assemble_matrix(K, stiffness, bcs=[clamp])
+        K.assemble()
+        if in_plane:
+            K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            K.setOption(PETSc.Mat.Option.SPD, True)
         else:  # tell GAMG what K does not resist
-            owned = self.K.getLocalSize()[0] // 3
-            with_rigid_motions(self.K, self.space.tabulate_dof_coordinates()[:owned])
-        self._ksp.setOperators(self.K)
-        self._ksp.solve(self.load, self._solution)
-        self.u.x.array[: len(self._solution.array)] = self._solution.array
-        self.u.x.scatter_forward()
-        gradient = petsc.assemble_vector(self._gradient).array_r.copy()
-        return float(self.load.dot(self._solution)), gradient
+            owned = K.getLocalSize()[0] // 3
+            with_rigid_motions(K, space.tabulate_dof_coordinates()[:owned])
+        solver.setOperators(K)
+        solver.solve(load, solution)
+        found.x.array[: len(solution.array)] = solution.array
+        found.x.scatter_forward()
+        slopes = petsc.assemble_vector(gradient).array_r.copy()
+        return float(load.dot(solution)), slopes
+
+    return iterate
 
 
 def pymoto_iteration(scene: Scene, cells: Sequence[int]) -> Iteration | None:
@@ -288,11 +287,8 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
 def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
     """Return the densities (n_cells,) of a straight solid member within an arm's box of cells.
 
-    Args:
-        arm: of cells along, over the height, and of solids over the thickness.
-        kind: "bar": the arm's section times `size`; "tube": walls of `size` half heights, in the
-            plane flanges; "truss": such flanges, and as thick diagonals of 45 degrees between them.
-        size: from 0 to 1.
+    A "bar" is the arm's section times `size`, from 0 to 1; a "tube" has walls of `size` half
+    heights, in the plane flanges; a "truss" such flanges, and as thick diagonals of 45 degrees.
     """
     off = across(arm)
     away = np.abs(off).max(axis=1)
@@ -309,9 +305,9 @@ def drawn_by_hand(name: str, kind: str) -> Rows:
     """Measure the best straight member of a kind that keeps a problem's limits, all arms alike."""
     scene = posed(problems()[name], "half", 0)
     arms, partition = arms_of(scene), partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    turned = objective_of(scene).turned
+    sign = -1.0 if objective_of(scene).turned else 1.0
 
-    def looked_at(size: float) -> tuple[bool, float, float, float]:
+    def judged(size: float) -> tuple[bool, float, float, float]:
         """Return whether limits are broken, what is minimised, the excess, and the size."""
         x = {k: drawn(arm, kind, size) for k, arm in arms.items()}
         if not scene.design.projection:  # grey at the edges, as what is optimised
@@ -321,18 +317,18 @@ def drawn_by_hand(name: str, kind: str) -> Rows:
         except ConvergenceError:
             return True, np.inf, np.inf, size
         excess = max((one.excess for one in limits_of(scene, found)), default=0.0)
-        return excess > EXCESS, -found.objective if turned else found.objective, excess, size
+        return excess > EXCESS, sign * found.objective, excess, size
 
     def best() -> tuple[bool, float, float, float]:
-        found = min(looked_at(size) for size in np.linspace(STRIDE, 1.0, round(1.0 / STRIDE)))
+        found = min(map(judged, np.linspace(STRIDE, 1.0, round(1.0 / STRIDE))))
         for k in range(1, HALVINGS + 1):
             near = (found[3] + side * STRIDE / 2**k for side in (-1.0, 1.0))
-            found = min(found, *(looked_at(size) for size in near if 0.0 < size <= 1.0))
+            found = min(found, *(judged(size) for size in near if 0.0 < size <= 1.0))
         return found
 
     seconds, _, (_, value, excess, size) = timed(best)
-    value = -value if turned else value
-    yield name, kind, 0, 0, 0, value, excess, 0, seconds, f"{100.0 * size:.1f} % of the height"
+    words = f"{100.0 * size:.1f} % of the height"
+    yield name, kind, 0, 0, 0, sign * value, excess, 0, seconds, words
 
 
 def _starts(plan: Plan) -> Steps:

@@ -16,10 +16,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from mpi4py import MPI
@@ -35,8 +34,9 @@ Densities: TypeAlias = dict[int, np.ndarray]
 Cells: TypeAlias = tuple[int, int]  # of an arm
 # As dolfinopt.sh has it: containers run as root; more ranks than cores are fine; ranks are not
 # bound to the cores of another run. Open MPI 4 (OMPI), then 5 (PRTE).
-ENVIRONMENT = dict.fromkeys(("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM"), "1")
-ENVIRONMENT |= {
+ENVIRONMENT = {
+    "OMPI_ALLOW_RUN_AS_ROOT": "1",
+    "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
     "OMPI_MCA_rmaps_base_oversubscribe": "1",
     "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe",
     "OMPI_MCA_hwloc_base_binding_policy": "none",
@@ -44,8 +44,7 @@ ENVIRONMENT |= {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(NamedTuple):
     """What is measured on: a scene; a quick plan has coarse settings and a single repeat."""
 
     scene: Scene
@@ -60,9 +59,9 @@ class Plan:
 def timed(
     action: Callable[[], Any], repeats: int = 1, short: float = math.inf
 ) -> tuple[float, float, Any]:
-    """Call `repeats` times; return the least seconds of CPU and on the wall, and the last value.
+    """Call `repeats` times, once what takes more than `short` seconds; return the last value.
 
-    Whatever disturbs a call makes it longer. What takes more than `short` seconds is called once.
+    Before it the least seconds of CPU and on the wall: whatever disturbs a call makes it longer.
     """
     cpu = wall = math.inf
     for _ in range(repeats):
@@ -79,9 +78,6 @@ def timed(
 def arms_of(scene: Scene) -> Arms:
     """Return the scene's arms on this rank alone."""
     return build_arms(scene, partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile())
-
-
-# -- processes -------------------------------------------------------------------------------
 
 
 def mpirun() -> str | None:
@@ -109,8 +105,7 @@ def in_processes(
 
 
 def _main(module: str, name: str, text: str) -> None:
-    comm = MPI.COMM_WORLD
-    scene, *given = json.loads(text)
+    comm, (scene, *given) = MPI.COMM_WORLD, json.loads(text)
     found = getattr(import_module(module), name)(comm, scene_from_dict(scene), *given)
     # Not by getrusage, which inherits the peak of the parent; kB.
     peak = Path("/proc/self/status").read_text(encoding="utf-8").partition("VmHWM:")[2].split()[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -39,7 +38,6 @@ class Diagram:
     note: str  # on what is measured
     each: tuple[str, ...] = ()  # columns; every combination of values has panels of its own
     drawn: Callable[[Frame], Frame] = Frame.copy  # returns the frame that is drawn
-    uses: tuple[str, ...] = ()  # packages whose versions, or absence, change the rows
 
     def frame(self, rows: Iterable[Row]) -> Frame:
         """Return rows under their columns."""
@@ -51,21 +49,8 @@ def write(diagram: Diagram, frame: Frame, folder: Path) -> str:
     table = Table(diagram.name, diagram.note, frame)
     write_text(folder / f"{diagram.name}.csv", table.csv())
     save(draw(figure_of(diagram, frame)), folder / f"{diagram.name}.png")
-    left_out = "Left out, not installed (pip install 'dolfinopt[bench]'): {}."
-    missing = [left_out.format(package) for package in diagram.uses if not version(package)]
-    head = [f"## {diagram.title}", f"![{diagram.title}]({diagram.name}.png)"]
-    return "\n\n".join([*head, *missing, table.markdown()])
-
-
-def version(package: str) -> str:
-    """Return a package's version, "" where it is not installed."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-# -- curves ----------------------------------------------------------------------------------
+    picture = f"![{diagram.title}]({diagram.name}.png)"
+    return f"## {diagram.title}\n\n{picture}\n\n{table.markdown()}"
 
 
 def curves(frame: Frame, x: str, y: str, by: str) -> dict[str, Frame]:

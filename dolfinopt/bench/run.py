@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 from dolfinopt.bench import accuracy, iterations, solid
 from dolfinopt.bench.measure import Plan
-from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, version, write
+from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, write
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.study.tables import Table
 
 Tell = Callable[[str], None]
@@ -68,10 +67,10 @@ def bench(
 def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[list[Row], list[str]]:
     """Return the rows of all steps, kept in FOLDER/<name>.json or measured, and what failed.
 
-    Those of another source of this package, or other versions of what they use, are not kept.
+    Those of another source of this package are not kept.
     """
-    path, versions = folder / f"{diagram.name}.json", [version(one) for one in diagram.uses]
-    asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict(), versions]
+    path = folder / f"{diagram.name}.json"
+    asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict()]
     stamp = json.loads(json.dumps(asked))
     kept: dict[str, list[Row]] = {}
     try:
@@ -106,7 +105,6 @@ def source(folder: Path = Path(__file__).parents[1]) -> str:
 FASTER = 50.0  # than SciPy
 LARGE = 4e4  # elements per arm up to which the exponent is fitted
 SETTLED, DEMO = (math.prod(cells) for cells in (iterations.SETTLED, iterations.DEMO))
-FEWEST, MILLION = 15_000, 900_000  # dofs from which on goals of links, and of their memory, hold
 
 
 class Goal(NamedTuple):
@@ -121,10 +119,10 @@ class Goal(NamedTuple):
     def cells(self, frame: Frame) -> tuple[str, str, str, str]:
         """Return goal, limit, measured, met."""
         value = self.measure(frame)
-        met = value >= self.limit if self.least else value <= self.limit
         limit = f"at {'least' if self.least else 'most'} {self.limit:g}"
         if math.isnan(value):
             return self.what, limit, "not measured", ""
+        met = value >= self.limit if self.least else value <= self.limit
         return self.what, limit, f"{value:.3g}", "yes" if met else "no"
 
 
@@ -134,98 +132,54 @@ def goal_table(frames: Mapping[str, Frame]) -> Frame:
     return Frame(rows, columns=["goal", "limit", "measured", "met"])
 
 
-def _at(frame: Frame, **values: object) -> Frame:
-    """Return the rows with these values; in names _ stands for a space."""
-    for name, value in values.items():
-        frame = frame[frame[name.replace("_", " ")] == value]
-    return frame
+USUAL = f"method == '{accuracy.USUAL}' and `tolerance [-]` == {accuracy.USUAL_TOLERANCE}"
 
 
-# -- plane arms ------------------------------------------------------------------------------
-
-
-def _usual(coordinates: int, frame: Frame) -> Frame:
-    """Return the rows of a simulation as scenes have it by default."""
-    usual = {"method": accuracy.USUAL, "tolerance [-]": accuracy.USUAL_TOLERANCE}
-    return _at(frame, coordinates_per_arm=coordinates, **usual)
+def _cold(coordinates: int, frame: Frame) -> float:
+    """Return the seconds of a simulation as scenes have it by default; of the worse design."""
+    here = frame[frame["coordinates per arm"] == coordinates]
+    return here.query(USUAL)[accuracy.SECONDS].max()
 
 
 def _superiority(coordinates: int, frame: Frame) -> float:
     """Return how many times as long SciPy takes to our error, or a bound; of the worse design."""
-    theirs = _at(frame, coordinates_per_arm=coordinates)
-    theirs = theirs[theirs["method"].str.startswith("SciPy")]
+    here = frame[frame["coordinates per arm"] == coordinates]
+    theirs = here[here["method"].str.startswith("SciPy")]
     ratios = [
         least_x(points, one[accuracy.ERROR]) / one[accuracy.SECONDS]
-        for _, one in _usual(coordinates, frame).iterrows()
-        for points in curves(_at(theirs, design=one["design"]), *accuracy.CURVES).values()
+        for _, one in here.query(USUAL).iterrows()
+        for points in curves(theirs[theirs["design"] == one["design"]], *accuracy.CURVES).values()
     ]
     return min(ratios, default=math.nan)
 
 
 def _over_plain(program: str, column: str, frame: Frame) -> float:
     """Return the seconds of a program's iteration over those of plain DOLFINx's."""
-    here = _at(frame, elements_per_arm=SETTLED)
-    ours, plain = (_at(here, program=name)[column].min() for name in (program, iterations.PLAIN))
-    return ours / plain
+    seconds = frame[frame["elements per arm"] == SETTLED].groupby("program")[column].min()
+    return float(seconds.get(program, math.nan) / seconds.get(iterations.PLAIN, math.nan))
 
 
 def _power_of_elements(frame: Frame) -> float:
     """Return the power of the elements that an iteration's time on one rank grows with."""
-    here = _at(frame, program=iterations.OURS)[["elements per arm", "iteration [s]"]]
-    return fitted_power(here[here["elements per arm"] <= LARGE])
+    here = frame[(frame["program"] == iterations.OURS) & (frame["elements per arm"] <= LARGE)]
+    return fitted_power(here[["elements per arm", "iteration [s]"]])
 
 
 def _demo(frame: Frame) -> float:
     """Return the seconds of a whole optimisation: of more iterations than the others have."""
-    done = _at(frame, program=iterations.TWO_RANKS, elements_per_arm=DEMO)
-    return done[done["iterations"] > iterations.COUNTED]["all iterations, wall clock [s]"].min()
+    done = frame[frame["iterations"] > iterations.COUNTED]
+    done = done[(done["program"] == iterations.TWO_RANKS) & (done["elements per arm"] == DEMO)]
+    return done["all iterations, wall clock [s]"].min()
 
 
-# -- solid links, the optimiser --------------------------------------------------------------
-
-
-def _links(frame: Frame, what: str, ranks: int) -> Frame:
-    return _at(frame[frame["dofs"] >= FEWEST], what=what, ranks=ranks)
-
-
-def _beside_plain(what: str, ranks: int, frame: Frame) -> float:
-    """Return the largest ratio of an iteration to plain DOLFINx's of all sizes."""
-    ours, plain = (_links(frame, one, ranks)["iteration [s]"] for one in (what, solid.PLAIN))
-    return (ours / plain.to_numpy()).max() if len(ours) == len(plain) else math.nan
-
-
-def _power_of_dofs(what: str, ranks: int, frame: Frame) -> float:
-    """Return the power of the dofs that time grows with beyond the range of factors."""
-    ours = _at(_links(frame, what, ranks), solver=solid.ITERATIVE)
-    return fitted_power(ours[["dofs", "iteration [s]"]])
-
-
-def _over_pymoto(design: str, dofs: int, frame: Frame) -> float:
-    """Return the seconds over pyMOTO's of the largest link with at most so many dofs."""
-    here = _at(frame[frame["dofs"] <= dofs], design=design)
-    ours, theirs = (_at(here, program=one) for one in (solid.STATIC, solid.PYMOTO))
-    if not len(ours) or len(ours) != len(theirs):
-        return math.nan
-    return ours["iteration [s]"].iloc[-1] / theirs["iteration [s]"].iloc[-1]
-
-
-def _over_straight(frame: Frame) -> float:
-    """Return the rod's least mass over that of the best one drawn by hand."""
-    kept = frame[(frame["problem"] == iterations.ROD) & (frame["largest excess [-]"] <= EXCESS)]
-    drawn = kept["start"].isin(iterations.DRAWN)
-    return kept[~drawn]["objective"].min() / kept[drawn]["objective"].min()
-
-
-def _infeasible(frame: Frame) -> float:
-    made = frame[frame["iterations"] > 0]
-    return float((made["largest excess [-]"] > EXCESS).sum()) if len(made) else math.nan
+def _tip_error(frame: Frame) -> float:
+    here = frame[(frame["element"] == accuracy.DEFAULT) & (frame["cells"] == "50 x 3")]
+    return 100.0 * here[accuracy.TIP_ERROR].min()
 
 
 GOALS = (
-    Goal("time", "simulation to 1e-4 from cold, 4 coordinates per arm [s]", 0.03,
-         lambda f: _usual(4, f)[accuracy.SECONDS].max()),
-    Goal("time", "simulation to 1e-4 from cold, 48 coordinates per arm [s]", 0.3,
-         lambda f: _usual(48, f)[accuracy.SECONDS].max()),
+    *(Goal("time", f"simulation to 1e-4 from cold, {q} coordinates per arm [s]", limit,
+           partial(_cold, q)) for q, limit in ((4, 0.03), (48, 0.3))),
     *(Goal("time", f"times as fast as solve_ivp at the same error, {q} coordinates per arm [-]",
            FASTER, partial(_superiority, q), least=True) for q in (4, 48)),
     Goal("iteration", "dynamic iteration of two arms of 400 x 24 cells over plain DOLFINx's static "
@@ -237,28 +191,7 @@ GOALS = (
     Goal("iteration", "demos/two_arm.toml on two ranks until it has converged, set-up included, "
          "wall clock [s]", 20.0, _demo),
     Goal("mesh", "error of tip compliance, 50 x 3 cells of the default element [%]", 0.5,
-         lambda f: 100.0
-         * _at(f, element=accuracy.DEFAULT, cells="50 x 3")[accuracy.TIP_ERROR].min()),
+         _tip_error),
     Goal("tolerance", "largest true error over simulation.tolerance [-]", 1.0,  # inf: it failed
          lambda f: (f["true error [-]"] / f["tolerance [-]"]).max()),
-    Goal("optimiser", "objective from a start over the best of its problem, the largest [-]", 1.05,
-         lambda f: iterations.over_best(f[f["iterations"] > 0])[iterations.OVER].max()),
-    Goal("optimiser", "mass of the rod over the best straight one [-]", 1.0, _over_straight),
-    Goal("optimiser", "evaluations for an iteration, mean [-]", 1.3,
-         lambda f: f["evaluations"].sum() / (f["iterations"].sum() or math.nan)),
-    Goal("optimiser", "runs that end without a feasible design", 0.0, _infeasible),
-    *(Goal("solid", f"{what}, {ranks} rank{'s' * (ranks > 1)} [-]", limit,
-           partial(measure, design, ranks))
-      for ranks in (1, 2) for what, limit, measure, design in (
-       ("iteration beside plain DOLFINx, the largest of all links", 3.0, _beside_plain, solid.COLD),
-       ("with warm starts beside it, the largest of all links", 1.5, _beside_plain, solid.WARM),
-       ("exponent of a first design beyond the range of factors", 1.15, _power_of_dofs, solid.COLD),
-       ("exponent of a nearby design beyond the range of factors", 1.15, _power_of_dofs,
-        solid.WARM),
-    )),
-    *(Goal("statics", f"nearby design over pyMOTO's, up to {dofs} dofs [-]", limit,
-           partial(_over_pymoto, solid.NEARBY, dofs))
-      for dofs, limit in ((80_000, 0.7), (170_000, 1.0))),
-    Goal("solid", "memory of a million dofs on two ranks [GB]", 20.0,
-         lambda f: _links(f[f["dofs"] >= MILLION], solid.COLD, 2)["memory [GB]"].max()),
 )  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.bench.iterations import PlainStatics, pymoto_iteration
+from dolfinopt.bench.iterations import plain_statics, pymoto_iteration
 from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.fem.multigrid import NAME as ITERATIVE
@@ -34,19 +34,22 @@ STATIC, PYMOTO = "dolfinopt, one load", "pyMOTO, one load"
 DESIGNS = FIRST, NEARBY = "first design", "nearby design"
 STATIC_CELLS = (64, 8, 8), (112, 16, 12), (156, 20, 16)  # that three grids divide
 LOAD = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0  # N across the end
-
 Cells = tuple[int, int, int]
 Found = tuple[int, str, list[float]]  # dofs of all ranks, solver, CPU seconds by design
 
 
-def link_scene(scene: Scene, cells: Cells) -> Scene:
+def link_scene(scene: Scene, cells: Cells, static: bool = False) -> Scene:
     """Return the scene with one solid link, whatever its motion would be."""
     size = {"length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": cells}
-    arm = scene.arms[0].unchecked_copy({**size, "element": "incompatible", "passive": 0.02})
-    reduction = scene.reduction.unchecked_copy({"method": "craig-bampton", "coordinates": 6})
-    radius = 1.5 * LENGTH / cells[0]
-    design = scene.design.unchecked_copy({"filter_radius": radius})
-    return scene.unchecked_copy({"arms": (arm,), "reduction": reduction, "design": design})
+    tables = {
+        "arms": {**size, "element": "incompatible", "passive": 0.02},
+        "reduction": {"method": "craig-bampton", "coordinates": 6},
+        "design": {"filter_radius": 1.5 * LENGTH / cells[0]},
+        "objective": {"kind": "static"} if static else {},
+    }
+    changed = {key: getattr(scene, key) for key in tables} | {"arms": scene.arms[0]}
+    found = {key: table.unchecked_copy(tables[key]) for key, table in changed.items()}
+    return scene.unchecked_copy(found | {"arms": (found["arms"],)})
 
 
 def box_beam(centroid: np.ndarray) -> np.ndarray:
@@ -63,55 +66,53 @@ def _seconds(comm: MPI.Comm, action: Callable[[np.ndarray], Any], x: np.ndarray)
     return float(comm.allreduce(time.process_time() - begun, op=MPI.MAX))
 
 
-def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
-    """Return an iteration of this package: a first design and one nearby (collective)."""
-    arm = Arm(link_scene(scene, cells), 0, comm, Profile())
+def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool = False) -> Found:
+    """Return an iteration of this package: a first design and one nearby (collective).
 
-    def iterate(x: np.ndarray) -> None:
+    With its constraint modes and loads of the motion; if static, under one load.
+    """
+    arm = Arm(link_scene(scene, cells, static), 0, comm, Profile())
+
+    def dynamic(x: np.ndarray) -> None:
         state = arm.state(arm.physical(x))
         state.elastic.constraint_modes()
         _ = state.body
         arm.backward(esl_gradient(state, np.eye(6)))
 
+    def loaded(x: np.ndarray) -> None:
+        state = arm.state(x)
+        loads = static_response(state.elastic, np.array([LOAD])).loads
+        tip_gradient(state, loads, loads)
+
+    iterate = loaded if static else dynamic
     found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
-    return arm.substructure.T.num_dofs, arm.substructure.interior.solver.name, found
+    parts = arm.substructure
+    system = (parts.extended if static else None) or parts.interior
+    return parts.T.num_dofs, system.solver.name, found
 
 
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     """Return a static iteration in plain DOLFINx: trilinear hexahedra, one load (collective)."""
     arm, solid = box_arm(comm, "link", SIZE, cells), scene.material_of(0)
-    elastic = solid.modulus, solid.ratio
-    plain = PlainStatics(arm, *elastic, HEIGHT * THICKNESS, field_tolerance(scene))
-    return plain.load.getSize(), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
+    tolerance, area = field_tolerance(scene), HEIGHT * THICKNESS
+    plain = plain_statics(arm, solid.modulus, solid.ratio, area, tolerance)
+    return nodal_dofs(cells), ITERATIVE, [_seconds(comm, plain, box_beam(arm.centroid))]
 
 
-def static_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
-    """Return static iterations of this package: one load, two designs (collective)."""
-    link = link_scene(scene, cells)
-    objective = link.objective.unchecked_copy({"kind": "static"})
-    arm = Arm(link.unchecked_copy({"objective": objective}), 0, comm, Profile())
-
-    def iterate(x: np.ndarray) -> None:
-        state = arm.state(x)
-        loads = static_response(state.elastic, np.array([LOAD])).loads
-        tip_gradient(state, loads, loads)
-
-    found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
-    system = arm.substructure.extended or arm.substructure.interior
-    return arm.substructure.T.num_dofs, system.solver.name, found
-
-
-def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found | None:
+def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool) -> Found | None:
     """Return the same by pyMOTO, None where it is not installed."""
-    iterate = pymoto_iteration(link_scene(scene, cells), cells)
+    iterate = pymoto_iteration(link_scene(scene, cells, static), cells)
     if iterate is None:
         return None
     # Its cells run along first, then up the height.
-    places = [(np.arange(n) + 0.5) / n * size for n, size in zip(cells, SIZE, strict=True)]
-    z, y, x = (one.ravel() for one in np.meshgrid(*places[::-1], indexing="ij"))
-    centroid = np.column_stack([x, y - 0.5 * HEIGHT, z - 0.5 * THICKNESS])
-    found = [_seconds(comm, iterate, x) for x in two_designs(centroid)]
-    return 3 * math.prod(n + 1 for n in cells), ITERATIVE, found
+    places = np.indices(cells).reshape(3, -1, order="F").T + 0.5
+    centroid = places / cells * SIZE - [0.0, 0.5 * HEIGHT, 0.5 * THICKNESS]
+    return nodal_dofs(cells), ITERATIVE, [_seconds(comm, iterate, x) for x in two_designs(centroid)]
+
+
+def nodal_dofs(cells: Cells) -> int:
+    """Return the degrees of freedom of all nodes."""
+    return 3 * math.prod(n + 1 for n in cells)
 
 
 def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,23 +122,25 @@ def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.clip(moved, 1e-3, 1.0)
 
 
-def _static_steps(plan: Plan) -> Steps:
-    def rows(link: Callable[..., Found | None], name: str, cells: Cells) -> Rows:
-        result, memory = in_processes(link, plan.scene, cells, ranks=1)
+def _statics(plan: Plan) -> Steps:
+    def rows(name: str, cells: Cells) -> Rows:
+        link = iterate_link if name == STATIC else pymoto_link
+        result, memory = in_processes(link, plan.scene, cells, True, ranks=1)
         if result is not None:
             dofs, solver, found = result
             for design, seconds in zip(DESIGNS, found, strict=True):
                 yield name, design, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for cells in STATIC_CELLS[: 1 if plan.quick else None]:
-        for name, link in ((STATIC, static_link), (PYMOTO, pymoto_link)):
-            yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, link, name, cells)
+        for name in (STATIC, PYMOTO):
+            yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, name, cells)
 
 
 def _links(plan: Plan) -> Steps:
-    def rows(link: Callable[..., Found], cells: Cells, ranks: int) -> Rows:
+    def rows(who: str, cells: Cells, ranks: int) -> Rows:
+        link = plain_link if who == PLAIN else iterate_link
         (dofs, solver, found), memory = in_processes(link, plan.scene, cells, ranks=ranks)
-        for name, seconds in zip(OURS if link is iterate_link else [PLAIN], found, strict=True):
+        for name, seconds in zip([PLAIN] if who == PLAIN else OURS, found, strict=True):
             yield name, ranks, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for ranks, cells in product((1, 2) if mpirun() else (1,), QUICK if plan.quick else CELLS):
@@ -145,8 +148,8 @@ def _links(plan: Plan) -> Steps:
         if solid_bytes(math.prod(cells), ranks) > free_memory():
             yield f"{size} need more memory than is free: left out", list
             continue
-        for who, link in (("dolfinopt", iterate_link), (PLAIN, plain_link)):
-            yield f"{who}, {size}", partial(rows, link, cells, ranks)
+        for who in ("dolfinopt", PLAIN):
+            yield f"{who}, {size}", partial(rows, who, cells, ranks)
 
 
 SOLID = Diagram(
@@ -167,7 +170,7 @@ STATICS = Diagram(
     "statics",
     "One solid link: a static iteration against degrees of freedom",
     "program | design | dofs | iteration [s] | memory [GB] | solver",
-    _static_steps,
+    _statics,
     "dofs",
     ("iteration [s]", "memory [GB]"),
     "program",
@@ -175,5 +178,4 @@ STATICS = Diagram(
     f"beam, then densities moved by up to {MOVE:g}. pyMOTO: conjugate gradients with three "
     "geometric grids; the loaded end is not rigid there.",
     each=("design",),
-    uses=("pymoto",),
 )

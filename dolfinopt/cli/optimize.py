@@ -106,10 +106,11 @@ def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
     from tempfile import TemporaryDirectory
 
     from dolfinopt.parallel import together
+    from dolfinopt.study.cases import Runner
     from dolfinopt.study.sections import ahead
 
     with TemporaryDirectory() as own:
-        lines = ahead(scene, Path(world.bcast(own, root=0)), world)
+        lines = ahead(scene, Runner(Path(world.bcast(own, root=0)), world, shown=False))
         with together(world):  # until all ranks are done with the folder
             for line in lines:
                 click.echo(line)

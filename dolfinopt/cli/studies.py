@@ -47,9 +47,9 @@ designs_option = click.option(
 )
 
 
-# What a command asks: name of the study's files, design.npz files, what does the study in a folder,
-# and what else it asks, but for the values it goes through, which may grow.
-Question = tuple[str, Sequence[Path], Callable[["Path", "MPI.Comm"], "Study"], dict[str, Any]]
+# What a command asks: name of the study's files, design.npz files, what does the study, and what
+# else it asks, but for the values it goes through, which may grow.
+Question = tuple[str, Sequence[Path], Callable[..., "Study"], dict[str, Any]]
 
 
 def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
@@ -65,8 +65,10 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
         scene: Path, out: Path | None, overwrite: bool, overrides: Any, plots: bool, **own: Any
     ) -> None:
         world, loaded = load(scene, overrides)
+        keep = own.pop("keep", True)
         name, designs, study, question = ask(loaded, **own)
         from dolfinopt.parallel import on_root
+        from dolfinopt.study.cases import Runner
         from dolfinopt.study.tables import write_study
 
         # One folder for all studies of a scene, which share the optimised design.
@@ -74,7 +76,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
         asked = on_root(world, _asked, loaded, designs) | question
         if not overwrite:
             on_root(world, _check_question, folder, name, asked)
-        done = study(folder, world)
+        done = study(runner=Runner(folder, world, keep=keep))
 
         def conclude() -> None:
             _remove_listed(folder, name)
@@ -162,7 +164,6 @@ def sweep(
     vary: tuple[str, ...],
     designs: tuple[Path, ...],
     reoptimize: bool,
-    keep: bool,
 ) -> Question:
     """Simulate designs of SCENE for a range of values: tables and curves of what they do.
 
@@ -177,7 +178,7 @@ def sweep(
         )
     from dolfinopt.study.studies import study, sweep_name
 
-    do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize, keep=keep)
+    do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize)
     return sweep_name(preset, vary), designs, do, {}
 
 
@@ -256,33 +257,19 @@ def compare(
 )
 @click.option("--samples", type=int, default=1000, show_default=True, help="of the random values")
 @click.option("--seed", type=int, default=1, show_default=True, help="of the samples")
-@click.option(
-    "--sampler",
-    type=click.Choice(["sobol", "latin-hypercube"]),
-    default="sobol",
-    show_default=True,
-    help="how they fill the space",
-)
-@click.option(
-    "--indices",
-    type=click.Choice(["polynomial", "saltelli"]),
-    default="polynomial",
-    show_default=True,
-    help="Sobol' indices of a polynomial fitted to the samples, or of more simulations",
-)
 @designs_option
 @study_command
 def uncertainty(
-    scene: Scene, random: tuple[str, ...], designs: tuple[Path, ...], **sampling: Any
+    scene: Scene, random: tuple[str, ...], designs: tuple[Path, ...], samples: int, seed: int
 ) -> Question:
     """Simulate designs of SCENE with random values: statistics and Sobol' indices.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
-    from dolfinopt.study.uncertainty import Sampling, random_name, study_random
+    from dolfinopt.study.uncertainty import random_name, study_random
 
-    do = partial(study_random, scene, random, designs, sampling=Sampling(**sampling))
+    do = partial(study_random, scene, random, designs, samples=samples, seed=seed)
     return random_name(random), designs, do, {"distributions": sorted(random)}
 
 

@@ -1,13 +1,12 @@
 """The paper's figures 3 to 15: its cases, what comes out of them, figures, data and page.
 
-Every row of the table is one design in one scene: its table, label, kind (of the objective or the
+A row of the table is one design in one scene: its table, label, kind (of the objective or the
 reduction), x (coordinates, or the swept value), the value that it was made for, the case that is
 simulated, and the one that made the design. `add_outcomes` adds compliance (N m), deviation
 (largest, m), grayness, iterations, note (how it ended), own (compliance as the design's own model
-sees it, N m) and apart: of "reductions" the part of the cells on the other side of one half than in
-the design made with the most Craig-Bampton coordinates, of "coordinates" the largest distance of
-the deviation from that with the most, over the latter's largest. What does not apply, or failed,
-is nan. The figures bear the paper's numbers; which of several shows what is our choice.
+sees it, N m) and apart: from what the most Craig-Bampton coordinates give, of "reductions" the part
+of the cells on the other side of one half, of "coordinates" the largest distance of the deviation
+over the largest one. What does not apply, or failed, is nan. Which figure shows what is our choice.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from dolfinopt.scene.load import Scene, tomllib
 from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
-from dolfinopt.study.tables import Figure, LineFigure, Panel, Table, embedded, html_page
+from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table, embedded, html_page
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -70,19 +69,13 @@ Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what h
 
 
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
-    """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden.
-
-    InputError where there is no such key, or it does not allow the value.
-    """
+    """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden."""
     return load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
 
 
 def cell_sizes(scene: Scene) -> dict[int, float]:
     """Return the longest side of a cell by arm, m, 0 where a mesh file decides it."""
     return {k: arm.cell_size or 0.0 for k, arm in enumerate(scene.arms) if arm.flexible}
-
-
-# -- cases -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -154,14 +147,10 @@ class Plan:
                 yield table, label, "", value, made_for, case, design or case
 
 
-# -- results ---------------------------------------------------------------------------------
-
-
 def reproduce(plan: Plan, folder: Path, world: MPI.Comm) -> tuple[pd.DataFrame, Outcomes]:
     """Return the plan's table with results, and all outcomes; the same on all ranks (collective).
 
-    What is done already is kept in DIR `folder`. InputError where the scene does not allow what the
-    paper varies, or DIR cannot be written.
+    InputError where the scene does not allow what the paper varies, or DIR cannot be written.
     """
     with together(world):
         cases = [*plan.table.case, *plan.table.made]
@@ -182,14 +171,13 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
         own=[one.compliance for one in made],
         apart=math.nan,
     )
-    for name, distance in (("coordinates", _distance), ("reductions", _cells_apart)):
-        rows = results[results.table == name]
-        for _, group in rows.groupby(rows.label if name == "coordinates" else rows.table):
-            finest = outcomes[group.made[group.kind == CRAIG_BAMPTON].iloc[-1]]
-            pairs = [(outcomes[case], finest) for case in group.made]
-            results.loc[group.index, "apart"] = [
-                math.nan if a.failure or b.failure else distance(a, b) for a, b in pairs
-            ]
+    apart = {"coordinates": ("label", _deviations_apart), "reductions": ("table", _cells_apart)}
+    for name, (by, distance) in apart.items():
+        for _, rows in results[results.table == name].groupby(by):
+            finest = outcomes[rows.made[rows.kind == CRAIG_BAMPTON].iloc[-1]]
+            for at, case in rows.made.items():
+                if not (outcomes[case].failure or finest.failure):
+                    results.loc[at, "apart"] = distance(outcomes[case], finest)
     return results
 
 
@@ -200,7 +188,7 @@ def _cells_apart(one: Outcome, other: Outcome) -> float:
         return float(np.mean([((a[key] > 0.5) != (b[key] > 0.5)).mean() for key in keys]))
 
 
-def _distance(one: Outcome, other: Outcome) -> float:
+def _deviations_apart(one: Outcome, other: Outcome) -> float:
     """Return how far two deviations are apart at most, relative to the other's largest."""
     a, b = one.deviation()[1], other.deviation()[1]
     return float(np.abs(a - b).max() / b.max())
@@ -231,34 +219,29 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     def good(cases: Iterable[Case]) -> list[Outcome]:
         return [outcome for case in cases if not (outcome := outcomes[case]).failure]
 
-    optimum = coordinates[coordinates.label == OPTIMUM]
-    by_kind = optimum.groupby("kind", sort=False)
-    ends = [case for _, one in by_kind for case in one.case.iloc[[0, -1]]]
+    optimum = coordinates[coordinates.label == OPTIMUM].groupby("kind", sort=False)
+    ends = dict.fromkeys(case for _, one in optimum for case in one.case.iloc[[0, -1]])
     again = [replace(outcomes[c], case=made) for c, made in zip(reductions.case, reductions.made)]
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
-    objective, grayness = studies.convergence(good(reductions.made))
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
     by_count = tuple(
         Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
         for label, one in coordinates.astype({"x": int}).groupby("label", sort=False)
     )
-    lines = {
-        3: _over_time("Deviation of the end-effector by objective", *shown),
-        5: LineFigure("", "Convergence of the compliance by reduction", (objective,)),
-        6: LineFigure("", "Convergence of the grayness by reduction", (grayness,)),
-        7: LineFigure("", "Compliance against the number of coordinates", by_count),
-        8: _over_time("Deviation of the optimised design by reduction", good(dict.fromkeys(ends))),
-        9: _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
-    }
-    swept = product(SWEEPS, QUANTITIES)
-    lines |= {n: _sweep(by[name], name, what) for n, (name, what) in enumerate(swept, 10)}
-    figures: Figures = {number: (figure, figure) for number, figure in lines.items()}
-    title = "Designs by objective"
+    lines = [
+        _over_time("Deviation of the end-effector by objective", *shown),
+        *_convergence(good(reductions.made)),
+        LineFigure("", "Compliance against the number of coordinates", by_count),
+        _over_time("Deviation of the optimised design by reduction", good(ends)),
+        _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
+        *(_sweep(by[name], name, what) for name, what in product(SWEEPS, QUANTITIES)),
+    ]
+    figures: Figures = {n: (one, one) for n, one in zip((3, *range(5, 14)), lines, strict=True)}
     names = {"label": "made for", "grayness": "grayness [-]", "note": "ended by"}
     columns = ["label", *QUANTITIES, "grayness", "iterations", "note"]
-    table = Table("", title, objectives[columns].rename(columns=names))
-    figures[4] = studies.design_figure("", title, good(objectives.case)), table
+    designs = studies.design_figure("", "Designs by objective", good(objectives.case))
+    figures[4] = designs, Table("", designs.title, objectives[columns].rename(columns=names))
     labels = [f"{value:g}" for value in by["path"].made_for.dropna().unique()]
     for number, what in enumerate(QUANTITIES, 14):
         losses = 100.0 * loss(by["path"], what).to_numpy()
@@ -274,6 +257,22 @@ def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
     return LineFigure("", title, tuple(panels) or (Panel("", "time [s]", "deviation [mm]", ()),))
 
 
+def _convergence(found: Sequence[Outcome]) -> Iterator[LineFigure]:
+    """Yield objective and grayness of designs against the iteration."""
+    for what, key, label in (
+        ("compliance", "objective", "objective [N m]"),
+        ("grayness", "grayness", "grayness [-]"),
+    ):
+        lines = []
+        for one in found:
+            x, y = zip(*((row.iteration, getattr(row, key)) for row in one.history()))
+            lines.append(Line(one.case.label, np.array(x), np.array(y)))
+        seen = key == "objective"
+        title = "as the own model sees it" * seen
+        panel = Panel(title, "iteration [-]", label, tuple(lines), y_log=seen or None)
+        yield LineFigure("", f"Convergence of the {what} by reduction", (panel,))
+
+
 def _sweep(rows: pd.DataFrame, name: str, quantity: str) -> LineFigure:
     """Return a quantity over the swept value; the initial design has a scale of its own."""
     axis, lines = SWEEPS[name][1], studies.lines_by(rows, "label", "x", quantity)
@@ -287,19 +286,19 @@ def write_report(
     *, plots: bool = True,
 ) -> None:  # fmt: skip
     """Write figNN.csv, measured.json and, with plots, figNN.png and report.html (root only)."""
-    figures = all_figures(results, outcomes)
+    figures = {f"fig{number:02d}": pair for number, pair in all_figures(results, outcomes).items()}
     records = results[MEASURED].to_json(orient="records", double_precision=15, indent=1)
     write_text(folder / "measured.json", records + "\n")
-    for number, (_, data) in figures.items():
-        write_text(folder / f"fig{number:02d}.csv", data.csv())
+    for name, (_, data) in figures.items():
+        write_text(folder / f"{name}.csv", data.csv())
     if not plots:
         return
     from dolfinopt.study.figures import draw_all
 
-    files = draw_all({f"fig{number:02d}": one for number, (one, _) in figures.items()}, folder)
+    files = draw_all({name: one for name, (one, _) in figures.items()}, folder)
     pictures = [
-        (number, figure.title, embedded(file.read_bytes()))
-        for (number, (figure, _)), file in zip(figures.items(), files)
+        (int(name[3:]), one.title, embedded(file.read_bytes()))
+        for (name, (one, _)), file in zip(figures.items(), files, strict=True)
     ]
     tables = [data for _, data in figures.values() if isinstance(data, Table)]
     differing = variants.differences(load_paper(), plan.scene).items()
@@ -377,17 +376,14 @@ def percent(part: float) -> str:
     return f"{part:.0f} times" if part >= MANY else f"{100.0 * part:.{digits}f} %"
 
 
-# -- quantities ------------------------------------------------------------------------------
-
-
 def quantities(results: pd.DataFrame) -> dict[str, Any]:
     """Return everything that texts and criteria name; nan where a case failed."""
     by = dict(iter(results.groupby("table")))
     curves, reductions = by["coordinates"], by["reductions"].sort_values("x").astype({"x": int})
     cms, modal = (reductions[reductions.kind == method] for method in METHODS)
-    ends = {"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]}
-    ends |= {"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]}
-    return ends | {
+    return {
+        **{"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]},
+        **{"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]},
         "cms_change": abs(cms.compliance.iloc[0] / cms.compliance.iloc[-1] - 1.0),
         "before": _of_coordinates(curves[curves.label == INITIAL]),
         "after": _of_coordinates(curves[curves.label == OPTIMUM]),

@@ -39,7 +39,7 @@ LOOKS = {BEFORE: look(1), AFTER: look(0)}  # as an initial and an optimised desi
 
 def compare_runs(before: Path, after: Path) -> Table:
     """Return `before_after` of the runs in two folders."""
-    return before_after(*map(_summary, (before, after)))
+    return before_after(_summary(before), _summary(after))
 
 
 def _summary(run: Path) -> Summary:
@@ -60,11 +60,11 @@ def before_after(before: Summary, after: Summary) -> Table:
     InputError where they have other arms or drives.
     """
     for key, what in (("mass", "arms"), ("drive_peak", "drives")):
-        names = [list(one.get(key) or {}) for one in (before, after)]
+        names = [", ".join(one.get(key) or {}) for one in (before, after)]
         if names[0] != names[1]:
             raise InputError(
-                f"the runs have other {what}: {', '.join(names[0]) or 'none'} before, "
-                f"{', '.join(names[1]) or 'none'} after; name runs of the same machine"
+                f"the runs have other {what}: {names[0] or 'none'} before, "
+                f"{names[1] or 'none'} after; name runs of the same machine"
             )
     frame = pd.DataFrame(_figures(before), columns=["figure", BEFORE, "unit"])
     frame.insert(2, AFTER, [value for _, value, _ in _figures(after)])
@@ -76,17 +76,17 @@ def before_after(before: Summary, after: Summary) -> Table:
 
 def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
     """Yield name, value and unit."""
-
-    def thousandths(key: str) -> float | None:
-        return None if summary.get(key) is None else 1e3 * summary[key]
-
     links = summary["first_frequency"]
     yield "mass of all arms", sum(summary["mass"].values()), "kg"
     for link in links:
         yield f"mass of {link}", summary["mass"][link], "kg"
-    yield "largest tool deflection", thousandths("max_deviation"), "mm"
-    yield "largest tool rotation", thousandths("max_rotation"), "mrad"
-    yield "deflection at rest", thousandths("settling"), "mm"
+    for name, key, unit in (
+        ("largest tool deflection", "max_deviation", "mm"),
+        ("largest tool rotation", "max_rotation", "mrad"),
+        ("deflection at rest", "settling", "mm"),
+    ):
+        value = summary.get(key)
+        yield name, None if value is None else 1e3 * value, unit
     for link, frequency in links.items():
         yield f"first frequency of {link}", frequency, "Hz"
     joints = {one["name"]: one["type"] for one in summary["scene"].get("joints", ())}
@@ -163,7 +163,7 @@ def before_after_page(
         ],
         machines=machines,
         links=list(_links(sides)),
-        curves=list(_curves(sides, table)),
+        curves=list(_curves(sides)),
         table=table,
         sections=sections,
         differing=differences(before.scene, after.scene),
@@ -177,42 +177,30 @@ def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
 
     found = [(label, view) for label, side in sides.items() for view in designed(side.views)]
     for name in dict.fromkeys(view.name for _, view in found):
-        own = [(label, view) for label, view in found if view.name == name]
-        masses = {label: sides[label].summary["mass"][name] for label, _ in own}
-        views = [replace(view, name=label) for label, view in own]
+        views = [replace(view, name=label) for label, view in found if view.name == name]
+        masses = {view.name: sides[view.name].summary["mass"][name] for view in views}
         yield name, _embedded(solid_design_figure(views, name, masses))
 
 
-def _curves(sides: Mapping[str, Side], table: Table) -> Iterator[tuple[str, str, Image]]:
-    """Yield title, figures in words, and picture of deflection and drive forces over time."""
-    title, figure = "deflection of the tool", "largest tool deflection"
+def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
+    """Yield title and picture of deflection and drive forces over time."""
     deflections = {label: 1e3 * side.deviation for label, side in sides.items()}
-    words = _words(table, "largest", figure)
-    yield title, words, _plot(sides, title, f"{title} [mm]", deflections)
+    yield _plot(sides, "deflection of the tool", "deflection of the tool [mm]", deflections)
     for drive, unit in drive_units(sides[AFTER].scene).items():
         forces = {label: side.drive_forces[drive] for label, side in sides.items()}
-        words = "; ".join(
-            _words(table, word, f"{word} of drive {drive}") for word in ("peak", "root mean square")
-        )
         what = "force" if unit == "N" else "torque"
-        yield f"drive {drive}", words, _plot(sides, f"drive {drive}", f"{what} [{unit}]", forces)
+        yield _plot(sides, f"drive {drive}", f"{what} [{unit}]", forces)
 
 
-def _words(table: Table, word: str, figure: str) -> str:
-    """Return a row of the table in words."""
-    row = table.frame.set_index("figure").loc[figure]
-    change = row["change [%]"]
-    ending = f" ({change:+.3g} %)" if np.isfinite(change) and change else ""
-    return f"{word} {row[BEFORE]:.4g} → {row[AFTER]:.4g} {row['unit']}{ending}"
-
-
-def _plot(sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]) -> Image:
-    """Return curves of both runs over time."""
+def _plot(
+    sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]
+) -> tuple[str, Image]:
+    """Return curves of both runs over time, and their title."""
     from dolfinopt.study.figures import line_figure
 
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return _embedded(line_figure(LineFigure("", title, (panel,)), LOOKS))
+    return title, _embedded(line_figure(LineFigure("", title, (panel,)), LOOKS))
 
 
 def _embedded(figure: Figure) -> Image:

@@ -126,7 +126,7 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `store.SAMPLED`
+    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `SAMPLED`
     messages: Mapping[int, str] = field(default_factory=dict)  # of samples that failed, by number
 
     def __str__(self) -> str:
@@ -165,8 +165,10 @@ class Outcome:
             return data["t"], lengths(data["deviation"])
 
     def summary(self) -> dict[str, Any]:
-        """Return the content of summary.json."""
-        return dict(json.loads((self.folder / "summary.json").read_text("utf-8")))
+        """Return the content of summary.json, {} of a case that failed."""
+        if self.failure:
+            return {}
+        return dict(json.loads((self.folder / SUMMARY).read_text("utf-8")))
 
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""
@@ -190,6 +192,23 @@ class Outcomes:
         return [outcome for outcome in self.by_case.values() if outcome.failure]
 
 
+@dataclass
+class Runner:
+    """Where a study does its cases, see `run_cases`, and how many were computed."""
+
+    folder: Path
+    world: MPI.Comm
+    shown: bool = True
+    keep: bool = True
+    computed: int = 0
+
+    def run(self, cases: Iterable[Case]) -> Outcomes:
+        """Do the cases that are not done yet (collective)."""
+        done = run_cases(cases, self.folder, self.world, shown=self.shown, keep=self.keep)
+        self.computed += done.computed
+        return done
+
+
 def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:
     """Return what a scene computes with: its values and its files' content, `but` some tables."""
     data = with_digests(scene.to_dict())
@@ -205,12 +224,7 @@ def _digest(content: Any) -> str:
 # -- simulating them -------------------------------------------------------------------------
 
 
-APART = (
-    "motion",
-    "payload",
-    "forces",
-    "damping",
-)  # tables that leave the reduced bodies as they are
+APART = "motion payload forces damping".split()  # tables that leave the reduced bodies alone
 
 
 def simulate_scenarios(
@@ -244,10 +258,10 @@ def simulate_scenarios(
 
 def scales_bodies(scene: Scene, keys: Iterable[str]) -> bool:
     """Return whether one reduction serves all values of these keys."""
-    scaling = scene.scaling_keys
     parts = [key.split(".") for key in keys]
     return all(
-        one[0] in APART or (one[0] in ("material", "arms") and one[-1] in scaling) for one in parts
+        table in APART or (table in ("material", "arms") and rest[-1] in scene.scaling_keys)
+        for table, *rest in parts
     )
 
 
@@ -268,20 +282,22 @@ def simulate_samples(
     The bodies are scaled from those of `nominal`, the design in the nominal scene, and every sample
     starts from its solution: the bits depend on no other sample. None: they are reduced anew.
     """
-    if nominal is None:
+    if isinstance(nominal, ConvergenceError):
+        yield from [nominal] * len(scenes)
+    elif nominal is None:
         for scene in scenes:
             (found,) = simulate_scenarios([scene], design)
-            trajectory = found if isinstance(found, ConvergenceError) else found.trajectory
-            assert trajectory is not None  # on a single rank
-            yield trajectory
-    elif isinstance(nominal, ConvergenceError):
-        yield from [nominal] * len(scenes)
+            yield found if isinstance(found, ConvergenceError) else _trajectory(found)
     else:
-        assert nominal.trajectory is not None
-        owned = {k: nominal.trajectory.mechanism.bodies[k] for k in nominal.arms}
+        start = _trajectory(nominal)
+        owned = {k: start.mechanism.bodies[k] for k in nominal.arms}
         bodies = [bodies_in(nominal.scene, scene, owned) for scene in scenes]
-        starts = [nominal.trajectory.solution] * len(scenes)
-        yield from simulate_all(scenes, bodies, Profile(), starts)
+        yield from simulate_all(scenes, bodies, Profile(), [start.solution] * len(scenes))
+
+
+def _trajectory(result: RankResult) -> Trajectory:
+    assert result.trajectory is not None  # on a single rank
+    return result.trajectory
 
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
@@ -308,26 +324,44 @@ class _Place:
 
     def has(self, case: Case) -> bool:
         """Tell whether the case is done, or has failed in this run."""
-        return (self[case] / SUMMARY).exists() or bool(self.failure(case))
+        return (self[case] / SUMMARY).exists() or self._failure(case).exists()
+
+    def _failure(self, case: Case) -> Path:
+        return self.work / f"{case.key}.json"
+
+    def takes(self, job: Job) -> bool:
+        """Take a job; False if another rank has it."""
+        try:
+            (self.work / f"{job[0].key}.taken").touch(exist_ok=False)
+        except FileExistsError:
+            return False
+        return True
 
     def fail(self, case: Case, message: str, **more: Any) -> None:
         """Keep why a case failed, for this run."""
-        write_text(self.work / f"{case.key}.json", json.dumps({"message": message, **more}))
+        write_text(self._failure(case), json.dumps({"message": message, **more}))
 
-    def failure(self, case: Case) -> dict[str, Any]:
-        """Return what the case left when it failed in this run, nothing if it did not."""
-        path = self.work / f"{case.key}.json"
-        return dict(json.loads(path.read_text("utf-8"))) if path.exists() else {}
-
-    def tell(self) -> None:
-        """Tell of cases that have ended meanwhile, a line each."""
-        for case in [case for case in self.untold if self.has(case)]:
-            self.untold.remove(case)
-            log.info("%s; %d to go", _read(case, self), len(self.untold))
+    def read(self, case: Case) -> Outcome:
+        """Read a case back."""
+        failed = self._failure(case).exists()
+        path = self._failure(case) if failed else self[case] / SUMMARY
+        data = json.loads(path.read_text("utf-8"))
+        found: dict[str, Any] = {"failure": data["message"] if failed else ""}
+        if case.action == "sample":
+            samples = data.get("samples", {})
+            found["samples"] = {name: np.array(values, float) for name, values in samples.items()}
+            found["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
+        elif not failed:
+            found |= {name: data[name] for name in FIGURES}
+        if not failed:
+            found["seconds"] = data["seconds"]["total"]
+        return Outcome(case, self[case], **found)
 
     def check(self) -> None:
-        """Tell what has ended; raise OthersFailed if another rank has failed."""
-        self.tell()
+        """Tell of cases that have ended; raise OthersFailed if another rank has failed."""
+        for case in [case for case in self.untold if self.has(case)]:
+            self.untold.remove(case)
+            log.info("%s; %d to go", self.read(case), len(self.untold))
         if (self.work / "stop").exists():
             raise OthersFailed("another rank failed")
 
@@ -360,7 +394,7 @@ def run_cases(
             with together(world):
                 _share(_jobs(missing, world.size), place, world)
             with together(world):
-                outcomes = {case: _read(case, place) for case in wanted}
+                outcomes = {case: place.read(case) for case in wanted}
         finally:
             if world.rank == 0:  # all ranks have met
                 shutil.rmtree(place.work, ignore_errors=True)
@@ -408,20 +442,15 @@ def _jobs(missing: Iterable[Case], ranks: int) -> list[Job]:
 
 def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
     """Do one job after the other that no other rank has taken; end when all ranks do."""
-    left = list(jobs)
     try:
-        while left:
+        for job in jobs:
             place.check()
-            job = next((one for one in left if _is_ready(one[0], place)), None)
-            if job is None:
-                time.sleep(IDLE)
-                continue
-            left.remove(job)
-            try:
-                (place.work / f"{job[0].key}.taken").touch(exist_ok=False)
-            except FileExistsError:  # by another rank
-                continue
-            _do(job, place)
+            if place.takes(job):
+                design = job[0].design
+                while isinstance(design, Case) and not place.has(design):  # another rank makes it
+                    time.sleep(IDLE)
+                    place.check()
+                _do(job, place)
     except OthersFailed:
         raise
     except BaseException:
@@ -432,21 +461,16 @@ def _share(jobs: Sequence[Job], place: _Place, world: MPI.Comm) -> None:
         ended = world.Ibarrier()
         while not ended.Test():  # asleep: waiting in MPI would keep the processor busy
             time.sleep(IDLE)
-        place.tell()
-
-
-def _is_ready(case: Case, place: _Place) -> bool:
-    """Tell whether the design is there, or will not be."""
-    return not isinstance(case.design, Case) or place.has(case.design)
+    place.check()
 
 
 def _do(job: Job, place: _Place) -> None:
     """Do a job; without their design its cases fail."""
     action, design = job[0].action, job[0].design
     if isinstance(design, Case):
-        if failed := place.failure(design):
+        if failure := place.read(design).failure:
             for case in job:
-                place.fail(case, f"{design.label or design.key}: {failed['message']}")
+                place.fail(case, f"{design.label or design.key}: {failure}")
             return
         design = place[design] / "design.npz"
     if action == "optimize":
@@ -463,19 +487,19 @@ def _do(job: Job, place: _Place) -> None:
 def _optimise(case: Case, place: _Place) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
     begun, folder, scene = time.perf_counter(), place[case], _unnamed(case)
-    resume = True
+    resume, earlier = True, 0.0
     try:
         checkpoint.check(folder, scene)
     except InputError:  # none, damaged, or made when a file of the scene was elsewhere
         resume = False
-    rows = read_history(folder / HISTORY) if resume and (folder / HISTORY).exists() else []
+    if resume and (folder / HISTORY).exists() and (rows := read_history(folder / HISTORY)):
+        earlier = rows[-1].seconds
     how: dict[str, Any] = {"resume": resume, "overwrite": not resume, "world": MPI.COMM_SELF}
     try:
         result = optimize(scene, folder, **how, report=lambda row: place.check())
     except ConvergenceError as error:
         place.fail(case, str(error))
         return
-    earlier = rows[-1].seconds if rows else 0.0
     write_result(folder, result, earlier + time.perf_counter() - begun, paraview=False)
 
 
@@ -487,24 +511,18 @@ def _simulate(job: Job, design: Path | None, place: _Place) -> None:
         begun = time.perf_counter()
         result = next(found)
         wall = time.perf_counter() - begun
-        part = place.work / case.key
         if isinstance(result, ConvergenceError):
             place.fail(case, str(result))
+            continue
+        part = place.work / case.key
+        make_folder(part)
+        if place.keep:
+            write_result(part, result, wall, paraview=False)
         else:
-            make_folder(part)
-            if place.keep:
-                write_result(part, result, wall, paraview=False)
-            else:
-                _write_figures(part, result, wall)
-            os.rename(part, place[case])
-
-
-def _write_figures(folder: Path, result: RankResult, wall: float) -> None:
-    """Write the figures and the deviation over time of a simulation."""
-    assert result.trajectory is not None  # on a single rank
-    sampled = result.trajectory.sampled
-    write_arrays(folder / DEVIATION, {"t": sampled.t, "deviation": sampled.deviation})
-    write_summary(folder, figures(result, wall))
+            sampled = _trajectory(result).sampled
+            write_arrays(part / DEVIATION, {"t": sampled.t, "deviation": sampled.deviation})
+            write_summary(part, figures(result, wall))
+        os.rename(part, place[case])
 
 
 def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
@@ -541,19 +559,3 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
 def _unnamed(case: Case) -> Scene:
     """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
     return case.scene.unchecked_copy({"name": case.key})
-
-
-def _read(case: Case, place: _Place) -> Outcome:
-    """Read a case back."""
-    failed = place.failure(case)
-    data = failed or json.loads((place[case] / SUMMARY).read_text("utf-8"))
-    found: dict[str, Any] = {"failure": failed.get("message", "")}
-    if case.action == "sample":
-        samples = data.get("samples", {})
-        found["samples"] = {name: np.array(values, float) for name, values in samples.items()}
-        found["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
-    elif not failed:
-        found |= {name: data[name] for name in FIGURES}
-    if not failed:
-        found["seconds"] = data["seconds"]["total"]
-    return Outcome(case, place[case], **found)

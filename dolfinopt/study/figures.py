@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,23 +51,22 @@ def common_looks(figures: Iterable[tables.Figure]) -> Looks:
 def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
     """Return a study's figure, drawn in the looks of `common_looks`; default: of itself alone."""
     styles = styles or common_looks([figure])
+    if isinstance(figure, tables.DesignFigure):
+        return design_figure(figure)
     if isinstance(figure, LineFigure):
         return line_figure(figure, styles)
-    if isinstance(figure, FrameFigure) and figure.kind == "matrix":
+    if figure.kind == "matrix":
         return matrix_figure(figure)
-    if isinstance(figure, FrameFigure):
-        return histogram_figure(figure, styles)
-    return design_figure(figure)
+    return histogram_figure(figure, styles)
 
 
 def _grid(
-    title: str, shape: tuple[int, int], panel: tuple[float, float], **options: Any
+    title: str, rows: int, columns: int, width: float, height: float
 ) -> tuple[Figure, np.ndarray]:
     """Return a figure with its title, and axes (rows, columns), inches each."""
-    (rows, columns), (width, height) = shape, panel
     drawn = style.new_figure(width * columns + 0.6, height * rows + 0.6)
     drawn.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
-    return drawn, drawn.subplots(rows, columns, squeeze=False, **options)
+    return drawn, drawn.subplots(rows, columns, squeeze=False)
 
 
 def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> None:
@@ -103,14 +103,14 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
         if len(line.x) > style.FEW_POINTS:
             look["marker"] = ""
         axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **look)
-    y = np.concatenate([np.empty(0), *(line.y[np.isfinite(line.y)] for line in panel.lines)])
-    x = np.concatenate([np.empty(0), *(line.x for line in panel.lines)])
+    y = np.concatenate([[], *(line.y[np.isfinite(line.y)] for line in panel.lines)])
+    x = np.concatenate([[], *(line.x for line in panel.lines)])
     wide = bool(len(y)) and panel.y_log is not False and style.spans_decade(y)
     if panel.log:
         axes.set(xscale="log", yscale="log")
     elif wide or (panel.y_log and len(y) and y.min() > 0.0):
         style.log_scale(axes, y)
-    elif len(y) and y.min() >= 0.0 and y.min() < 0.5 * y.max():
+    elif len(y) and 0.0 <= y.min() < 0.5 * y.max():
         axes.set_ylim(bottom=0.0)
     if panel.x_log2 and len(x) and x.min() > 0.0:
         style.log2_scale(axes)
@@ -133,7 +133,7 @@ def matrix_figure(figure: FrameFigure) -> Figure:
     panels, made = list(figure.frame.groupby("panel", sort=False)), figure.frame.columns[0]
     count = len(panels[0][1])
     side = max(3.6, 0.62 * count + 1.6)
-    drawn, grid = _grid(figure.title, (1, len(panels)), (side, side))
+    drawn, grid = _grid(figure.title, 1, len(panels), side, side)
     for axes, (title, part) in zip(grid[0], panels, strict=True):
         values = part.iloc[:, 1:-1].to_numpy(dtype=float)
         image = axes.imshow(values, cmap="RdBu_r", vmin=-LOSS, vmax=LOSS)
@@ -160,7 +160,7 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
     designs = list(figure.frame.groupby("design", sort=False))
     quantities = list(figure.frame.columns[2:])
     title = f"{figure.title}; dashed: nominal"
-    drawn, grid = _grid(title, (len(designs), len(quantities)), (5.2, 3.2))
+    drawn, grid = _grid(title, len(designs), len(quantities), 5.2, 3.2)
     for row, (design, own) in zip(grid, designs, strict=True):
         for axes, what in zip(row, quantities, strict=True):
             values = own.loc[own["sample"] > 0, what].to_numpy()
@@ -180,36 +180,21 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
 
 
 def design_figure(figure: tables.DesignFigure) -> Figure:
-    """Return the designs below each other, arms side by side, to one scale."""
-    from matplotlib.collections import PolyCollection
-
+    """Return the designs below each other, to one scale."""
     views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
+    labels = [label for label, _, _ in figure.designs]
     if figure.designs[0][1].dimension == 3:  # PyVista is imported where solids are drawn
         from dolfinopt.plots.solid_design import solid_designs_figure
 
-        return solid_designs_figure([label for label, _, _ in figure.designs], views, figure.title)
-    columns = max(map(len, views))
-    tall = max(np.ptp(v.corners[..., 1]) / np.ptp(v.corners[..., 0]) for row in views for v in row)
-    wide = 6.0
-    drawn = style.new_figure(wide * columns + 0.4, len(views) * (wide * tall + 0.45) + 1.2)
-    grid = drawn.subplots(len(views), columns, squeeze=False)
-    for row, arms, (label, _, _) in zip(grid, views, figure.designs, strict=True):
-        for axes in row[len(arms) :]:
-            axes.set_visible(False)
-        for axes, view in zip(row, arms):
-            # Edges of the faces' colour close the seams between neighbours.
-            cells = PolyCollection(list(view.corners), array=view.density, cmap=style.COLOURS,
-                                   edgecolors="face", linewidths=0.2)  # fmt: skip
-            cells.set_clim(0.0, 1.0)
-            axes.add_collection(cells)
-            low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
-            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", yticks=[])
-            axes.xaxis.set_visible(False)
-            axes.set_title(view.name, loc="right", fontsize=9, color=GREY)
-        row[0].set_title(label, loc="left", fontsize=10, parse_math=False)
-    for axes in grid[-1]:
-        axes.xaxis.set_visible(True)
-        axes.set_xlabel("x [m]")
-    drawn.colorbar(cells, ax=grid, location="bottom", shrink=0.3, aspect=40, label=style.DENSITY)
-    drawn.suptitle(figure.title, x=0.01, ha="left", fontsize=12)
+        return solid_designs_figure(labels, views, figure.title)
+    from dolfinopt.plots import design
+
+    every = [
+        replace(view, name=f"{label}: {view.name}")
+        for label, row in zip(labels, views, strict=True)
+        for view in row
+    ]
+    drawn = design.design_figure(every, figure.title)
+    for axes, view in zip(drawn.axes, every):  # all arms have one size
+        axes.set_title(view.name, loc="left", fontsize=10, parse_math=False)
     return drawn

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -29,7 +28,7 @@ from dolfinopt.output.design import arms_with_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
-from dolfinopt.study.cases import Case, Outcome, run_cases
+from dolfinopt.study.cases import Case, Outcome, Runner
 from dolfinopt.study.studies import DEVIATION, Design, deviation_panels, given_designs
 from dolfinopt.study.tables import LineFigure, Study, Table
 
@@ -47,16 +46,7 @@ ROWS = 2000  # of a table of shaped joints
 TEN_PERCENT, FIVE_PERCENT = 1.1, 0.95
 
 
-@dataclass(frozen=True)
-class Machine:
-    """A machine that a motion does not know: its name in the table, and what differs."""
-
-    label: str
-    change: str
-
-
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """A motion in the table.
 
     Attributes:
@@ -70,48 +60,34 @@ class Motion:
     finer: float = math.nan
 
 
-@dataclass(frozen=True)
-class Row:
-    """A motion and what came out."""
-
-    motion: Motion
-    outcome: Outcome
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-        return self.motion.case.label
-
-
-def study_motions(
-    scene: Scene, designs: Sequence[Path], folder: Path, world: MPI.Comm, *, shown: bool = True
-) -> Study:
+def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
     """Compare motions of a scene's machine (collective).
 
     Args:
         scene: whose arms move.
         designs: design.npz of the arms; none: they are optimised, for the rigid path and again for
             feed-forward.
-        folder, world, shown: see `cases.run_cases`.
+        runner: of all cases.
 
     Raises:
         InputError: the scene's motion cannot be corrected or shaped; nothing was computed.
     """
-    design = on_root(world, _design, scene, designs)
-    searched = [design, Case(with_kind(scene, "tip"), "optimize", label=DESIGNED)]
-    searched = searched if isinstance(design, Case) else []
-    found = run_cases(searched, folder, world, shown=shown)
-    if found.failures:
-        failed = tuple(text for one in found.failures for text in one.failures)
-        return Study(NAME, (), (), failed, found.computed)
-    files = [found[one].design for one in searched] or [design]
-    motions = on_root(world, _motions, scene, files, folder / NAME)
-    done = run_cases([one.case for one in motions], folder, world, shown=shown)
-    rows = [Row(one, done[one.case]) for one in motions]
-    with together(world):
+    design = on_root(runner.world, _design, scene, designs)
+    files = [design]
+    if isinstance(design, Case):
+        searched = [design, Case(with_kind(scene, "tip"), "optimize", label=DESIGNED)]
+        found = runner.run(searched)
+        if found.failures:
+            failed = tuple(text for one in found.failures for text in one.failures)
+            return Study(NAME, (), (), failed, runner.computed)
+        files = [found[one].design for one in searched]
+    motions = on_root(runner.world, _motions, scene, files, runner.folder / NAME)
+    done = runner.run(one.case for one in motions)
+    rows = [(one, done[one.case]) for one in motions]
+    with together(runner.world):
         table, figure = report(scene, rows)
-    failed = tuple(text for row in rows for text in row.outcome.failures)
-    return Study(NAME, (table,), (figure,), failed, found.computed + done.computed)
+    failed = tuple(text for _, outcome in rows for text in outcome.failures)
+    return Study(NAME, (table,), (figure,), failed, runner.computed)
 
 
 def _design(scene: Scene, designs: Sequence[Path]) -> Design:
@@ -131,18 +107,16 @@ def with_kind(scene: Scene, kind: str) -> Scene:
     return scene_from_dict(data, scene.source)
 
 
-def machines(scene: Scene) -> list[Machine]:
-    """Return the machines that motions do not know, those that differ from the scene's."""
-    found, material = [], scene.material
+def machines(scene: Scene) -> dict[str, str]:
+    """Return what differs in the machines that motions do not know, by their names."""
+    material, damping = scene.material, scene.damping.stiffness_proportional
+    found = {}
     if scene.payload.mass > 0.0:
-        mass = TEN_PERCENT * scene.payload.mass
-        found.append(Machine("payload + 10 %", f"payload.mass={mass!r}"))
+        found["payload + 10 %"] = f"payload.mass={TEN_PERCENT * scene.payload.mass!r}"
     if isinstance(material.young_modulus, float):
-        young = FIVE_PERCENT * material.young_modulus
-        found.append(Machine("E - 5 %", f"material.young_modulus={young!r}"))
-    if scene.damping.stiffness_proportional > 0.0:
-        half = 0.5 * scene.damping.stiffness_proportional
-        found.append(Machine("half the damping", f"damping.stiffness_proportional={half!r}"))
+        found["E - 5 %"] = f"material.young_modulus={FIVE_PERCENT * material.young_modulus!r}"
+    if damping > 0.0:
+        found["half the damping"] = f"damping.stiffness_proportional={0.5 * damping!r}"
     return found
 
 
@@ -151,7 +125,7 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list
     first, *second = designs
     rigid, forward = _judged(with_kind(scene, "none")), _judged(with_kind(scene, "tip"))
     found = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer_deviation(rigid, first))]
-    frequency, damping_ratio = vibration(rigid, first)
+    frequency, damping_ratio = build_system(rigid, _bodies(rigid, first)).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
@@ -166,7 +140,7 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list
 def _judged(scene: Scene) -> Scene:
     """Return the scene with the machines that it does not know as its scenarios."""
     data = scene.to_tree()
-    data["scenarios"] = [{"changes": [one.change]} for one in machines(scene)]
+    data["scenarios"] = [{"changes": [change]} for change in machines(scene).values()]
     return scene_from_dict(data, scene.source)
 
 
@@ -176,15 +150,13 @@ def finer_deviation(scene: Scene, design: Path | None) -> float:
     It has twice the elastic coordinates, and geometric stiffness; nan where it is not solved.
     """
     data = scene.to_tree() | {"scenarios": []}
-    here = scene_from_dict(data, scene.source)
-    count = here.reduction.coordinates
-    if isinstance(count, str):
+    here, held = scene_from_dict(data, scene.source), None
+    if isinstance(here.reduction.coordinates, str):
         return math.nan
-    data["reduction"]["coordinates"] = 2 * count
+    data["reduction"]["coordinates"] = 2 * here.reduction.coordinates
     data["simulation"]["stiffening"] = True
     there, profile = scene_from_dict(data, scene.source), Profile()
     try:
-        held = None
         if here.feed_forward.on:
             held = simulate(here, _bodies(here, design), profile).feed_forward
         moved = simulate(there, _bodies(there, design), profile, feed_forward=held)
@@ -197,11 +169,6 @@ def _bodies(scene: Scene, design: Path | None) -> list[ShapeIntegrals]:
     """Return the reduced arms of a design, from the base outwards (this rank alone)."""
     _, arms, x_phys = arms_with_design(MPI.COMM_SELF, scene, design, Profile())
     return chain_of(scene, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
-
-
-def vibration(scene: Scene, design: Path | None) -> tuple[float, float]:
-    """Return frequency, rad/s, and damping ratio of the slowest vibration at the motion's end."""
-    return build_system(scene, _bodies(scene, design)).slowest_vibration(2)
 
 
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
@@ -224,13 +191,13 @@ def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
 # -- table, sentence, picture ----------------------------------------------------------------
 
 
-def report(scene: Scene, rows: Sequence[Row]) -> tuple[Table, LineFigure]:
+def report(scene: Scene, rows: Sequence[tuple[Motion, Outcome]]) -> tuple[Table, LineFigure]:
     """Return the table under a sentence, and the deviations over time."""
-    frame = pd.DataFrame([_cells(scene, row) for row in rows])
-    table = Table("", f"{_verdict(rows)} {NOTE}", frame)
-    shown = [row.outcome for row in rows if not row.outcome.failure]
+    frame = pd.DataFrame([_cells(scene, *row) for row in rows])
+    able = [outcome for _, outcome in rows if not outcome.failure]
+    table = Table("", f"{_verdict(able)} {NOTE}", frame)
     title = "Deviation of the tip from the path of each motion"
-    return table, LineFigure("deviation", title, tuple(deviation_panels(shown)))
+    return table, LineFigure("deviation", title, tuple(deviation_panels(able)))
 
 
 NOTE = (
@@ -241,35 +208,32 @@ NOTE = (
 )
 
 
-def _verdict(rows: Sequence[Row]) -> str:
+def _verdict(able: Sequence[Outcome]) -> str:
     """Return how far the tip is off with the first motion and with the best."""
-    able = [row for row in rows if not row.outcome.failure]
     if not able:
         return "No motion can be simulated."
-    first, best = able[0], min(able, key=lambda row: row.outcome.max_deviation)
+    first, best = able[0], min(able, key=lambda one: one.max_deviation)
     return (
-        f"With {first.name} the tip is off by {1e3 * first.outcome.max_deviation:.4g} mm, with "
-        f"{best.name} by {1e3 * best.outcome.max_deviation:.4g} mm."
+        f"With {first.case.label} the tip is off by {1e3 * first.max_deviation:.4g} mm, with "
+        f"{best.case.label} by {1e3 * best.max_deviation:.4g} mm."
     )
 
 
-def _cells(scene: Scene, row: Row) -> dict[str, Any]:
+def _cells(scene: Scene, motion: Motion, outcome: Outcome) -> dict[str, Any]:
     """Return a row by column."""
-    outcome = row.outcome
-    summary = {} if outcome.failure else outcome.summary()
+    summary = outcome.summary()
     cells: dict[str, Any] = {
-        "motion": row.name,
+        "motion": motion.case.label,
         "mass [kg]": summary.get("designed_mass", math.nan),
-        "longer by [s]": row.motion.longer,
+        "longer by [s]": motion.longer,
         DEVIATION: 1e3 * outcome.max_deviation,
-        "finer model [mm]": 1e3 * row.motion.finer,
+        "finer model [mm]": 1e3 * motion.finer,
         "settling [mm]": 1e3 * summary.get("settling", math.nan),
     }
-    for one, found in zip(machines(scene), summary.get("scenarios", ()), strict=False):
-        cells[f"{one.label} [mm]"] = 1e3 * found["max_deviation"]
-    units = scene.rigid_units
+    for name, found in zip(machines(scene), summary.get("scenarios", ()), strict=False):
+        cells[f"{name} [mm]"] = 1e3 * found["max_deviation"]
     for name in scene.driven:
-        unit = "N" if units[name] == "m" else "N m"
+        unit = "N" if scene.rigid_units[name] == "m" else "N m"
         cells[f"peak {name} [{unit}]"] = summary.get("drive_peak", {}).get(name, math.nan)
     if outcome.failure:
         cells["failed"] = outcome.failure

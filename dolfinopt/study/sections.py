@@ -15,15 +15,13 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from mpi4py import MPI
 from scipy.optimize import brentq, minimize
 
 from dolfinopt.disk import make_folder, write_bytes
@@ -36,13 +34,14 @@ from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
 from dolfinopt.scene.tables.arms import WALL_KEYS
-from dolfinopt.study.cases import Case, Outcome, run_cases
+from dolfinopt.study.cases import Case, Outcome, Runner
 from dolfinopt.study.studies import (
     COMPLIANCE,
     DEVIATION,
     Design,
     deviation_panels,
     given_designs,
+    results_of,
 )
 from dolfinopt.study.tables import LineFigure, Study, Table
 
@@ -67,7 +66,8 @@ SLIGHT = 0.01  # relative excess of a limit by the design up to which it is told
 OF_MATERIAL = ("volume_fraction", "mass")
 
 Shares = tuple[float, ...]  # of every designed arm, in the scene's order
-Search = Generator[list[Shares], list[Outcome], "tuple[Shares, bool] | None"]
+Simulate = Callable[[Sequence[Shares]], Sequence[Outcome]]
+Found = tuple[Shares, bool] | None  # whether they hold; None: no simulation succeeded
 
 
 # -- members ---------------------------------------------------------------------------------
@@ -75,19 +75,19 @@ Search = Generator[list[Shares], list[Outcome], "tuple[Shares, bool] | None"]
 
 @dataclass(frozen=True)
 class Members:
-    """Arms of one kind of section, in a folder.
+    """Arms of one kind of section.
 
     Attributes:
         scene: whose designed arms are replaced.
         kind: of the section, in words.
         section: itself.
-        folder: of their meshes.
+        runner: in whose folder their meshes are, and their simulations.
     """
 
     scene: Scene
     kind: str
     section: Section
-    folder: Path
+    runner: Runner
 
     @property
     def arms(self) -> tuple[int, ...]:
@@ -116,11 +116,14 @@ class Members:
         """Return the shares times exp(x), within the bounds."""
         return tuple(round(min(max(math.exp(x) * s, LEAST), self.most), 9) for s in shares)
 
-    def of_mass(self, masses: Mapping[int, float]) -> Shares | None:
+    def of_mass(self, masses: Mapping[str, float]) -> Shares | None:
         """Return the shares with which every arm has its mass, kg; None where one cannot."""
         found = []
         for k in self.arms:
-            gap = partial(lambda share, k: self.mass(k, share) - masses[k], k=k)
+
+            def gap(share: float) -> float:
+                return self.mass(k, share) - masses[self.scene.arms[k].name]  # noqa: B023
+
             if gap(LEAST) > 0.0 or gap(self.most) < 0.0:
                 return None
             found.append(float(brentq(gap, LEAST, self.most, xtol=1e-9)))
@@ -138,12 +141,10 @@ class Members:
     def case(self, shares: Shares) -> Case:
         """Return the simulation of the members; their meshes are written (root only)."""
         data = self.scene.to_tree()
-        rows = {
-            k: self._row(k, share) for k, share in zip(self.arms, shares, strict=True)
-        }  # fmt: skip
+        rows: dict[int | None, dict[str, Any]]
+        rows = {k: self._row(k, share) for k, share in zip(self.arms, shares, strict=True)}
         for row, owner in zip(data["arms"], self.scene.owners, strict=True):
-            if owner is not None:
-                row.update(rows[owner])
+            row.update(rows.get(owner, {}))
         data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
         scene = scene_from_dict(data, self.scene.source)
         return Case(scene, label=f"{self.kind}, {self.sizes(shares)} mm")
@@ -151,22 +152,20 @@ class Members:
     def _row(self, index: int, share: float) -> dict[str, Any]:
         """Return the keys of an arm with its section."""
         arm = self.scene.arms[index]
-        row: dict[str, Any] = dict.fromkeys(
-            ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive", "pattern",
-             "interface_offset")
-        )  # fmt: skip
-        row |= {"symmetric": False, "extruded": False, "regions": [], "interfaces": []}
-        row["mesh_scale"] = 1.0
-        row |= {"hollow": False, **dict.fromkeys(WALL_KEYS)}
+        none = ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive", "pattern",
+                "interface_offset", *WALL_KEYS)  # fmt: skip
+        row: dict[str, Any] = dict.fromkeys(none)
+        row |= {"symmetric": False, "extruded": False, "hollow": False, "mesh_scale": 1.0}
+        row |= {"regions": [], "interfaces": []}
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
             cells = arm.cells or _bar_cells(arm.length, height, thickness, arm.is_solid)
             return row | {"height": height, "thickness": thickness, "cells": list(cells)}
         mesh = member(self.section, arm.length, (arm.height, arm.thickness), share)
         data = msh_bytes(mesh)
-        path = self.folder / f"{hashlib.sha256(data).hexdigest()[:16]}.msh"
+        path = self.runner.folder / NAME / f"{hashlib.sha256(data).hexdigest()[:16]}.msh"
         if not path.exists():
-            make_folder(self.folder)
+            make_folder(path.parent)
             write_bytes(path, data)
         _, height, thickness = map(float, mesh.extents)
         own = {"height": height, "thickness": thickness, "cell_shape": "hexahedron"}
@@ -182,19 +181,23 @@ def _bar_cells(length: float, height: float, thickness: float, solid: bool) -> t
     return max(24, round(2.0 * length / max(sides))), *across
 
 
+def simulated(pairs: Sequence[tuple[Members, Shares]], runner: Runner) -> list[Outcome]:
+    """Simulate members with their shares (collective)."""
+    cases = on_root(runner.world, lambda: [one.case(shares) for one, shares in pairs])
+    done = runner.run(cases)
+    return [done[case] for case in cases]
+
+
 # -- the lightest that hold the limits -----------------------------------------------------------
 
 
 def limited(outcome: Outcome) -> dict[str, float]:
     """Return ln(1 + excess) of every limit that material helps to hold; <= 0 where it is held."""
-    if outcome.failure:
-        return {}
-    found = {}
-    for name, one in outcome.summary()["constraints"].items():
-        if name.startswith(OF_MATERIAL):
-            continue
-        found[name] = math.log(max(1e-9, 1.0 + _excess(one)))
-    return found
+    return {
+        name: math.log(max(1e-9, 1.0 + _excess(one)))
+        for name, one in outcome.summary().get("constraints", {}).items()
+        if not name.startswith(OF_MATERIAL)
+    }
 
 
 def _excess(limit: Mapping[str, Any]) -> float:
@@ -203,22 +206,25 @@ def _excess(limit: Mapping[str, Any]) -> float:
     return float(-gap if limit["bound"] == "least" else gap)
 
 
-def lightest(members: Members) -> Search:
-    """Search the lightest members that hold the limits; yield shares, take their outcomes.
+def lightest(members: Members, simulate: Simulate) -> Found:
+    """Search the lightest members that hold the limits.
 
     Returns:
         Shares, and whether they hold; of members that do not, those that come nearest. None where
         no simulation succeeded.
     """
     count, move = len(members.arms), MOVE
-    found = yield from _on_limit(members, (members.most,) * count)
+    found = _on_limit(members, simulate, (members.most,) * count)
     if found is None or not found[1]:
         return found
     best = found[0]
     while count > 1 and move >= LEAST_MOVE:
         stepped = [_stepped(members, best, k) for k in range(count)]
-        outcomes = yield [best, *stepped]
-        found = yield from _on_limit(members, _balanced(members, best, stepped, outcomes, move))
+        outcomes = simulate([best, *stepped])
+        balanced = on_root(
+            members.runner.world, _balanced, members, best, stepped, outcomes, move
+        )  # others' last digits may differ
+        found = _on_limit(members, simulate, balanced)
         gain = 0.0
         if found is not None and found[1]:
             gain = 1.0 - members.total_mass(found[0]) / members.total_mass(best)
@@ -228,15 +234,15 @@ def lightest(members: Members) -> Search:
     return best, True
 
 
-def _on_limit(members: Members, shares: Shares) -> Search:
+def _on_limit(members: Members, simulate: Simulate, shares: Shares) -> Found:
     """Search the least factor of all shares with which the members hold the limits."""
-    low, high = (math.log(bound / one) for bound, one in
-                 ((LEAST, max(shares)), (members.most, min(shares))))  # fmt: skip
+    low, high = math.log(LEAST / max(shares)), math.log(members.most / min(shares))
     excess: dict[float, float] = {}
     x: float | None = 0.0
     while x is not None and len(excess) < STEPS:
-        [outcome] = yield [members.scaled(shares, x)]
-        excess[x] = max(limited(outcome).values(), default=math.inf)  # of one that failed
+        [outcome] = simulate([members.scaled(shares, x)])
+        failed = bool(outcome.failure)
+        excess[x] = math.inf if failed else max(limited(outcome).values(), default=math.inf)
         x = _next(excess, low, high)
     held = [at for at, value in excess.items() if value <= 0.0]
     if held:
@@ -345,119 +351,100 @@ class Row:
     lightest: bool = False
 
     @property
-    def summary(self) -> dict[str, Any]:
-        """Its summary, empty where it failed."""
-        return {} if self.outcome.failure else self.outcome.summary()
-
-    @property
     def mass(self) -> float:
         """Of all arms with a design or a section, kg."""
-        return float(self.summary.get("designed_mass", math.nan))
+        return float(self.outcome.summary().get("designed_mass", math.nan))
 
     @property
     def holds(self) -> bool:
         """Whether it holds every limit but that of the volume."""
-        limits = _limits(self.summary)
-        return not self.outcome.failure and all(one["met"] for one in limits.values())
+        limits = _limits(self.outcome).values()
+        return not self.outcome.failure and all(one["met"] for one in limits)
 
 
-def _limits(summary: Mapping[str, Any]) -> dict[str, Any]:
+def _limits(outcome: Outcome) -> dict[str, Any]:
     """Return the scene's limits and what becomes of them, without that of the volume."""
-    found = summary.get("constraints", {})
+    found = outcome.summary().get("constraints", {})
     return {name: one for name, one in found.items() if not name.startswith("volume_fraction")}
 
 
-def study_sections(
-    scene: Scene,
-    designs: Sequence[Path],
-    folder: Path,
-    world: MPI.Comm,
-    *,
-    shown: bool = True,
-) -> Study:
+def study_sections(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
     """Compare straight members with the design (collective).
 
     Args:
         scene: whose designed arms are replaced, all by one kind of section.
         designs: design.npz of the design; none: it is optimised.
-        folder, world, shown: see `cases.run_cases`.
+        runner: of all simulations.
 
     Raises:
         InputError: the scene's arms cannot be replaced; nothing was computed.
     """
-    label, design = on_root(world, _checked, scene, designs)
-    kinds = KINDS[scene.dimension].items()
-    every = [Members(scene, kind, one, folder / NAME) for kind, one in kinds]
+    label, design = on_root(runner.world, _checked, scene, designs)
     own = Case(scene, "simulate", design, DESIGN)
-    done = run_cases([own], folder, world, shown=shown)
-    computed = done.computed
-    rows = [Row(DESIGN, label, "", done[own])]
-    if rows[0].outcome.failure:
-        return Study(NAME, (), (), tuple(rows[0].outcome.failures), computed)
+    first = Row(DESIGN, label, "", runner.run([own])[own])
+    if first.outcome.failure:
+        return Study(NAME, (), (), tuple(first.outcome.failures), runner.computed)
+    every = [Members(scene, kind, one, runner) for kind, one in KINDS[scene.dimension].items()]
     asked: list[tuple[Members, str, Shares, bool]] = []
-    if limited(rows[0].outcome):
-        found, computed = _searched(every, folder, world, computed, shown)
-        asked += found
-    masses = rows[0].summary["mass"]
-    by_arm = {k: masses[arm.name] for k, arm in enumerate(scene.arms) if arm.name in masses}
-    for one in every:
-        if (shares := one.of_mass(by_arm)) is not None:
-            asked.append((one, SAME, shares, False))
-    cases = on_root(world, lambda: [one.case(shares) for one, _, shares, _ in asked])
-    done = run_cases(cases, folder, world, shown=shown)
-    rows += [
-        Row(one.kind, made, f"{one.section.named}: {one.sizes(shares)}", done[case], light)
-        for (one, made, shares, light), case in zip(asked, cases, strict=True)
-    ]
-    with together(world):
+    for one in every if limited(first.outcome) else ():
+        if found := lightest(one, lambda wanted: simulated([(one, s) for s in wanted], runner)):  # noqa: B023
+            shares, holds = found
+            asked.append((one, "lightest" if holds else "nearest to the limits", shares, holds))
+    asked += [(one, SAME, shares, False) for one, shares in _as_heavy(every, first.outcome)]
+    outcomes = simulated([(one, shares) for one, _, shares, _ in asked], runner)
+    rows = [first]
+    for (one, made, shares, light), outcome in zip(asked, outcomes, strict=True):
+        sizes = f"{one.section.named}: {one.sizes(shares)}"
+        rows.append(Row(one.kind, made, sizes, outcome, light))
+    with together(runner.world):
         found_table, figures = report(scene, rows)
     # A member that is too soft to be simulated is a finding, in its row, and no failure.
-    return Study(NAME, (found_table,), figures, (), computed + done.computed)
+    return Study(NAME, (found_table,), figures, (), runner.computed)
+
+
+def _as_heavy(every: Sequence[Members], outcome: Outcome) -> list[tuple[Members, Shares]]:
+    """Return the members that have the masses of what was simulated in every arm."""
+    masses = outcome.summary()["mass"]
+    return [(one, shares) for one in every if (shares := one.of_mass(masses)) is not None]
 
 
 AHEAD = ("solid bar", "rectangular tube", "round tube")  # whose figures come before a design
 
 
-def ahead(scene: Scene, folder: Path, world: MPI.Comm) -> list[str]:
+def ahead(scene: Scene, runner: Runner) -> list[str]:
     """Return what straight tubes and bars reach in place of solid links, a line each (collective).
 
     Those of the links' mass at the start, and the limit that each uses most: three simulations.
     [] of machines in the plane, and where no straight member can take a link's place.
     """
     try:
-        on_root(world, _check_replaceable, scene)
+        on_root(runner.world, _check_replaceable, scene)
     except InputError:
         return []
     if not any(scene.arms[k].is_solid and not scene.arms[k].hollow for k in scene.designed):
         return []
-    every = [Members(scene, kind, KINDS[3][kind], folder / NAME) for kind in AHEAD]
     start = Case(scene, label="start")
-    [first] = run_cases([start], folder, world, shown=False).by_case.values()
+    first = runner.run([start])[start]
     if first.failure:
         return []
-    masses = first.summary()["mass"]
-    by_arm = {k: masses[arm.name] for k, arm in enumerate(scene.arms) if arm.name in masses}
-    asked = [(one, shares) for one in every if (shares := one.of_mass(by_arm)) is not None]
-    cases = on_root(world, lambda: [one.case(shares) for one, shares in asked])
-    done = run_cases(cases, folder, world, shown=False)
-    pairs = [(one, done[case]) for (one, _), case in zip(asked, cases, strict=True)]
-    lines = [_reached(scene, one, found) for one, found in pairs if not found.failure]
-    tubes = [found for one, found in pairs if one.section.plane is not None and not found.failure]
-    if tubes:
+    every = _as_heavy([Members(scene, kind, KINDS[3][kind], runner) for kind in AHEAD], first)
+    pairs = zip(every, simulated(every, runner), strict=True)
+    found = [(one, outcome) for (one, _), outcome in pairs if not outcome.failure]
+    lines = [_reached(scene, *one) for one in found]
+    if any(one.section.plane is not None for one, _ in found):
         lines.append("with walls, arms.hollow = true, a link keeps a tube's outer surface")
     return lines
 
 
 def _reached(scene: Scene, members: Members, found: Outcome) -> str:
     """Return mass and objective of members in words."""
-    summary, response = found.summary(), scene.objective.response
+    response, limits = scene.objective.response, _limits(found)
     value = with_unit(f"{response.label} {found.objective:.4g}", response.unit)
-    limits = _limits(summary)
     if limits:
         name, most = max(limits.items(), key=lambda one: _excess(one[1]))
         used = f"{name.replace('_', ' ')} {most['value']:.3g} of {most['limit']:.3g}"
         value = f"{value}, {with_unit(used, most['unit'])}"
-    mass = summary.get("designed_mass", math.nan)
+    mass = found.summary()["designed_mass"]
     return f"a straight {members.kind} of the links' mass at the start, {mass:.3g} kg: {value}"
 
 
@@ -474,53 +461,17 @@ def _check_replaceable(scene: Scene) -> None:
     if not any(owner is not None for owner in scene.owners):
         raise InputError(f"{scene.source}: sections: expected arms with a design, found none")
     for index, arm in enumerate(scene.arms):
-        if scene.is_spatial and arm.flexible and scene.material_of(index).angle:
+        where, angle = f"{scene.source}: arms.{arm.name}", scene.material_of(index).angle
+        if scene.is_spatial and arm.flexible and angle:
             raise InputError(
-                f"{scene.source}: arms.{arm.name}.angle: sections: expected 0 in space, found "
-                f"{scene.material_of(index).angle:.4g} rad; the fibres of a member are along it"
+                f"{where}.angle: sections: expected 0 in space, found {angle:.4g} rad; the fibres "
+                "of a member are along it"
             )
         if arm.flexible and arm.further_interfaces:
             raise InputError(
-                f"{scene.source}: arms.{arm.name}.interfaces: sections: expected one outboard "
-                "interface, found more; a straight member has one end"
+                f"{where}.interfaces: sections: expected one outboard interface, found more; a "
+                "straight member has one end"
             )
-
-
-def _searched(
-    every: Sequence[Members], folder: Path, world: MPI.Comm, computed: int, shown: bool
-) -> tuple[list[tuple[Members, str, Shares, bool]], int]:
-    """Return the lightest members of every kind; all kinds search at once (collective)."""
-    # Outcomes are the same on all ranks; what follows from them is the root's to say.
-    searches = {k: lightest(one) for k, one in enumerate(every)} if world.rank == 0 else {}
-    answers: dict[int, list[Outcome] | None] = dict.fromkeys(range(len(every)))
-    ended: dict[int, tuple[Shares, bool] | None] = {}
-    while True:
-
-        def advance() -> dict[int, list[Case]]:
-            cases = {}
-            for k, answer in answers.items():  # noqa: B023
-                try:
-                    wanted = searches[k].send(answer) if answer else next(searches[k])
-                    cases[k] = [every[k].case(shares) for shares in wanted]
-                except StopIteration as end:
-                    ended[k] = end.value
-            return cases
-
-        asked = on_root(world, advance)
-        if not asked:
-            break
-        done = run_cases([case for cases in asked.values() for case in cases], folder, world,
-                         shown=shown)  # fmt: skip
-        computed += done.computed
-        answers = {k: [done[case] for case in cases] for k, cases in asked.items()}
-    ended = on_root(world, lambda: ended)
-    found = []
-    for k, one in enumerate(every):
-        end = ended[k]
-        if end is not None:
-            shares, holds = end
-            found.append((one, "lightest" if holds else "nearest to the limits", shares, holds))
-    return found, computed
 
 
 # -- table, sentence, picture ----------------------------------------------------------------
@@ -550,24 +501,21 @@ def verdict(scene: Scene, rows: Sequence[Row]) -> str:
     design, *others = rows
     if not limited(design.outcome):
         return _by_objective(scene, design, others)
-    over = {name: _excess(one) for name, one in _limits(design.summary).items() if not one["met"]}
-    broken = [name for name, excess in over.items() if excess > SLIGHT]
+    over = {name: _excess(one) for name, one in _limits(design.outcome).items() if not one["met"]}
+    missed = ", ".join(f"{name} {100.0 * x:.2g} % over its limit" for name, x in over.items())
+    weight = f"{design.mass:.4g} kg" + f" ({missed})" * bool(over)
+    broken = max(over.values(), default=0.0) > SLIGHT
     able = [row for row in others if row.lightest and row.holds]
     if not able:
-        none = "o straight member within the arms' envelope holds the limits"
-        if broken:
-            return f"N{none}, nor does the design ({', '.join(broken)}): nobody wins."
-        return f"N{none}, the design does with {design.mass:.4g} kg: the design wins."
+        return (
+            "No straight member within the arms' envelope holds the limits, the design weighs "
+            f"{weight}: {'nobody' if broken else 'the design'} wins."
+        )
     best = min(able, key=lambda row: row.mass)
-    text = (
+    return (
         f"The lightest straight {best.kind} that holds the limits weighs {best.mass:.4g} kg, the "
-        f"design {design.mass:.4g} kg"
+        f"design {weight}: the {best.kind if broken or best.mass < design.mass else DESIGN} wins."
     )
-    if broken:
-        return f"{text} without holding them ({', '.join(broken)}): the {best.kind} wins."
-    if over:
-        text += f" ({', '.join(f'{k} {100.0 * x:.2g} % over its limit' for k, x in over.items())})"
-    return f"{text}: the {best.kind if best.mass < design.mass else DESIGN} wins."
 
 
 def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
@@ -576,12 +524,12 @@ def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
     if not able:
         return "No straight member within the arms' envelope has the design's mass."
     best = min(able, key=lambda row: row.outcome.objective)
-    values = best.outcome.objective, design.outcome.objective
+    ours, theirs = design.outcome.objective, best.outcome.objective
     name, unit = scene.objective.response.label, scene.objective.response.unit
     return (
         f"With the design's mass of {design.mass:.4g} kg the best straight member, a {best.kind}, "
-        f"has an objective ({name}) of {values[0]:.4g} {unit}, the design {values[1]:.4g} {unit}: "
-        f"the {best.kind if values[0] < values[1] else DESIGN} wins."
+        f"has an objective ({name}) of {theirs:.4g} {unit}, the design {ours:.4g} {unit}: the "
+        f"{best.kind if theirs < ours else DESIGN} wins."
     )
 
 
@@ -601,26 +549,18 @@ def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
 
 def _cells(scene: Scene, row: Row) -> dict[str, Any]:
     """Return a row by column."""
-    outcome, summary = row.outcome, row.summary
-    stress = summary.get("stress")
-    cells: dict[str, Any] = {
-        "section": row.kind,
-        "made": row.made,
-        "sizes [mm]": row.sizes,
-        "mass [kg]": row.mass,
-        f"objective [{scene.objective.response.unit}]": outcome.objective,
-        COMPLIANCE: outcome.compliance,
-        DEVIATION: 1e3 * outcome.max_deviation,
-        "settling [mm]": 1e3 * summary.get("settling", math.nan),
-        "stress [MPa]": math.nan if stress is None else 1e-6 * stress["value"],
-        "grayness [-]": outcome.grayness,
-    }
-    for name, one in _limits(summary).items():
+    outcome, known = row.outcome, results_of(row.outcome)
+    cells: dict[str, Any]
+    cells = {"section": row.kind, "made": row.made, "sizes [mm]": row.sizes, "mass [kg]": row.mass}
+    cells[f"objective [{scene.objective.response.unit}]"] = outcome.objective
+    for name in (COMPLIANCE, DEVIATION, "settling [mm]", "stress [MPa]", "grayness [-]"):
+        cells[name] = known[name]
+    for name, one in _limits(outcome).items():
         sign = ">=" if one["bound"] == "least" else "<="
         key = f"{name.replace('_', ' ')} {sign} {one['limit']:g} {one['unit']}"
         cells[key] = f"{one['value']:.4g} {'met' if one['met'] else 'not met'}"
-    if row.outcome.failure:
-        cells["failed"] = row.outcome.failure
+    if outcome.failure:
+        cells["failed"] = outcome.failure
     return cells
 
 

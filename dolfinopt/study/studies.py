@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,12 +20,11 @@ import pandas as pd
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.optimization.state import HistoryRow
-from dolfinopt.output.design import arms_with_design, read_design
+from dolfinopt.output.design import arms_with_design
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
+from dolfinopt.study.cases import Case, Outcome, Runner
 from dolfinopt.study.tables import (
     DesignFigure,
     Figure,
@@ -87,13 +86,10 @@ def study(
     preset: Preset | None,
     vary: Sequence[str],
     designs: Sequence[Path],
-    folder: Path,
-    world: MPI.Comm,
+    runner: Runner,
     *,
     reoptimize: bool = False,
     kinds: Sequence[str] = (),
-    shown: bool = True,
-    keep: bool = True,
 ) -> Study:
     """Do a study (collective); the result is the same on all ranks.
 
@@ -101,50 +97,52 @@ def study(
         scene, preset: what is varied; which study, None for a sweep over `vary` alone.
         vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
-        folder, world, shown, keep: see `run_cases`.
+        runner: of all cases.
         reoptimize: optimise for every scenario, too.
         kinds: of objectives to compare; by default all.
 
     Raises:
         InputError: something asked for is not possible; nothing was computed.
     """
-    plan = on_root(world, _plan, scene, preset, tuple(vary), tuple(designs), reoptimize, kinds)
+    plan = on_root(runner.world, _plan, scene, preset, vary, designs, reoptimize, kinds)
     if any(case.action == "optimize" for _, case in plan.rows):
         scene.check_designed()
-    return carry_out(plan, folder, world, shown=shown, keep=keep)
+    return carry_out(plan, runner)
 
 
-def carry_out(
-    plan: Plan, folder: Path, world: MPI.Comm, *, shown: bool = True, keep: bool = True
-) -> Study:
+def carry_out(plan: Plan, runner: Runner) -> Study:
     """Do what is planned, see `study`."""
-    cases = [case for _, case in plan.rows]
-    outcomes = run_cases(cases, folder, world, shown=shown, keep=keep)
-    with together(world):
-        tables, figures = plan.report(tabulated(plan, outcomes))
+    outcomes = runner.run(case for _, case in plan.rows)
+    with together(runner.world):
+        rows = ((labels, outcomes[case]) for labels, case in plan.rows)
+        tables, figures = plan.report(tabulated(rows))
     failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
-    return Study(plan.name, tuple(tables), tuple(figures), failures, outcomes.computed)
+    return Study(plan.name, tuple(tables), tuple(figures), failures, runner.computed)
 
 
-def tabulated(plan: Plan, outcomes: Outcomes) -> pd.DataFrame:
-    """Return a row a case: the plan's labels, the results with units, and the outcome itself."""
-    found = [outcomes[case] for _, case in plan.rows]
-    results = pd.DataFrame(
-        {
-            "label": one.case.label,
-            COMPLIANCE: one.compliance,
-            DEVIATION: 1e3 * one.max_deviation,
-            "at [s]": one.max_deviation_time,
-            "grayness [-]": one.grayness,
-            "iterations": one.iterations,
-            "seconds": one.seconds,
-            "ended by": f"failed: {one.failure}" if one.failure else one.stopped,
-            "failure": one.failure,
-            "outcome": one,
-        }
-        for one in found
-    )
-    return pd.concat([pd.DataFrame([labels for labels, _ in plan.rows]), results], axis=1)
+def tabulated(rows: Iterable[tuple[Mapping[str, Any], Outcome]]) -> pd.DataFrame:
+    """Return a row a case: its labels, the results with units, and the outcome itself."""
+    return pd.DataFrame({**labels, **results_of(outcome)} for labels, outcome in rows)
+
+
+def results_of(one: Outcome) -> dict[str, Any]:
+    """Return results by column, with units, and the outcome itself."""
+    summary = one.summary()
+    return {
+        "label": one.case.label,
+        COMPLIANCE: one.compliance,
+        DEVIATION: 1e3 * one.max_deviation,
+        "at [s]": one.max_deviation_time,
+        "settling [mm]": 1e3 * summary.get("settling", math.nan),
+        "stress [MPa]": 1e-6 * (summary.get("stress") or {}).get("value", math.nan),
+        "mass [kg]": summary.get("designed_mass", math.nan),
+        "grayness [-]": one.grayness,
+        "iterations": one.iterations,
+        "seconds": one.seconds,
+        "ended by": f"failed: {one.failure}" if one.failure else one.stopped,
+        "failure": one.failure,
+        "outcome": one,
+    }
 
 
 def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
@@ -157,8 +155,8 @@ def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
 def _plan(
     scene: Scene,
     preset: Preset | None,
-    vary: tuple[str, ...],
-    designs: tuple[Path, ...],
+    vary: Sequence[str],
+    designs: Sequence[Path],
     reoptimize: bool,
     kinds: Sequence[str],
 ) -> Plan:
@@ -167,11 +165,11 @@ def _plan(
     keys = [one.key for one in asked]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--vary {twice[0]} twice; give all its values in one")
-    if preset is None and not asked:
-        raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
     if preset is None or preset in RANGES:
         if preset is not None and (own := parse_vary(RANGES[preset])).key not in keys:
             asked.insert(0, own)
+        if not asked:
+            raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
         return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
     command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
     if others := [one.text for one in asked if preset == "objective" or one.key != COORDINATES]:
@@ -200,9 +198,7 @@ def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
         for path in designs:
             if not path.is_file():
                 raise InputError(f"{path}: --design: no such file; give design.npz files")
-        partition, arms, _ = arms_with_design(MPI.COMM_SELF, scene, None, Profile())
-        for path in designs:
-            read_design(path, partition, arms)
+            arms_with_design(MPI.COMM_SELF, scene, path, Profile())
         names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
         plain = len(set(names)) == len(names)
         return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
@@ -244,7 +240,7 @@ def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
     """Return the deviation over time; designs of another magnitude get a panel of their own."""
     panels = []
     for group in magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
-        curves = [(one.case.label, *one.deviation()) for one in group]
+        curves = ((one.case.label, *one.deviation()) for one in group)
         lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
         panels.append(Panel("", "time [s]", "deviation [mm]", lines))
     return panels
@@ -289,11 +285,11 @@ def sweep_plan(
                 f"--vary {one.text}: does not change what a given design does; add "
                 "--reoptimize to optimise one for every value"
             )
-    resized = [one for one in asked if re.search(RESIZING, one.key)]
+    resized = [one.text for one in asked if re.search(RESIZING, one.key)]
     if resized and (designs or not reoptimize):
+        remedy = "leave out --design" if reoptimize else "add --reoptimize to optimise one for each"
         raise InputError(
-            f"--vary {resized[0].text}: no given design fits arms of several sizes; "
-            + ("leave out --design" if reoptimize else "add --reoptimize to optimise one for each")
+            f"--vary {resized[0]}: no given design fits arms of several sizes; {remedy}"
         )
     given = {"initial design": None} if resized else given_designs(scene, designs)
     grids = [asked] if len(asked) <= 2 else [[one] for one in asked]
@@ -315,28 +311,29 @@ def _sweep(
     # Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
     # "made for" in scenario "point", where it fits their arms.
     swept = ", ".join(vary.key for vary in keys)
-    points, labels, columns = [], [], []
+    points = []  # labels, scene and columns of each
     for j, values in enumerate(product(*(vary.values for vary in keys))):
         settings = list(zip(keys, values, strict=True))
+        label = ", ".join(f"{vary.key} = {float(value):g}" for vary, value in settings)
         with asked_by(" ".join(f"--vary {vary.text}" for vary in keys)):
-            points.append(changed(scene, *(f"{vary.key}={value}" for vary, value in settings)))
-        labels.append(", ".join(f"{vary.key} = {float(value):g}" for vary, value in settings))
-        known = {vary.axis: float(value) for vary, value in settings}
-        columns.append({"swept": swept, "point": j, **known})
-    every = range(len(points))
+            there = changed(scene, *(f"{vary.key}={value}" for vary, value in settings))
+        columns = {vary.axis: float(value) for vary, value in settings}
+        points.append((label, there, {"swept": swept, "point": j} | columns))
 
-    def row(role: str, name: str, design: Design, j: int, made: int = -1) -> tuple[Any, Case]:
-        known = {"role": role, "design": name * (role == "shown"), "made for": made, **columns[j]}
-        return known, Case(points[j], "simulate", design, f"{name}, {labels[j]}")
+    def rows(role: str, name: str, designs: Sequence[Design], made: int = -1) -> Rows:
+        known = {"role": role, "design": name * (role == "shown"), "made for": made}
+        return [
+            (known | columns, Case(there, "simulate", design, f"{name}, {label}"))
+            for (label, there, columns), design in zip(points, designs, strict=True)
+        ]
 
-    rows = [row("shown", name, design, j) for name, design in given.items() for j in every]
+    found = [row for n, d in given.items() for row in rows("shown", n, [d] * len(points))]
     if reoptimize:
-        optima = [Case(points[j], "optimize", label=f"optimised, {labels[j]}") for j in every]
-        rows += [row("shown", MADE, optima[j], j) for j in every]
-        if fits:
-            rows += [row("crossed", f"made for {labels[i]}", optima[i], j, i)
-                     for i, j in product(every, every)]  # fmt: skip
-    return rows
+        optima = [Case(there, "optimize", label=f"optimised, {n}") for n, there, _ in points]
+        found += rows("shown", MADE, optima)
+        for i, (label, *_) in enumerate(points if fits else ()):
+            found += rows("crossed", f"made for {label}", [optima[i]] * len(points), i)
+    return found
 
 
 def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -> Report:
@@ -348,12 +345,9 @@ def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -
     if (failed != "").any():
         table["failed"] = failed.to_numpy()
     title = f"Designs by {' and '.join(axes)}."
-    tables = [Table(prefix, title, table)]
-    figures: list[Figure] = [LineFigure(prefix, title, _sweep_panels(shown, keys))]
-    if (frame["role"] == "crossed").any():
-        more = _cross(frame, table[axes], prefix)
-        tables, figures = tables + more[0], figures + more[1]
-    return tables, figures
+    tables, figures = _cross(frame, table[axes], prefix)
+    curves = LineFigure(prefix, title, _sweep_panels(shown, keys))
+    return [Table(prefix, title, table), *tables], [curves, *figures]
 
 
 def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[Panel, ...]:
@@ -372,12 +366,14 @@ def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[Panel, ...
     return tuple(panels)
 
 
-def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
-    """Return design i in scenario j, and what it loses against the one made for j."""
+def _cross(
+    frame: pd.DataFrame, points: pd.DataFrame, prefix: str
+) -> tuple[list[Table], list[FrameFigure]]:
+    """Return design i in scenario j, and what it loses against the one made for j; or nothing."""
     labels = [", ".join(f"{value:g}" for value in point) for point in points.to_numpy()]
     axis, tables, losses = ", ".join(points.columns), [], {}
     crossed = frame[frame["role"] == "crossed"]
-    for what in QUANTITIES:
+    for what in QUANTITIES if len(crossed) else ():
         values = crossed.pivot(index="made for", columns="point", values=what).to_numpy()
         quantity = what.partition(" [")[0]
         name = joined(prefix, f"cross_{quantity.replace(' ', '_')}")
@@ -388,7 +384,8 @@ def _cross(frame: pd.DataFrame, points: pd.DataFrame, prefix: str) -> Report:
         tables.append(square_table(f"{name}_loss", lost, axis, labels, loss))
         losses[f"loss of {quantity} [%]"] = tables[-1]
     title = "What a design loses where it was not made for"
-    return tables, [square_figure(joined(prefix, "cross"), title, losses)]
+    figures = [square_figure(joined(prefix, "cross"), title, losses)] if losses else []
+    return tables, figures
 
 
 def square_table(
@@ -411,21 +408,19 @@ def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
     tables: list[Table] = []
     figures: list[Figure] = []
     rows = []
+    shown = frame[frame["role"] == "shown"].groupby(["design", "swept"])
+    bases = frame[frame["role"] == "base"].set_index("design")
     for vary in keys:
         more = _sweep_report(frame[frame["swept"] == vary.key], [vary], vary.key)
         tables, figures = tables + more[0], figures + more[1]
-    shown = frame[frame["role"] == "shown"]
-    for _, base in frame[frame["role"] == "base"].iterrows():
-        own = shown[shown["design"] == base["design"]].groupby("swept")
-        for what in QUANTITIES:
-            first, last = (100.0 * (end / base[what] - 1.0)
-                           for end in (own[what].nth(0), own[what].nth(-1)))  # fmt: skip
-            bars = [
-                (f"{vary.axis}: {vary.numbers[0]:g} ... {vary.numbers[-1]:g}", float(a), float(b))
-                for vary, a, b in zip(keys, first, last, strict=True)
-            ]
-            bars.sort(key=lambda bar: -max(abs(bar[1]), abs(bar[2])))
-            rows += [(base["design"], what.partition(" [")[0], *bar) for bar in bars]
+    for design, what in product(bases.index, QUANTITIES):
+        bars = []
+        for vary in keys:
+            change = 100.0 * (shown.get_group((design, vary.key))[what] / bases[what][design] - 1.0)
+            ends = f"{vary.axis}: {vary.numbers[0]:g} ... {vary.numbers[-1]:g}"
+            bars.append((ends, float(change.iloc[0]), float(change.iloc[-1])))
+        bars.sort(key=lambda bar: -max(abs(bar[1]), abs(bar[2])))
+        rows += [(design, what.partition(" [")[0], *bar) for bar in bars]
     title = "Change at both ends of each key, the others as in the scene."
     columns = ["design", "quantity", "key", "at its first value [%]", "at its last [%]"]
     return [Table("", title, pd.DataFrame(rows, columns=columns)), *tables], figures
@@ -451,26 +446,21 @@ def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
 
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
-    measures = pd.DataFrame([_measures(outcome, weights) for outcome in frame["outcome"]])
-    rest = ["grayness [-]", "iterations", "seconds", "ended by"]
-    whole = pd.concat([frame[["label", *QUANTITIES, "at [s]"]], measures, frame[rest]], axis=1)
+    """Return true values in the motion, efforts by one set of weights, and all designs."""
+    found = [outcome.summary() for outcome in frame["outcome"]]
+    none = {"": math.nan}
+    forces = [np.array([*one.get("drive_rms", none).values()]) for one in found]
+    by = 1.0 if weights is None else np.array(weights)
+    whole = frame.rename(columns={"label": "objective"}).assign(
+        **{"effort [-]": [float(np.linalg.norm(one * by)) for one in forces]},
+        **{"mass [kg]": [sum(one.get("mass", none).values()) for one in found]},
+    )
+    columns = ["objective", *QUANTITIES, "at [s]", "settling [mm]", "stress [MPa]", "effort [-]",
+               "mass [kg]", "grayness [-]", "iterations", "seconds", "ended by"]  # fmt: skip
     title = "Designs optimised for every objective, simulated in the scene."
-    table = Table("", title, whole.rename(columns={"label": "objective"}))
     good = [outcome for outcome in frame["outcome"] if not outcome.failure]
-    return [table], [design_figure("designs", "Designs by objective", good)]
-
-
-def _measures(outcome: Outcome, weights: Sequence[float] | None) -> dict[str, float]:
-    """Return what else a design does in its motion: true values, efforts by one set of weights."""
-    names = ("settling [mm]", "stress [MPa]", "effort [-]", "mass [kg]")
-    if outcome.failure:
-        return dict.fromkeys(names, math.nan)
-    summary = outcome.summary()
-    forces = np.array([*summary["drive_rms"].values()])
-    effort = float(np.linalg.norm(forces if weights is None else forces * np.array(weights)))
-    stress = math.nan if summary.get("stress") is None else 1e-6 * summary["stress"]["value"]
-    mass = float(sum(summary["mass"].values()))
-    return dict(zip(names, (1e3 * summary["settling"], stress, effort, mass)))
+    designs = design_figure("designs", "Designs by objective", good)
+    return [Table("", title, whole[columns])], [designs]
 
 
 # -- coordinates and reductions --------------------------------------------------------------
@@ -510,15 +500,14 @@ def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
     for other in reductions(scene, counts, OPTIMISED):
         made = Case(other, "optimize", label=reduction_name(other))
         again = Case(reference, "simulate", made, f"{made.label} in {called}")
-        known = _reduction(other)
-        rows += [({"role": "own", **known}, made), ({"role": "again", **known}, again)]
+        rows += [(_reduction(other) | {"role": "own"}, made)]
+        rows += [(_reduction(other) | {"role": "again"}, again)]
     return Plan("reduction", rows, partial(_reductions, called=called))
 
 
 def _reductions(frame: pd.DataFrame, called: str) -> Report:
     """Return the designs' results in their own model and in the reference."""
-    parts = {role: part.reset_index() for role, part in frame.groupby("role")}
-    own, again = parts["own"], parts["again"]
+    own, again = (frame[frame["role"] == role].reset_index() for role in ("own", "again"))
     ended = own["ended by"].where((own["failure"] != "") | (again["failure"] == ""),
                                   again["ended by"])  # fmt: skip
     known = {"method": own["method"], "coordinates": own["coordinates"]}
@@ -535,17 +524,3 @@ def _reductions(frame: pd.DataFrame, called: str) -> Report:
     simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
     figures: list[Figure] = [design_figure("designs", title, simulated)] * bool(simulated)
     return [Table("", f"{title} as well.", whole)], figures
-
-
-def convergence(found: Sequence[Outcome]) -> tuple[Panel, Panel]:
-    """Return objective and grayness against the iteration."""
-    rows = [{"made": one.case.label, **vars(row)} for one in found for row in one.history()]
-    frame = pd.DataFrame(rows, columns=["made", *(one.name for one in fields(HistoryRow))])
-    unit = {"compliance": "N m s", "deviation": "m", "eigenfrequency": "s2"}
-    kind = found[0].case.scene.objective.kind if found else ""
-    label, x = f"objective [{unit.get(kind, 'N m')}]", "iteration [-]"
-    objective, grayness = (
-        lines_by(frame, "made", "iteration", y) for y in ("objective", "grayness")
-    )
-    first = Panel("as the own model sees it", x, label, objective, y_log=True)
-    return first, Panel("", x, "grayness [-]", grayness)

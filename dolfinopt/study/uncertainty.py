@@ -7,13 +7,13 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import combinations_with_replacement
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import Any, NamedTuple, Union, get_args, get_origin
 
 import numpy as np
 import pandas as pd
-from mpi4py import MPI
 from numpy.polynomial import legendre
 from pydantic.fields import FieldInfo
 from scipy import stats
@@ -25,7 +25,7 @@ from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.tables.base import without_none
-from dolfinopt.study.cases import SAMPLED, Case, scales_bodies, with_sample
+from dolfinopt.study.cases import SAMPLED, Case, Runner, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
     Design,
@@ -43,13 +43,10 @@ from dolfinopt.study.variants import asked_by, axis_of, changed
 # Inputs are independent. Points (n, d) of the unit cube become samples through the distributions'
 # quantiles; what is said of a model rests on its values (n,) at the samples alone.
 
-Sampler = Literal["sobol", "latin-hypercube"]
-
 CONFIDENCE = 0.95  # of all intervals
 TAIL = 0.5 * (1.0 - CONFIDENCE)
 WIDE = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))  # half an interval, in standard errors
 QUANTILES = (0.05, 0.5, 0.95)
-RESAMPLES = 400  # of a bootstrap: its ends are right to a tenth of the interval
 # Quantiles beyond it, at both ends, are out of reach of any number of samples.
 REMOTE = 1e-12
 DEPENDENT = 1e-10  # of a basis' largest column: below, its terms are one another's to rounding
@@ -68,7 +65,6 @@ class Distribution:
 
     text: str  # as the user wrote it, e.g. "normal:6:0.3"
     law: Any = field(compare=False)  # SciPy's frozen distribution
-    bounded: bool  # whether it has bounds of its own
     low: float = -math.inf
     high: float = math.inf
     breakpoint: float | None = None  # where the density's slope jumps
@@ -84,7 +80,7 @@ class Distribution:
         InputError where bounds of its own reach beyond, or half of it does.
         """
         least, most = self.law.support()
-        if self.bounded and (least < low or most > high):
+        if math.isfinite(most - least) and (least < low or most > high):
             raise InputError(f"{self.text}: reaches from {least:g} to {most:g}")
         cut = replace(self, low=low, high=high)
         if cut.cut_off > 0.5:
@@ -130,19 +126,17 @@ class Distribution:
         return np.linalg.solve(upper.T, rows.T).T * np.sign(np.diag(upper))
 
 
-# By name: parameters and what they must fulfil, in words and as a function; SciPy's law of them.
-LAWS: dict[str, tuple[str, Callable[..., bool], Callable[..., Any]]] = {
-    "normal": ("MEAN:DEVIATION with DEVIATION > 0", lambda m, s: s > 0.0, stats.norm),
-    "uniform": ("LOW:HIGH with LOW < HIGH", lambda a, b: a < b,
-                lambda a, b: stats.uniform(a, b - a)),
+# By name: parameters and what they must fulfil, in words; SciPy's law of them, whose deviation is
+# no positive number otherwise.
+LAWS: dict[str, tuple[str, Callable[..., Any]]] = {
+    "normal": ("MEAN:DEVIATION with DEVIATION > 0", lambda m, s: stats.norm(m, s)),
+    "uniform": ("LOW:HIGH with LOW < HIGH", lambda a, b: stats.uniform(a, b - a)),
     "triangular": (
         "LOW:MODE:HIGH with LOW <= MODE <= HIGH and LOW < HIGH",
-        lambda a, b, c: a <= b <= c and a < c,
         lambda a, b, c: stats.triang((b - a) / (c - a), a, c - a),
     ),
-    "lognormal": ("MEDIAN:SIGMA with both > 0", lambda m, s: m > 0.0 and s > 0.0,
-                  lambda m, s: stats.lognorm(s, scale=m)),
-}  # fmt: skip
+    "lognormal": ("MEDIAN:SIGMA with both > 0", lambda m, s: stats.lognorm(s, scale=m)),
+}
 
 
 def parse_distribution(text: str) -> Distribution:
@@ -153,29 +147,26 @@ def parse_distribution(text: str) -> Distribution:
     name, *words = (part.strip() for part in text.split(":"))
     if name not in LAWS:
         raise InputError(f"{text}: expected one of {', '.join(LAWS)}, for example normal:6:0.3")
-    form, is_allowed, law = LAWS[name]
+    form, make = LAWS[name]
     try:
         values = [float(word) for word in words]
-        allowed = all(map(math.isfinite, values)) and is_allowed(*values)
-    except (ValueError, TypeError):  # no number, too few or too many
+        law = make(*values)
+        allowed = all(map(math.isfinite, values)) and law.std() > 0.0
+    except (ValueError, TypeError, ArithmeticError):  # no number, too few or too many
         allowed = False
     if not allowed:
         raise InputError(f"{text}: expected {name}:{form}")
-    middle = values[1] if name == "triangular" else None
-    return Distribution(text, law(*values), name in ("uniform", "triangular"), breakpoint=middle)
+    return Distribution(text, law, breakpoint=values[1] if name == "triangular" else None)
 
 
 # -- samples ---------------------------------------------------------------------------------
 
 
-def unit_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
+def unit_points(count: int, dimensions: int, seed: int) -> np.ndarray:
     """Return points (count, dimensions) that fill the unit cube evenly.
 
-    "sobol": Owen's scrambling of Sobol's sequence; more of them begin with the same ones.
-    "latin-hypercube": every input has one point in each of `count` equal intervals.
+    Owen's scrambling of Sobol's sequence; more of them begin with the same ones.
     """
-    if sampler == "latin-hypercube":
-        return qmc.LatinHypercube(dimensions, seed=seed).random(count)
     with warnings.catch_warnings():
         # Numbers that are no power of two are a little less even, and no error.
         warnings.filterwarnings("ignore", "The balance properties", UserWarning)
@@ -185,18 +176,6 @@ def unit_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.
 def draw(distributions: Sequence[Distribution], points: np.ndarray) -> np.ndarray:
     """Return the samples (n, d) at points (n, d) of the unit cube."""
     return np.stack([one.at(points[:, i]) for i, one in enumerate(distributions)], axis=1)
-
-
-def saltelli_points(count: int, dimensions: int, sampler: Sampler, seed: int) -> np.ndarray:
-    """Return the points ((d + 2) n, d) of Saltelli's scheme: A, B, and A with each column of B.
-
-    A and B are two samples of n points each. Source: Saltelli et al. (2010),
-    doi:10.1016/j.cpc.2009.09.018.
-    """
-    both = unit_points(count, 2 * dimensions, sampler, seed)
-    A, B = both[:, :dimensions], both[:, dimensions:]
-    mixed = [np.where(np.arange(dimensions) == i, B, A) for i in range(dimensions)]
-    return np.concatenate([A, B, *mixed])
 
 
 # -- statistics ------------------------------------------------------------------------------
@@ -249,43 +228,13 @@ def quantile(values: np.ndarray, share: float) -> Estimate:
 # -- Sobol' indices --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Indices:
+class Indices(NamedTuple):
     """Shares of the variance, one an input."""
 
-    first: tuple[Estimate, ...]  # of the input alone
-    total: tuple[Estimate, ...]  # of it alone and together with others
-    degree: int = 0  # of the polynomial they were taken from; 0 without one
-    unexplained: float = math.nan  # share that the polynomial misses, found by leaving one out
-
-
-def saltelli_indices(values: np.ndarray, dimensions: int, seed: int) -> Indices:
-    """Return the indices from the values ((d + 2) n,) at `saltelli_points`.
-
-    With V the variance: S_i = mean(f(B) (f(A_B^i) - f(A))) / V and
-    T_i = mean((f(A) - f(A_B^i))^2) / (2 V), f without its mean; intervals by bootstrap.
-    Sources: Saltelli et al. (2010), doi:10.1016/j.cpc.2009.09.018; Jansen (1999),
-    doi:10.1016/S0010-4655(98)00154-4.
-    """
-    rows = values.reshape(dimensions + 2, -1)
-    n = rows.shape[1]
-
-    def estimate(weights: np.ndarray) -> np.ndarray:
-        mean = 0.5 * (rows[0] + rows[1]) @ weights
-        f = rows - mean
-        variance = 0.5 * (f[0] ** 2 + f[1] ** 2) @ weights
-        if variance == 0.0:
-            return np.zeros(2 * dimensions)
-        first = (f[1] * (f[2:] - f[0])) @ weights
-        total = 0.5 * (f[0] - f[2:]) ** 2 @ weights
-        return np.concatenate([first, total]) / variance
-
-    # A bootstrap. Source: Efron & Tibshirani (1993), 13.3, doi:10.1201/9780429246593.
-    even = np.full(n, 1.0 / n)
-    draws = np.random.default_rng(seed).multinomial(n, even, size=RESAMPLES) / n
-    ends = np.quantile([estimate(weights) for weights in draws], [TAIL, 1.0 - TAIL], axis=0)
-    found = [Estimate(*map(float, row)) for row in zip(estimate(even), *ends)]
-    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]))
+    first: Sequence[Estimate]  # of the input alone
+    total: Sequence[Estimate]  # of it alone and together with others
+    degree: int  # of the polynomial they were taken from
+    unexplained: float  # share that the polynomial misses, found by leaving one out
 
 
 def polynomial_indices(
@@ -309,22 +258,15 @@ def polynomial_indices(
     single = [one.polynomials(samples[:, i], degrees[-1]) for i, one in enumerate(distributions)]
     fits = []
     for degree in degrees:
-        powers = _powers(dimensions, degree)
+        chosen = combinations_with_replacement(range(dimensions + 1), degree)  # the last is 1
+        rows = [tuple(np.bincount(one, minlength=dimensions + 1)[:-1]) for one in chosen]
+        powers = np.array(sorted(rows, key=lambda row: (sum(row), row)))
         basis = np.prod([single[i][:, powers[:, i]] for i in range(dimensions)], axis=0)
-        fits.append((powers, *_fit(basis, spread)))
-    powers, coefficients, without, missed = min(fits, key=lambda fit: fit[-1])
+        fits.append((degree, powers, *_fit(basis, spread)))
+    degree, powers, coefficients, without, missed = min(fits, key=lambda fit: fit[-1])
     shares, leaving = _shares(powers, coefficients[None])[0], _shares(powers, without)
     found = [_jackknife(share, others) for share, others in zip(shares, leaving.T)]
-    degree = int(powers.sum(axis=1).max())
-    return Indices(tuple(found[:dimensions]), tuple(found[dimensions:]), degree, missed)
-
-
-def _powers(dimensions: int, degree: int) -> np.ndarray:
-    """Return the degrees (terms, d) of all products up to a total degree, the constant first."""
-    rows: list[tuple[int, ...]] = [()]
-    for _ in range(dimensions):
-        rows = [(*row, p) for row in rows for p in range(degree + 1 - sum(row))]
-    return np.array(sorted(rows, key=lambda row: (sum(row), row)))
+    return Indices(found[:dimensions], found[dimensions:], degree, missed)
 
 
 def _fit(basis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -374,27 +316,6 @@ INTERVAL = f"{100.0 * CONFIDENCE:g} % confidence intervals"
 
 
 @dataclass(frozen=True)
-class Sampling:
-    """How samples are drawn and what is made of them.
-
-    Sobol' indices are of a polynomial fitted to the samples, or ("saltelli") of the simulations
-    themselves, d / 2 times as many more for d inputs.
-    """
-
-    samples: int = 1000  # that the statistics rest on
-    seed: int = 1  # of all that is random
-    sampler: Sampler = "sobol"  # see `unit_points`
-    indices: Literal["polynomial", "saltelli"] = "polynomial"
-
-    def points(self, dimensions: int) -> np.ndarray:
-        """Return points (n, d) of the unit cube."""
-        if self.indices == "saltelli" and dimensions > 1:
-            half = -(-self.samples // 2)
-            return saltelli_points(half, dimensions, self.sampler, self.seed)
-        return unit_points(self.samples, dimensions, self.sampler, self.seed)
-
-
-@dataclass(frozen=True)
 class Input:
     """A scene value, what the scene says of it, and its distribution within the key's range."""
 
@@ -417,22 +338,21 @@ def study_random(
     scene: Scene,
     random: Sequence[str],
     designs: Sequence[Path],
-    folder: Path,
-    world: MPI.Comm,
-    sampling: Sampling = Sampling(),
-    *,
-    shown: bool = True,
+    runner: Runner,
+    samples: int = 1000,
+    seed: int = 1,
 ) -> Study:
     """Simulate designs under random values of the scene (collective).
 
     Args:
         scene: with the nominal values; its scenarios are left out.
         random: texts "key.path=distribution", see `parse_distribution`.
-        designs, folder, world, shown: see `studies.study`; InputError as there.
-        sampling: how many samples, and how they are drawn.
+        designs, runner: see `studies.study`; InputError as there.
+        samples: how many.
+        seed: of what is random.
     """
-    plan = on_root(world, _plan, scene, tuple(random), tuple(designs), sampling)
-    return carry_out(plan, folder, world, shown=shown)
+    plan = on_root(runner.world, _plan, scene, random, designs, samples, seed)
+    return carry_out(plan, runner)
 
 
 def random_name(random: Sequence[str]) -> str:
@@ -444,19 +364,19 @@ def random_name(random: Sequence[str]) -> str:
 
 
 def _plan(
-    scene: Scene, random: Sequence[str], designs: tuple[Path, ...], sampling: Sampling
+    scene: Scene, random: Sequence[str], designs: Sequence[Path], count: int, seed: int
 ) -> Plan:
     """Check what is asked and draw the samples (root only)."""
-    if sampling.samples < LEAST:
-        raise InputError(f"--samples {sampling.samples}: expected at least {LEAST}")
-    if sampling.seed < 0:
-        raise InputError(f"--seed {sampling.seed}: expected an integer >= 0")
+    if count < LEAST:
+        raise InputError(f"--samples {count}: expected at least {LEAST}")
+    if seed < 0:
+        raise InputError(f"--seed {seed}: expected an integer >= 0")
     nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
-    inputs = tuple(parse_input(nominal, text) for text in random)
+    inputs = [parse_input(nominal, text) for text in random]
     keys = [one.key for one in inputs]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--random {twice[0]} twice; a value has one distribution")
-    values = draw([one.distribution for one in inputs], sampling.points(len(inputs)))
+    values = draw([one.distribution for one in inputs], unit_points(count, len(inputs), seed))
     samples = sample_texts(keys, values)
     for index in (*values.argmin(axis=0), *values.argmax(axis=0)):  # refused, it is so there mostly
         with_sample(nominal, samples[1 + index], 1 + index)
@@ -465,8 +385,7 @@ def _plan(
         for label, design in given_designs(scene, designs).items()
         for case in sample_cases(nominal, samples, label, design)
     ]
-    report = partial(_report, inputs=inputs, values=values, sampling=sampling)
-    return Plan(random_name(random), rows, report)
+    return Plan(random_name(random), rows, partial(_report, inputs=inputs, values=values))
 
 
 def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
@@ -498,32 +417,31 @@ def parse_input(scene: Scene, text: str) -> Input:
         example = "for example payload.mass=normal:6:0.3"
         raise InputError(f"--random {text}: expected KEY=DISTRIBUTION, {example}")
     with asked_by(f"--random {text}"):
-        distribution = parse_distribution(law)
-        middle, named = float(distribution.at(np.array(0.5))), key
-        key = in_new_words(key)
-        if not isinstance(nominal_value(changed(scene, f"{named}={middle!r}"), key), float):
+        distribution, parts = parse_distribution(law), in_new_words(key).split(".")
+        there = changed(scene, f"{key}={float(distribution.at(np.array(0.5)))!r}")
+        if not isinstance(nominal_value(there, key), float):
             raise InputError("expected a key with a real number as its value")
-        parts = key.split(".")
         if parts[0] not in TABLES:
             raise InputError(
                 f"does not change what a given design does; expected a key of {', '.join(TABLES)}"
             )
         if parts[0] == "arms" and parts[-1] in scene.arm_sizes:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
-        if key.endswith("*"):
-            return Input(named, 1.0, distribution.within(0.0, math.inf))
+        if parts[-1].endswith("*"):
+            return Input(key, 1.0, distribution.within(0.0, math.inf))
         field = field_at((parts[0], parts[-1]))
         try:
-            return Input(named, nominal_value(scene, key), distribution.within(*_range(field)))
+            return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
         except InputError as error:
-            raise InputError(f"{error}; {key} is {allowed_words(field)}") from None
+            words = allowed_words(field)
+            raise InputError(f"{error}; {'.'.join(parts)} is {words}") from None
 
 
 def nominal_value(scene: Scene, key: str) -> object:
     """Return the scene's value of a key, None where arms differ in it."""
-    if key.endswith("*"):
-        return 1.0
     table, *which, name = in_new_words(key).split(".")
+    if name.endswith("*"):
+        return 1.0
     rows = getattr(scene, table)
     if not isinstance(rows, tuple):
         return getattr(rows, name, None)
@@ -554,9 +472,7 @@ def _range(field: FieldInfo) -> tuple[float, float]:
 # -- what comes out --------------------------------------------------------------------------
 
 
-def _report(
-    frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray, sampling: Sampling
-) -> Report:
+def _report(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> Report:
     """Return tables and figures of the samples' values (n, d), and a table of all samples."""
     tables = [_input_table(inputs)]
     if any(o.failure and not o.messages for o in frame["outcome"]):  # a design is missing
@@ -564,17 +480,12 @@ def _report(
     samples, axes = _samples(frame, inputs, values), [one.axis for one in inputs]
     figures: list[Figure] = []
     if not (frame["failure"] != "").any():
-        several = len(inputs) > 1
-        # Saltelli's mixed samples are no draws of their own.
-        mixed = sampling.indices == "saltelli" and several
-        used = 2 * len(values) // (len(inputs) + 2) if mixed else len(values)
-        drawn = samples[samples["sample"] <= used]
-        tables.append(_statistics_table(drawn, used))
-        shown = drawn[["design", "sample", *QUANTITIES]]
-        title = f"Designs under {used} samples of the random values"
+        tables.append(_statistics_table(samples, len(values)))
+        shown = samples[["design", "sample", *QUANTITIES]]
+        title = f"Designs under {len(values)} samples of the random values"
         figures.append(FrameFigure("", title, "histogram", shown))
-        if several:
-            tables.append(_indices_table(samples, inputs, sampling))
+        if len(inputs) > 1:
+            tables.append(_indices_table(samples, inputs))
     wide = by_design(samples[samples["sample"] > 0], ["sample", *axes], RESULTS)
     return [*tables, Table("", "All samples.", wide, long=True)], figures
 
@@ -604,41 +515,34 @@ def _input_table(inputs: Sequence[Input]) -> Table:
     return Table("inputs", title, pd.DataFrame(rows, columns=columns))
 
 
-def _statistics_table(samples: pd.DataFrame, used: int) -> Table:
+def _statistics_table(samples: pd.DataFrame, count: int) -> Table:
     """Return all statistics, designs beside one another."""
     ends, rows = ("", "from", "to"), []
     for design, own in samples.groupby("design", sort=False):
         for what in QUANTITIES:
             values = own[what].to_numpy()
             found = {"nominal": (values[0], math.nan, math.nan), **statistics(values[1:])}
-            for name, one in found.items():
-                known = {"design": design, "quantity": what, "statistic": name}
-                rows.append(known | dict(zip(ends, one)))
-    title = f"Designs under {used} samples, with {INTERVAL} as for independent samples."
-    wide = by_design(pd.DataFrame(rows), ["quantity", "statistic"], ends)
-    return Table("statistics", title, wide)
+            rows += [(design, what, name, *one) for name, one in found.items()]
+    frame = pd.DataFrame(rows, columns=["design", "quantity", "statistic", *ends])
+    title = f"Designs under {count} samples, with {INTERVAL} as for independent samples."
+    return Table("statistics", title, by_design(frame, ["quantity", "statistic"], ends))
 
 
-def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input], sampling: Sampling) -> Table:
+def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input]) -> Table:
     """Return the Sobol' indices of all inputs, a row an input."""
-    fitted = sampling.indices == "polynomial"
-    names = ("first order [-]", "from", "to", "total [-]", "total from", "total to")
-    rows = []
+    rows, laws = [], [one.distribution for one in inputs]
     for design, own in samples[samples["sample"] > 0].groupby("design", sort=False):
         points = own[[one.axis for one in inputs]].to_numpy()
         for what in QUANTITIES:
-            values = own[what].to_numpy()
-            if fitted:
-                laws = [one.distribution for one in inputs]
-                found = polynomial_indices(points, values, laws)
-            else:
-                found = saltelli_indices(values, len(inputs), sampling.seed)
-            for known, first, total in zip(inputs, found.first, found.total, strict=True):
-                row: dict[str, Any] = {"design": design, "quantity": what.partition(" [")[0]}
-                row |= {"input": known.key, **dict(zip(names, (*first, *total), strict=True))}
-                if fitted:
-                    row |= {"degree [-]": found.degree, "unexplained [-]": found.unexplained}
-                rows.append(row)
-    how = "of a polynomial fitted to the samples" if fitted else "by Saltelli's scheme"
-    title = f"Sobol' indices, shares of the variance, {how}, with {INTERVAL}."
-    return Table("indices", title, pd.DataFrame(rows))
+            found = polynomial_indices(points, own[what].to_numpy(), laws)
+            rows += [
+                (design, what.partition(" [")[0], known.key, *first, *total, *found[2:])
+                for known, first, total in zip(inputs, found.first, found.total, strict=True)
+            ]
+    columns = ("design", "quantity", "input", "first order [-]", "from", "to", "total [-]",
+               "total from", "total to", "degree [-]", "unexplained [-]")  # fmt: skip
+    title = (
+        "Sobol' indices, shares of the variance, of a polynomial fitted to the samples, with "
+        f"{INTERVAL}."
+    )
+    return Table("indices", title, pd.DataFrame(rows, columns=columns))

@@ -95,7 +95,7 @@ def test_elements_that_do_not_lock():
 @pytest.mark.parametrize(
     ("make", "cells"),
     [
-        (iterations.plain_statics, (100, 12)),
+        (iterations.plain_iteration, (100, 12)),
         (iterations.pymoto_iteration, (100, 12)),
         pytest.param(iterations.pymoto_iteration, (100, 12, 4), marks=pytest.mark.slow),
     ],
@@ -121,7 +121,7 @@ def test_both_links():
     assert dofs == 3 * 3 * 4 * 3 + 6 and solver == "LAPACK's band" and len(seconds) == 2
     dofs, _, seconds = solid.plain_link(MPI.COMM_SELF, SCENE, (4, 3, 2))
     assert dofs == 3 * 5 * 4 * 3 and len(seconds) == 1
-    dofs, solver, seconds = solid.static_link(MPI.COMM_SELF, SCENE, (4, 3, 2))
+    dofs, solver, seconds = solid.iterate_link(MPI.COMM_SELF, SCENE, (4, 3, 2), True)
     assert dofs == 3 * 3 * 4 * 3 + 6 and solver == "LAPACK's band" and len(seconds) == 2
 
 
@@ -129,7 +129,7 @@ def test_plain_link_bends_like_a_beam():
     """Solid, one load: E I and shear, by cells that lock a little."""
     size = length, height, thickness = 0.5, 0.04, 0.02
     arm = box_arm(MPI.COMM_SELF, "link", size, (60, 6, 3))
-    statics = iterations.PlainStatics(arm, 70e9, 0.33, height * thickness, 1e-8)
+    statics = iterations.plain_statics(arm, 70e9, 0.33, height * thickness, 1e-8)
     compliance, _ = statics(np.ones(arm.num_cells))
     # Trilinear cells of this size are 2.4 % too stiff; of half the size 0.6 %.
     assert compliance == pytest.approx(length**3 / (70e9 * thickness * height**3 / 4), rel=0.03)

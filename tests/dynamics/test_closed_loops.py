@@ -19,7 +19,8 @@ from machines import (
     with_keys,
 )
 
-from dolfinopt.bench.field_machines import CRANK, END, ROD, crank, desired, rod, solved, unknowns
+from dolfinopt.bench.field import load_program
+from dolfinopt.data import benchmark_folder
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.known_forces import feed_forward
 from dolfinopt.multibody.kinematics import end_effector
@@ -119,7 +120,12 @@ def test_crank_without_stiffness_starts_closed_and_at_rest(kind: str) -> None:
     assert np.abs(gaps(result)).max() < 1e-9  # m
 
 
-# -- the flexible slider-crank `crank.f` of the IVP test set: `bench.field_machines` -----------
+# -- the flexible slider-crank `crank.f` of the IVP test set: `benchmarks/crank` ----------------
+
+PROGRAM = load_program(benchmark_folder() / "crank" / "crank.py")
+CRANK, END, ROD = PROGRAM.CRANK, PROGRAM.END, PROGRAM.ROD
+crank, desired, rod = PROGRAM.crank, PROGRAM.desired, PROGRAM.rod
+solved, unknowns = PROGRAM.solved, PROGRAM.unknowns
 
 
 # Its solution at 0.1 s: positions, velocities, accelerations of (phi2, q), multipliers of the

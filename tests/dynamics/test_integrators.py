@@ -9,12 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import Chain, Cloud, assert_close, beam, derivative, plane_chain, random_cloud
+from bodies import (
+    Chain,
+    Cloud,
+    assert_close,
+    beam,
+    derivative,
+    plane_body,
+    plane_chain,
+    random_cloud,
+)
 from machines import distance
 from remainders import build
 from scipy.integrate import solve_ivp
 
-from dolfinopt.bench.field_machines import plane_body
 from dolfinopt.dynamics import adjoint, march, measured, newton, newton_matrix, radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.bench.field_machines import plane_body
 from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.rotations import skew
 from dolfinopt.multibody.shape_integrals import STIFFENING, TABLE, ShapeIntegrals, rigid_body
@@ -21,6 +20,37 @@ from dolfinopt.multibody.tree import (
     Rotor,
     Site,
 )
+
+
+def plane_body(
+    mass: float,
+    moment: np.ndarray,
+    inertia: float,
+    C: np.ndarray,
+    j: np.ndarray,
+    r: np.ndarray,
+    M: np.ndarray,
+    G: np.ndarray,
+    K: np.ndarray,
+    D: np.ndarray,
+    outboard: np.ndarray,
+    outboard_point: np.ndarray,
+    K0: np.ndarray | None = None,
+) -> ShapeIntegrals:
+    """Return a plane body from its integrals by name, see `ShapeIntegrals`.
+
+    K0 is (7, q, q), by accelerations and by the outboard interface's loads; None if linear.
+    """
+    none = np.zeros((0, *K.shape))
+    W = np.array(
+        [np.block([[inertia, j], [j[:, None], M]]), np.block([[0.0, 0.0 - r], [r[:, None], G]])]
+    )
+    w, K0 = np.column_stack([moment, C]), none if K0 is None else K0
+    further = np.zeros((0, 2))  # as a mesh in the plane has: equal bodies are equal in every bit
+    return ShapeIntegrals(
+        float(mass), w, W, K, D, outboard, outboard_point, K0[:4], K0[4:], further, none
+    )
+
 
 # By which integrals a function of a body is differentiated.
 CONSTANTS = [one.name for one in TABLE if not one.name.endswith(("_point", "_points"))]

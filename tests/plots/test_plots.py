@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import plane_chain
+from bodies import plane_body, plane_chain
 from machines import GAINS, controlled, loop
 from mpi4py import MPI
 from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.bench.field_machines import plane_body
 from dolfinopt.multibody.closures import Along, Tie
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.rigid_motion import RigidMotion

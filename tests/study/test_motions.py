@@ -8,6 +8,7 @@ from runs import ROOT, refusal
 import dolfinopt as do
 from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.scene.csv_table import read_table
+from dolfinopt.study.cases import Runner
 from dolfinopt.study.motions import RIGID, SHAPERS, study_motions
 
 QUICK = ("arms.cells=[20,3]", "design.filter_radius=0", "simulation.tolerance=1e-3",
@@ -19,7 +20,7 @@ def found(tmp_path_factory):
     """The study of two small arms, and its folder."""
     folder = tmp_path_factory.mktemp("motions")
     scene = do.load_scene(ROOT / "demos" / "two_arm.toml", QUICK)
-    return study_motions(scene, (), folder, MPI.COMM_SELF, shown=False), folder, scene
+    return study_motions(scene, (), Runner(folder, MPI.COMM_SELF, False)), folder, scene
 
 
 @pytest.mark.serial
@@ -75,4 +76,6 @@ def test_vibration_is_the_first_frequency_of_the_machine() -> None:
 
 def test_refused(tmp_path) -> None:
     pinned = do.load_scene(ROOT / "demos" / "four_bar.toml")
-    refusal(lambda: study_motions(pinned, (), tmp_path, MPI.COMM_WORLD), "feed_forward.kind")
+    refusal(
+        lambda: study_motions(pinned, (), Runner(tmp_path, MPI.COMM_WORLD)), "feed_forward.kind"
+    )

@@ -16,8 +16,6 @@ from dolfinopt.study.uncertainty import (
     parse_distribution,
     polynomial_indices,
     quantile,
-    saltelli_indices,
-    saltelli_points,
     statistics,
     unit_points,
 )
@@ -98,33 +96,18 @@ def quadrature(law: Distribution) -> tuple[np.ndarray, np.ndarray]:
     return x, w * law.law.pdf(x)
 
 
-@pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
-def test_points_of_the_unit_cube(sampler):
-    """Seeds repeat; nets begin alike; a hypercube has a point in every interval."""
-    one = unit_points(50, 3, sampler, 7)
+def test_points_of_the_unit_cube():
+    """Seeds repeat; more of a net begin alike."""
+    one = unit_points(50, 3, 7)
     assert one.shape == (50, 3) and one.min() >= 0.0 and one.max() < 1.0
-    np.testing.assert_array_equal(one, unit_points(50, 3, sampler, 7))
-    assert not np.array_equal(one, unit_points(50, 3, sampler, 8))
-    more = unit_points(257, 3, sampler, 7)
-    assert np.array_equal(one, more[:50]) == (sampler == "sobol")  # more of a net begin alike
-    if sampler == "latin-hypercube":
-        for column in unit_points(40, 3, sampler, 3).T:
-            np.testing.assert_array_equal(np.sort((40 * column).astype(int)), np.arange(40))
-
-
-def test_saltelli_points():
-    points = saltelli_points(16, 3, "sobol", 1).reshape(5, 16, 3)
-    A, B, mixed = points[0], points[1], points[2:]
-    assert not np.isin(A, B).any()
-    for i in range(3):
-        np.testing.assert_array_equal(mixed[i][:, i], B[:, i])
-        np.testing.assert_array_equal(np.delete(mixed[i], i, axis=1), np.delete(A, i, axis=1))
+    np.testing.assert_array_equal(one, unit_points(257, 3, 7)[:50])
+    assert not np.array_equal(one, unit_points(50, 3, 8))
 
 
 def test_statistics_of_a_normal_sample():
     """Net points give the law's figures; intervals have the width of independent samples."""
     n = 2048
-    values = parse_distribution("normal:6:0.3").at(unit_points(n, 1, "sobol", 4)[:, 0])
+    values = parse_distribution("normal:6:0.3").at(unit_points(n, 1, 4)[:, 0])
     found = statistics(values)
     assert found["mean"].value == pytest.approx(6.0, abs=1e-4)
     assert found["standard deviation"].value == pytest.approx(0.3, rel=2e-3)
@@ -187,40 +170,17 @@ def ishigami_indices():
 ANGLE = parse_distribution(f"uniform:{-math.pi}:{math.pi}")
 
 
-@pytest.mark.parametrize("sampler", ["sobol", "latin-hypercube"])
-def test_saltelli_on_ishigami(sampler):
-    points = draw([ANGLE] * 3, saltelli_points(4096, 3, sampler, 1))
-    found = saltelli_indices(ishigami(points), 3, 1)
-    first, total = ishigami_indices()
-    for one, exact in zip((*found.first, *found.total), (*first, *total), strict=True):
-        assert one.low <= exact <= one.high
-        # Independent samples are right to 0.02; 4096 of a hypercube in six dimensions not better.
-        assert one.value == pytest.approx(exact, abs=0.03)
-        assert 0.005 < one.high - one.low < 0.12
-
-
-def test_saltelli_intervals_are_repeatable():
-    points = draw([ANGLE] * 3, saltelli_points(256, 3, "sobol", 1))
-    values = ishigami(points)
-    one, again, far = (saltelli_indices(v, 3, 5) for v in (values, values, values + 1e6))
-    assert repr(one) == repr(again)  # one of its numbers is nan
-    # A mean far from zero does not spoil the estimates.
-    expected = [share.value for share in one.first]
-    assert [share.value for share in far.first] == pytest.approx(expected, abs=1e-7)
-
-
 def test_polynomial_on_ishigami():
     """Degree 10 leaves 1e-5 of the variance."""
-    samples = draw([ANGLE] * 3, unit_points(1000, 3, "sobol", 1))
+    samples = draw([ANGLE] * 3, unit_points(1000, 3, 1))
     found = polynomial_indices(samples, ishigami(samples), [ANGLE] * 3)
     first, total = ishigami_indices()
     np.testing.assert_allclose([one.value for one in found.first], first, atol=1e-3)
     np.testing.assert_allclose([one.value for one in found.total], total, atol=1e-3)
     assert found.degree >= 9 and found.unexplained < 1e-4
     laws = [parse_distribution("normal:0:1")] * 2  # a constant has no shares
-    z = draw(laws, unit_points(50, 2, "sobol", 1))
+    z = draw(laws, unit_points(50, 2, 1))
     assert polynomial_indices(z, np.full(50, 2.0), laws).total[0].value == 0.0
-    assert saltelli_indices(np.full(64, 2.0), 2, 1).first[1].value == 0.0
 
 
 @pytest.mark.parametrize(
@@ -235,15 +195,11 @@ def test_linear_model(texts):
     laws = [parse_distribution(text) for text in texts]
     slopes = np.array([3.0 / laws[0].deviation, -2.0 / laws[1].deviation, 1.0 / laws[2].deviation])
     exact = np.array([9.0, 4.0, 1.0]) / 14.0
-    samples = draw(laws, unit_points(100, 3, "sobol", 1))
+    samples = draw(laws, unit_points(100, 3, 1))
     found = polynomial_indices(samples, 5.0 + samples @ slopes, laws)
     for one in (found.first, found.total):
         np.testing.assert_allclose([share.value for share in one], exact, rtol=1e-8)
     assert found.unexplained < 1e-20
-    points = draw(laws, saltelli_points(2048, 3, "sobol", 1))
-    direct = saltelli_indices(5.0 + points @ slopes, 3, 1)
-    for one in (direct.first, direct.total):
-        np.testing.assert_allclose([share.value for share in one], exact, atol=0.03)
 
 
 def test_noise_is_left_unexplained():
@@ -253,7 +209,7 @@ def test_noise_is_left_unexplained():
     exact = np.array([0.8, 0.2])
     covered = 0
     for seed in range(20):
-        z = draw(laws, unit_points(400, 2, "sobol", seed))
+        z = draw(laws, unit_points(400, 2, seed))
         y = z @ np.sqrt(exact) + rng.normal(0.0, 1.0 / 3.0, 400)
         found = polynomial_indices(z, y, laws)
         assert found.unexplained == pytest.approx(0.1, abs=0.03)

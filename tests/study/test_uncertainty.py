@@ -11,10 +11,9 @@ import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.study import cases as computing
 from dolfinopt.study import uncertainty
-from dolfinopt.study.cases import run_cases, scales_bodies, with_sample
+from dolfinopt.study.cases import Runner, run_cases, scales_bodies, with_sample
 from dolfinopt.study.figures import draw
 from dolfinopt.study.uncertainty import (
-    Sampling,
     nominal_value,
     parse_input,
     sample_cases,
@@ -245,7 +244,7 @@ def test_command(folder, capsys):
 
 def study(given, folder, *random, base=None, **options):
     base = scene() if base is None else base
-    return study_random(base, random, [given], folder, WORLD, Sampling(**options), shown=False)
+    return study_random(base, random, [given], Runner(folder, WORLD, False), **options)
 
 
 def tables_of(done):
@@ -279,32 +278,13 @@ def test_small_scatter_is_linear(folder, given):
         np.testing.assert_allclose([row[3] for row in rows], shares[:, j], atol=0.01)
 
 
-@alone
-def test_both_ways_to_the_indices(folder, given):
-    """Saltelli's scheme takes more simulations and comes to the polynomial's indices."""
-    fitted = study(given, folder / "i", MASS, YOUNG, samples=32)
-    direct = study(given, folder / "i", MASS, YOUNG, samples=32, indices="saltelli", seed=3)
-    assert direct.computed == 1 + 16 * (2 + 2)
-    assert len(tables_of(direct)[""].frame) == 64
-    ours, theirs = (cells_of(tables_of(done)["indices"]) for done in (fitted, direct))
-    assert len(ours) == len(theirs) == 4
-    for one, other in zip(ours, theirs, strict=True):
-        assert one[:3] == other[:3]
-        for value, (low, high) in ((one[3], other[4:6]), (one[6], other[7:9])):
-            # Twice as far as the 95 % interval of eight estimates leaves no chance.
-            middle, half = 0.5 * (low + high), 0.5 * (high - low)
-            assert abs(value - middle) < 2.0 * half and half < 0.8
-    # Mixed samples are no draws of their own: statistics rest on 32.
-    assert sorted(direct.figures[0].frame["sample"]) == list(range(33))
-
-
 def test_one_input_has_no_indices(folder, given):
     """Nor have the scene's scenarios a part in it."""
-    done = study(given, folder, MASS, samples=10, sampler="latin-hypercube", indices="saltelli")
+    done = study(given, folder, MASS, samples=10)
     assert done.computed == 11
     assert list(tables_of(done)) == ["inputs", "statistics", ""]
     several = scene('scenarios=[{changes=["payload.mass=4"]}]')
-    again = study(given, folder, MASS, base=several, samples=10, sampler="latin-hypercube")
+    again = study(given, folder, MASS, base=several, samples=10)
     assert again.computed == 0
 
 
